@@ -246,12 +246,12 @@ def independence(
     from experiments.scenario.loading import load_scenario
     from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.suite import one_scenario
-    from experiments.studies.independence import independence_trial, recorded_teams
+    from experiments.studies.independence import independence_trial
 
     require_folder(output, [scenario])
     path = one_scenario(scenario)
     loaded = [load_scenario(path, overrides, seed) for seed in parse_seeds(seeds)]
-    sizes = recorded_teams.team_sizes(robots, loaded[0])
+    sizes = independence_trial.team_sizes(robots, loaded[0])
     folder = output or results / f"independence-{loaded[0].name}"
     require_folder(folder)  # hours before it is written
     with layout.progress() as show:

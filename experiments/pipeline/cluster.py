@@ -1,9 +1,9 @@
 """Dask cluster of a sweep: local processes, or a cluster that is running already.
 
-Dask runs whatever its clients send. Processes of this machine listen on its loopback interface,
-which all its users can reach, so they take part only with the credentials of this sweep: a TLS key
-that is drawn for it and is kept in memory. Their web servers, which know no credentials, have no
-pages.
+Dask executes any code that its clients send. Local processes listen on the loopback interface,
+which all users of the machine can reach. So they accept only the credentials of this sweep: a TLS
+key that is created for it and kept in memory. Their web servers do not check credentials and
+therefore have no pages.
 """
 
 import functools
@@ -25,15 +25,15 @@ from experiments.pipeline.code_version import library_versions, source_hash, use
 from experiments.pipeline.workers import described, held_back_interrupts
 from mapfusion.errors import DamagedFileError, InputError
 
-# Tasks keep state of their process (the open PyBullet world, OpenCV's threads), so a worker that
-# was started with several threads works with one at a time.
+# Tasks use state of their process (the open PyBullet world, OpenCV's threads). So a worker that was
+# started with several threads runs one task at a time.
 _one_at_a_time = threading.Lock()
 
 
 class TaskFailedError(Exception):
-    """A task raised: its name and the reason in one line.
+    """Failure of a task: its name and the reason in one line.
 
-    And the traceback where it is a defect, or the error where it read a damaged file.
+    `details` is the traceback of a defect; `damage` is the error of a damaged file.
     """
 
     def __init__(
@@ -44,16 +44,16 @@ class TaskFailedError(Exception):
 
 
 class UnfitWorkerError(Exception):
-    """A worker that cannot take part, with the reason: nothing it did would be of use."""
+    """Reason why a worker cannot take part; its results would be useless."""
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What all tasks of a sweep have in common.
+    """Terms that all tasks of a sweep share.
 
     Attributes:
-        attempts: folder with a file for each task at work; one byte for each time it was begun.
-        retries: how often a task is begun again after the worker at it was killed.
+        attempts: folder with a file for each task that runs; one byte for each start of the task.
+        retries: number of restarts of a task whose worker was killed.
         code: `code_version()` of the machine that plans.
     """
 
@@ -64,27 +64,33 @@ class Terms:
 
 @functools.cache
 def code_version() -> str:
-    """Source and libraries: where they differ, results would be kept under wrong keys."""
+    """Return a text that identifies source and libraries.
+
+    Where it differs, results would be kept under wrong keys.
+    """
     return f"{source_hash()} {sorted(library_versions().items())} {platform.machine()}"
 
 
 @functools.cache
 def _prepare() -> None:
-    """Once a process, before anything is imported that computes."""
+    """Prepare the process, once, before modules that compute are imported."""
     use_kernel_cache()
     from experiments.pipeline.workers import single_threaded
 
     single_threaded()
 
 
-def perform(name: str, task: bytes, terms: Terms, *needs: None) -> None:
-    """Run a task, pickled so that it is unpacked only after this process is prepared.
+def perform(name: str, task: bytes, terms: Terms, *needs: None) -> object:
+    """Run a task. It comes pickled, because it is unpacked only after the process is prepared.
 
-    `needs` are results of the tasks before it (all None), so that Dask knows the order.
+    `needs` are the results of the tasks before it (all None); they tell Dask the order.
+
+    Returns:
+        The value of the task's function; None if the task was done before.
 
     Raises:
         TaskFailedError: the task raised, or its workers were killed too often.
-        UnfitWorkerError: this machine does not see the folder or has another version installed.
+        UnfitWorkerError: this machine does not see the folder, or has another version installed.
     """
     if not terms.attempts.is_dir():
         raise UnfitWorkerError(
@@ -98,11 +104,11 @@ def perform(name: str, task: bytes, terms: Terms, *needs: None) -> None:
         )
     with _one_at_a_time:
         _prepare()
-        _attempt(name, task, terms)
+        return _attempt(name, task, terms)
 
 
-def _attempt(name: str, task: bytes, terms: Terms) -> None:
-    """Run it under a mark: only a killed process leaves the mark behind."""
+def _attempt(name: str, task: bytes, terms: Terms) -> object:
+    """Run a task while a file marks it as begun: only a killed process leaves the file behind."""
     stage = name.partition("/")[0]
     mark = terms.attempts / name.replace("/", "_")
     if mark.exists() and mark.stat().st_size > terms.retries:
@@ -111,11 +117,12 @@ def _attempt(name: str, task: bytes, terms: Terms) -> None:
     with mark.open("ab") as file:
         file.write(b".")
     try:
-        pickle.loads(task).run()  # noqa: S301 (our own client's)
+        begun = pickle.loads(task)  # noqa: S301 (our own client's)
+        return None if begun.finished else begun.function(*begun.arguments)
     except InputError as error:
         damage = error if isinstance(error, DamagedFileError) else None
         raise TaskFailedError(name, " ".join(str(error).split()), damage=damage) from None
-    except (OSError, MemoryError) as error:  # of this machine: full, or not ours to write to
+    except (OSError, MemoryError) as error:  # the disk is full, or the folder is write-protected
         reason = " ".join(f"{stage}: {type(error).__name__} {error}".split())
         raise TaskFailedError(name, reason) from None
     except Exception as error:
@@ -126,21 +133,21 @@ def _attempt(name: str, task: bytes, terms: Terms) -> None:
 
 
 CONNECT_TIMEOUT_S = 30
-_STARTS = 3  # of a cluster: a worker may be killed for no fault of ours, thrice in a row it is not
+_STARTS = 3  # attempts to start a cluster: a worker may be killed while it starts
 
 _LOCAL_SETTINGS = {
-    # Dask blames every task that was assigned to a killed worker, not only the one at work; the
-    # sweep counts by itself (`dask_worker.Terms.retries`).
+    # Dask blames every task that was assigned to a killed worker, not only the one that ran. So
+    # the sweep counts by itself (`dask_worker.Terms.retries`).
     "distributed.scheduler.allowed-failures": 1_000_000,
-    # A killed worker is begun again, which a busy machine may take long for: Dask must not give up.
+    # A killed worker is started again, which takes long on a busy machine: Dask must not give up.
     "distributed.deploy.lost-worker-timeout": "1 day",
-    # Tasks keep nothing in Dask's memory, so there is nothing to spill, and a paused worker would
-    # wait for ever. One that fills 95 % of its share is killed and its task begun again.
+    # Dask keeps only rows of tables in memory, and only for a moment. So there is nothing to spill,
+    # and a paused worker would wait for ever. A worker that fills 95 % of its share is killed.
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
-    # Dask keeps the last tasks and events for developers: with thousands of them, tens of MB.
+    # Dask keeps the last tasks and events for developers, which take tens of MB by default.
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.log-length": 100,
     "distributed.admin.system-monitor.log-length": 100,
@@ -150,18 +157,18 @@ _LOCAL_SETTINGS = {
 
 
 def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client]:
-    """A client for a `with` block: of the scheduler at an address, else of `jobs` processes.
+    """Return a client for a `with` block: of the scheduler at an address, or of `jobs` processes.
 
-    Credentials for one at `tls://...` are those of Dask's configuration.
+    Credentials for an address `tls://...` are those of Dask's configuration.
 
     Raises:
-        InputError: no scheduler answers there, or it is not one for these credentials.
+        InputError: no scheduler answers there, or it refuses these credentials.
     """
     if scheduler is None:
         return _local(jobs)
     try:
         return Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
-    except TypeError as error:  # how Dask takes it that there are no credentials
+    except TypeError as error:  # Dask's reaction to missing credentials
         named = (
             "set distributed.comm.tls in Dask's configuration (DASK_DISTRIBUTED__COMM__TLS__...)"
         )
@@ -173,14 +180,14 @@ def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client
 
 @contextmanager
 def _local(jobs: int) -> Iterator[Client]:
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the sweep tells what matters
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the sweep reports failures
     with dask.config.set(_LOCAL_SETTINGS), held_back_interrupts() as let_them_come:
         cluster = _started(jobs)
         try:
             let_them_come()
             with Client(cluster, set_as_default=False) as client:
                 yield client
-        except BaseException:  # end workers at once: the next sweep begins their tasks again
+        except BaseException:  # end workers at once: the next sweep repeats their tasks
             for nanny in cluster.workers.values():
                 process = getattr(nanny.process, "process", None)
                 if process is not None and process.is_alive():
@@ -191,7 +198,7 @@ def _local(jobs: int) -> Iterator[Client]:
 
 
 def _started(jobs: int) -> LocalCluster:
-    """A cluster with all its workers; where one was killed before it answered, once more."""
+    """Start a cluster; try again if a worker was killed before it answered."""
     credentials = Security.temporary()
     for attempt in range(_STARTS):
         try:

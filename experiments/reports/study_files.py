@@ -29,11 +29,11 @@ from experiments.scenario.settings import AnyScenario
 from experiments.studies.benchmark import SIGMA_M, SIZE_M, SUMMARY, TRIALS, BenchmarkDesign
 from experiments.studies.independence.independence_trial import (
     COSTS,
+    STRATEGIES,
     TEAMS,
     Independence,
     at_the_end,
 )
-from experiments.studies.independence.strategies import STRATEGIES
 from experiments.studies.refusal.rates import (
     VERDICTS,
     Rate,

@@ -1,8 +1,8 @@
 """Benchmark of aligners on synthetic pairs of maps: success, error and time.
 
-Cells run one after the other in this process, warmed, so that times can be compared; each is kept
-under a key of all it depends on, so an interrupted benchmark goes on where it was and a new method
-costs only its own.
+A cell is one method, one number of pairs and one share of outliers. Cells run one after the other
+in this process after a first call, so times can be compared. Each cell is kept under a key of
+everything it depends on: an interrupted benchmark continues, and a new method adds only its cells.
 """
 
 import itertools
@@ -37,19 +37,19 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.registration import Registration
 
-# Fixed, so that the tables of different versions can be compared.
-SIZE_M = 20.0  # side of the square that holds the landmarks
-SIGMA_M = 0.05  # of a true pair's residual, per axis
-_OBSERVATIONS = 5  # that each landmark claims to be made of; no aligner asks
+# Constants, so that tables of different versions can be compared.
+SIZE_M = 20.0  # side of the square that contains the landmarks
+SIGMA_M = 0.05  # standard deviation of a true pair's residual, per axis
+_OBSERVATIONS = 5  # count of each landmark; no aligner uses it
 
 
 @dataclass(frozen=True)
 class SyntheticPair:
-    """Two planar maps of N landmarks each and N correspondences between them, in no order.
+    """Two planar maps of N landmarks each and N correspondences between them, in random order.
 
     Attributes:
-        T_a_b: (3,) the truth.
-        is_true: (N,) bool, which correspondences are one point of the world.
+        T_a_b: (3,) true motion.
+        is_true: (N,) bool, True for correspondences of one point of the world.
     """
 
     map_a: LandmarkMap
@@ -59,23 +59,23 @@ class SyntheticPair:
     is_true: np.ndarray
 
     def least_squares(self) -> Float:
-        """T_a_b (3,) that fits the true pairs best: all noise is equal, so weights are, too."""
+        """Return T_a_b (3,) of least squares on the true pairs; all have equal noise."""
         c = self.correspondences
         p_a, p_b = self.map_a.position_m[c.index_a], self.map_b.position_m[c.index_b]
         return np.array(fit_rigid(p_a, p_b, np.flatnonzero(self.is_true)))
 
 
 def true_pairs_of(n_pairs: int, outlier_share: float) -> int:
-    """Number of true ones among n pairs."""
+    """Return the number of true pairs among n."""
     return round((1 - outlier_share) * n_pairs)
 
 
 def synthetic_pair(n_pairs: int, outlier_share: float, rng: np.random.Generator) -> SyntheticPair:
     """Draw a world, two maps of it, the motion between them and the correspondences.
 
-    Landmarks are uniform in a square about the origin of frame b, so the translation's error is the
-    displacement of the world's middle. Both landmarks of a false pair are uniform, independently.
-    The residual's variance is shared equally between the maps, whose covariances say so.
+    Landmarks are uniform in a square about the origin of frame b. So the translation error is the
+    displacement of the centre of the world. Both landmarks of a false pair are uniform and
+    independent. Each map has half of the residual's variance, and its covariances say so.
     """
     half_m = SIZE_M / 2
     T_a_b = np.array([*rng.uniform(-half_m, half_m, 2), rng.uniform(-math.pi, math.pi)])
@@ -87,14 +87,14 @@ def synthetic_pair(n_pairs: int, outlier_share: float, rng: np.random.Generator)
     p_a = se2.transform_points(T_a_b, p_a) + rng.normal(0, own_m, p_a.shape)
     p_b = p_b + rng.normal(0, own_m, p_b.shape)
     index_a, index_b, order = (rng.permutation(n_pairs) for _ in range(3))
-    distance = rng.uniform(0, 0.3, n_pairs)  # as what matching lets through: they tell nothing
+    distance = rng.uniform(0, 0.3, n_pairs)  # of accepted matches; they carry no information
     map_a, map_b = _map(p_a, index_a, own_m, "a"), _map(p_b, index_b, own_m, "b")
     pairs = Correspondences(index_a[order], index_b[order], distance)
     return SyntheticPair(map_a, map_b, pairs, T_a_b, is_true[order])
 
 
 def _map(points_m: Float, rows: np.ndarray, sigma_m: float, name: str) -> LandmarkMap:
-    """The map whose landmark `rows[i]` is point i (N, 2)."""
+    """Return the map whose landmark `rows[i]` is point i of (N, 2)."""
     n = len(points_m)
     position = np.zeros((n, 3))
     position[rows, :2] = points_m
@@ -111,7 +111,7 @@ def _map(points_m: Float, rows: np.ndarray, sigma_m: float, name: str) -> Landma
 TRIALS_FILE = "trials.parquet"
 CELL = {"method": TEXT, "n_pairs": INT, "outlier_share": FLOAT}
 
-# One row a trial. All but the time are the same at every run.
+# One row per trial. All columns except the time are the same in every run.
 TRIALS = schema(
     "benchmark.trials",
     1,
@@ -120,7 +120,7 @@ TRIALS = schema(
         trial=INT,
         status=TEXT,
         reason=TEXT,
-        error_m=FLOAT,  # of the translation, at the middle of the world
+        error_m=FLOAT,  # of the translation, at the centre of the world
         error_rad=FLOAT,
         refined_status=TEXT,
         refined_error_m=FLOAT,
@@ -134,7 +134,7 @@ TRIALS = schema(
 
 @dataclass(frozen=True)
 class CellSettings:
-    """All that one method's trials in one cell depend on, among it an aligner as scenarios have."""
+    """Settings of one cell: an aligner as in scenarios, and the cell."""
 
     name: str
     method: str
@@ -160,7 +160,7 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     for trial in range(settings.trials):
         maps = ("benchmark", n_pairs, f"{share:g}", trial)
         pair = synthetic_pair(n_pairs, share, generator(settings.seed, *maps))
-        for _ in range(2 if trial == 0 else 1):  # the first one compiles, imports and fills caches
+        for _ in range(2 if trial == 0 else 1):  # the first call compiles and fills caches
             answer = _trial(registration, pair, generator(settings.seed, *maps, settings.name))
         rows.append(cell | {"trial": trial} | answer)
         if time.perf_counter() - started > settings.budget_s:
@@ -171,6 +171,7 @@ def run_cell(settings: CellSettings, job: Job) -> None:
 def _trial(
     registration: Registration, pair: SyntheticPair, rng: np.random.Generator
 ) -> dict[str, Any]:
+    """Return the columns of `TRIALS` that one answer determines."""
     estimated, refined, _ = registration.register(pair.map_a, pair.map_b, pair.correspondences, rng)
     row = {
         "status": str(estimated.status),
@@ -189,10 +190,11 @@ def _trial(
 OUTLIER_SHARES = (0.5, 0.8, 0.9, 0.95, 0.99)
 PAIR_COUNTS = (60, 200, 1000, 5000)
 
-# One row a cell. n_success: accepted, and right as estimated, with Wilson's 95 % interval; n_wrong:
-# accepted, and not right; n_failed: raised, hung or answered nonsense. Errors: medians over the
-# successes; ratios: of those to the oracle's on the same maps, as estimated and after the common
-# least squares; oracle_error: medians over all trials; elapsed: median, 10th and 90th percentile.
+# One row per cell. n_success: accepted estimates that are right; success: with Wilson's interval;
+# n_wrong: accepted estimates that are wrong; n_failed: exceptions, timeouts and invalid answers.
+# Errors: medians over successes; ratios: to the oracle's errors on the same maps, as estimated and
+# after the common least squares; oracle_error: medians over all trials; elapsed: median, 10th and
+# 90th percentile.
 SUMMARY = schema(
     "benchmark.summary",
     1,
@@ -200,7 +202,7 @@ SUMMARY = schema(
         **CELL,
         n_true=INT,
         n_trials=INT,
-        status=TEXT,  # "absent" where the package is, else "ran"
+        status=TEXT,  # "absent" if the package is not installed, else "ran"
         n_success=INT,
         **dict.fromkeys(("success", "success_low", "success_high"), FLOAT),
         n_wrong=INT,
@@ -215,10 +217,15 @@ SUMMARY = schema(
 
 @dataclass(frozen=True)
 class BenchmarkDesign:
-    """What is measured: methods, each on the same maps, in all cells of these counts and shares.
+    """Design of a benchmark.
 
-    Each of a cell's trials is on maps of its own; a cell that has taken longer than its budget ends
-    with the trials it has. The seed is of maps and methods.
+    Attributes:
+        aligners: methods; all get the same maps.
+        trials: number of trials per cell, each on its own maps.
+        seed: seed of maps and methods.
+        budget_s: time after which a cell ends with the trials it has.
+        pair_counts: numbers of pairs.
+        outlier_shares: shares of false pairs.
     """
 
     aligners: tuple[AlignerEntry, ...]
@@ -232,9 +239,9 @@ class BenchmarkDesign:
 def entries_of(
     methods: Sequence[str], scenario: str | Path | None = None
 ) -> tuple[AlignerEntry, ...]:
-    """The methods of these names, with their default parameters, or a scenario's aligners.
+    """Return methods with default parameters by name, or a scenario's aligners.
 
-    With both, the scenario's aligners of these names; with neither, all known methods.
+    With both arguments, return the scenario's aligners of these names; with none, all methods.
 
     Raises:
         InputError: a name or the scenario is unknown or unusable.
@@ -255,32 +262,30 @@ def entries_of(
 
 
 def run_benchmark(design: BenchmarkDesign, store: Store, on_progress: OnProgress) -> pd.DataFrame:
-    """All trials of all cells (TRIALS), from the store where they are there."""
+    """Return all trials of all cells (TRIALS); finished cells come from the store."""
+    stages = list[Stage]()
     cells = itertools.product(design.aligners, design.pair_counts, design.outlier_shares)
-    stages = [_stage(design, *cell) for cell in cells]
+    for entry, n_pairs, share in cells:
+        method = find_method(entry.method)
+        settings = CellSettings(
+            **dict(entry),
+            origin=method.origin(),
+            n_pairs=n_pairs,
+            outlier_share=share,
+            trials=design.trials,
+            seed=design.seed,
+            budget_s=design.budget_s,
+        )
+        loads, label = (method.target.partition(":")[0],), "measure the aligners"
+        stages.append(Stage("benchmark", label, settings, run_cell, (TRIALS_FILE,), loads=loads))
     with workers(1) as this_process:
         run_tasks(list(tasks_of(stages, store).values()), this_process, on_progress)
     trials = [read_rows(store.path(stage) / TRIALS_FILE, TRIALS) for stage in stages]
     return pd.concat(trials, ignore_index=True)
 
 
-def _stage(design: BenchmarkDesign, entry: AlignerEntry, n_pairs: int, share: float) -> Stage:
-    method = find_method(entry.method)
-    settings = CellSettings(
-        **dict(entry),
-        origin=method.origin(),
-        n_pairs=n_pairs,
-        outlier_share=share,
-        trials=design.trials,
-        seed=design.seed,
-        budget_s=design.budget_s,
-    )
-    loads, label = (method.target.partition(":")[0],), "measure the aligners"
-    return Stage("benchmark", label, settings, run_cell, (TRIALS_FILE,), loads=loads)
-
-
 def summarise(trials: pd.DataFrame) -> pd.DataFrame:
-    """One row a cell (see SUMMARY), in the order of the trials."""
+    """Return one row per cell (see SUMMARY), in the order of the trials."""
     keys = [trials[name] for name in CELL]
 
     def by_cell(column: pd.Series) -> "pd.api.typing.SeriesGroupBy":

@@ -1,7 +1,7 @@
 """Comparison of two versions on the same runs: changes that exceed noise.
 
-Only what both have counts: the same scenario, seed and settings (but for those left out by name),
-robot pair, iteration and aligner.
+Only rows that both versions have are compared: the same scenario, seed and settings (except those
+that are excluded by name), robot pair, iteration and aligner.
 """
 
 import json
@@ -40,12 +40,18 @@ _NEES, _REFINED = "nees_with_drift", "refined_translation_error_m"
 
 
 class Quantity(NamedTuple):
-    """What two versions are compared in: a column of the rows of a table, or of those `where`.
+    """Quantity in which two versions are compared.
 
-    Their counts are the lesser ones of the two versions. A change is told as a ratio b / a, as a
-    difference of shares, or as one of distances from consistency |ln(NEES per degree of freedom)|.
-    It is `of` each method, of the oracle, or of no aligner. What is timed depends on the machine
-    and its load, which runs share.
+    Attributes:
+        table: table of runs.
+        metric: name of the quantity.
+        column: column of the table.
+        scale: a change is a ratio b / a, a difference of shares, or a difference of distances from
+            consistency |ln(NEES per degree of freedom)|.
+        of: each method, the oracle, or empty for rows without an aligner.
+        higher_is_better: True if larger values are better.
+        where: condition on the rows; counts in it are the smaller ones of both versions.
+        timed: True for times, which depend on the machine and its load.
     """
 
     table: str
@@ -59,7 +65,7 @@ class Quantity(NamedTuple):
 
 
 def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `maps_of`, with each map's refined error over the oracle's there."""
+    """Return rows of `maps_of` with each map's refined error over that of the oracle."""
     maps = alignment_summary.maps_of(errors)
     of_oracle = maps.assign(oracle=maps[_REFINED].where(maps["aligner"] == ORACLE))
     reference = of_oracle.groupby(MAP_PAIR)["oracle"].transform("first")
@@ -67,17 +73,19 @@ def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
 
 
 def _nees_per_dof(fusion: pd.DataFrame) -> pd.DataFrame:
+    """Return the mean NEES per degree of freedom of each robot pair."""
     true = fusion[fusion["true_pair"]]
     per_dof = true.assign(nees=true[_NEES] / true["degrees_of_freedom"])
     return per_dof.groupby(["run_id", *ROBOT_PAIR], sort=False)["nees"].mean().reset_index()
 
 
 def _fused_last(fusers: pd.DataFrame) -> pd.DataFrame:
-    """Each fuser's last map, as of a method."""
+    """Return each fuser's last map, with the fuser as aligner."""
     return last_fused(fusers).drop(columns="iteration").rename(columns={"fuser": "aligner"})
 
 
 def _team_alignments(pairs: pd.DataFrame) -> pd.DataFrame:
+    """Add found (right and used), false (wrong and used) and off_m (error in the team's map)."""
     used, right = believed(pairs), right_refined(pairs)
     false = is_false_merge(pairs) & used
     off_m = pairs["team_translation_error_m"]
@@ -86,7 +94,7 @@ def _team_alignments(pairs: pd.DataFrame) -> pd.DataFrame:
 
 _SMOOTHER = ("path_rmse_m", "landmark_rmse_m", "nees_per_dof")
 _FUSERS = ("landmark_rmse_m", "over_better_filter", "nees_per_dof", "coverage_95")
-# What is read of each table, what older runs may lack of it, and how a run's rows are reduced.
+# Columns to read of each table, columns that older runs may lack, and the reduction of the rows.
 READ: dict[str, tuple[Sequence[str] | None, Sequence[str], Callable[..., pd.DataFrame]]] = {
     "errors": (alignment_summary.NEEDED, alignment_summary.OPTIONAL, _maps_over_oracle),
     "robots": (["robot", "path_error_m", "odometry_error_m"], (), partial(path_rms, by=_ROBOT)),
@@ -130,7 +138,7 @@ QUANTITIES = (
 )
 
 
-# A change of less than one percent (or percentage point) matters to nobody who picks a method.
+# A change of less than one percent (or percentage point) does not decide which method to choose.
 LEAST_CHANGE = 0.01
 BETTER, WORSE, SAME = "better", "worse", "identical"
 NOISE, UNKNOWN = "no difference beyond noise", "cannot be judged"
@@ -140,14 +148,14 @@ _KEYS = (*MAP_PAIR, "aligner", "robot", "map", "component", "source")
 
 
 class VersionComparison(NamedTuple):
-    """What two versions differ in.
+    """Differences of two versions.
 
     Attributes:
-        table: one row a metric; a and b are medians over all rows, means of shares; change is a
-            factor b / a, or a difference.
-        unit: what n_units counts, "run" or "maps of one run".
-        n_runs: matched.
-        notes: what a reader must know, one line each.
+        table: one row per metric; a and b are medians over all rows, or means of shares; change is
+            a factor b / a, or a difference.
+        unit: unit of n_units, "run" or "maps of one run".
+        n_runs: number of matched runs.
+        notes: warnings for the reader, one line each.
     """
 
     table: pd.DataFrame
@@ -157,7 +165,7 @@ class VersionComparison(NamedTuple):
 
     @property
     def worse(self) -> bool:
-        """Whether anything got worse beyond noise. Times do not count: see `_notes_on`."""
+        """True if a metric got worse beyond noise. Times do not count: see `_notes_on`."""
         return bool(((self.table["verdict"] == WORSE) & ~self.table["timed"]).any())
 
 
@@ -165,13 +173,13 @@ def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> Versi
     """Compare the result or sweep folders of two versions.
 
     Args:
-        path_a: of the first.
-        path_b: of the second.
-        apart_from: settings that sweeps varied, in which matched runs may differ.
+        path_a: folder of the first version.
+        path_b: folder of the second version.
+        apart_from: settings of sweeps in which matched runs may differ.
 
     Raises:
-        InputError: the two have no run in common, or no table; or such a setting is none that a
-            sweep varied, or tells two runs of one side apart.
+        InputError: both have no run or no table in common; no sweep varied a setting of
+            `apart_from`; or runs of one version differ only in these settings.
     """
     a, b = find_runs(path_a), find_runs(path_b)
     notes = _apart_from(a, b, apart_from)
@@ -201,7 +209,7 @@ def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> Versi
 
 
 def _names(path: Path, runs: Runs, apart_from: Sequence[str]) -> set[str]:
-    """What the runs of one side are matched by."""
+    """Return the names that the runs of one version are matched by."""
     names = match_names(runs.described, apart_from)
     several = names[names.duplicated()]
     if apart_from and len(several):
@@ -214,7 +222,7 @@ def _names(path: Path, runs: Runs, apart_from: Sequence[str]) -> set[str]:
 
 
 def _apart_from(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
-    """What each side has of the settings that runs are not matched by."""
+    """Return notes on the settings that runs are not matched by."""
     notes = []
     varied = [runs.described[setting_columns(runs.described)] for runs in (a, b)]
     for setting in settings:
@@ -228,10 +236,10 @@ def _apart_from(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
 
 
 def _judged(quantity: Quantity, method: str, values: pd.DataFrame, n_runs: int) -> dict[str, Any]:
-    """One row of the table, verdict and correction apart."""
+    """Return one row of the table, without verdict and corrected p."""
     is_share = quantity.scale == "share"
-    of_maps, run_id = values["change"].to_numpy(), values["run_id"]
-    changes = intervals.change_of_each_run(of_maps, run_id, n_runs, is_share)
+    per_map, run_id = values["change"].to_numpy(), values["run_id"]
+    changes = intervals.change_of_each_run(per_map, run_id, n_runs, is_share)
     found = intervals.mean_change(changes)
     told = np.exp(found[:3]) if quantity.scale == "ratio" else found[:3]
     a, b = values[["a", "b"]].agg("mean" if is_share else "median")
@@ -255,6 +263,7 @@ def _verdict(row: dict[Any, Any]) -> str:
 
 
 def _some(names: set[str]) -> str:
+    """Return the first names, and the number of the others."""
     shown = ", ".join(islice(sorted(names), _SHOWN_NAMES))
     return shown + (f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else "")
 
@@ -281,10 +290,15 @@ def _notes_on(table: pd.DataFrame, unit: str, n_runs: int, n_worlds: int) -> lis
 
 
 def _differing_settings(a: Runs, b: Runs) -> list[str]:
-    """Settings in which the scenarios of matched results differ."""
+    """Return notes on settings in which the scenarios of matched results differ."""
+
+    def settings_of(result: RunPath) -> dict[str, str]:  # by dotted name, as JSON
+        found = pd.json_normalize(read_scenario(result.path / "scenario.json")).to_dict("records")
+        return {str(name): json.dumps(value) for name, value in found[0].items()}
+
     found: dict[str, str] = {}
     for x, y in ((x, y) for x in a.results for y in b.results if x.run == y.run):
-        both = pd.DataFrame([_flat(x), _flat(y)]).fillna("absent")
+        both = pd.DataFrame([settings_of(x), settings_of(y)]).fillna("absent")
         for key, (old, new) in both.sort_index(axis=1).items():
             if old != new:
                 found[str(key)] = f"{key} is {old} in the first and {new} in the second"
@@ -293,25 +307,16 @@ def _differing_settings(a: Runs, b: Runs) -> list[str]:
     return [*shown, f"the scenarios differ in {more} more settings"] if more else shown
 
 
-def _flat(result: RunPath) -> dict[str, str]:
-    """Settings by dotted name, as JSON."""
-    scenario = read_scenario(result.path / "scenario.json")
-    settings = pd.json_normalize(scenario).to_dict("records")[0]
-    return {str(name): json.dumps(value) for name, value in settings.items()}
-
-
 def _all_values(
     a: Runs, b: Runs, apart_from: Sequence[str]
 ) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
-    """All quantities that both have tables for, the method, and columns run_id, a, b, change."""
+    """Yield quantities of common tables, the method, and columns run_id, a, b and change."""
     for table in READ:
         if not (a.has(table) and b.has(table)):
             continue
         rows = _joined(a, b, table, apart_from)
-        for method in [
-            *(alignment_summary.methods_in(rows, oracle=True) if "aligner" in rows else []),
-            "",
-        ]:
+        methods = alignment_summary.methods_in(rows, oracle=True) if "aligner" in rows else []
+        for method in [*methods, ""]:
             own = rows[rows["aligner"] == method] if method else rows
             of = method if method in ("", ORACLE) else EACH_METHOD
             for quantity in QUANTITIES:
@@ -322,7 +327,10 @@ def _all_values(
 
 
 def _joined(a: Runs, b: Runs, table: str, apart_from: Sequence[str]) -> pd.DataFrame:
-    """Rows of both by run and keys, values with the suffixes _a and _b; the lesser counts."""
+    """Join the rows of both by run and keys; values get suffixes _a and _b.
+
+    Counts are the smaller ones of both.
+    """
     columns, optional, reduce = READ[table]
     frames = []
     for runs in (a, b):
@@ -332,7 +340,7 @@ def _joined(a: Runs, b: Runs, table: str, apart_from: Sequence[str]) -> pd.DataF
                 columns=[*alignment_summary.RUN_KEYS, *alignment_summary.setting_columns(rows)]
             )
             parts.append(reduce(named.assign(run_id=match_names(rows, apart_from))))
-        # a run of one robot has no rows, and must not decide the columns' types
+        # a run of one robot has no rows; its columns have no useful types
         parts = [part for part in parts if len(part)] or parts[:1]
         frames.append(pd.concat(parts, ignore_index=True))
     keys = [name for name in _KEYS if name in frames[0]]
@@ -346,10 +354,10 @@ def _joined(a: Runs, b: Runs, table: str, apart_from: Sequence[str]) -> pd.DataF
 
 
 def _changes(quantity: Quantity, rows: pd.DataFrame) -> pd.DataFrame:
-    """Where both versions have a value and the change is finite; success tells the rest."""
+    """Return values and changes of rows with a finite change; success rates cover the others."""
     rows = rows.query(quantity.where) if quantity.where else rows
     a, b = (rows[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
-    if quantity.scale == "ln":  # too small a covariance is as wrong as one too large
+    if quantity.scale == "ln":  # too small covariances are as wrong as too large ones
         change = np.abs(intervals.log_ratio(b, np.ones(1))) - np.abs(
             intervals.log_ratio(a, np.ones(1))
         )

@@ -24,19 +24,23 @@ TIME_GROUPS = 8
 def error_bands(
     rows: pd.DataFrame, by: Sequence[str] = ROBOT_PAIR, absolute: bool = False
 ) -> pd.DataFrame:
-    """Errors against the iteration: median and 10-90 % of the rows.
+    """Return median and 10-90 % band of errors by iteration.
 
-    A row without an estimate is infinitely far off. A signed rotation has no such value: it is NaN
-    where not more than half of the rows have an estimate, and else of those that have one.
+    Bands are over repetitions for rows of `errors` and over runs for rows of `medians_of_run`. A
+    row without an estimate counts as an infinite error. A signed rotation cannot be infinite: its
+    band is NaN unless more than half of the rows have an estimate, and uses these rows only.
 
-    Over the repetitions for rows of `errors`, over the runs for rows of `medians_of_run`; apart for
-    each robot pair, or whatever `by` names; `absolute` drops the sign of rotations first.
+    Args:
+        rows: rows of `errors` or `medians_of_run`.
+        by: columns that separate groups, by default the robot pair.
+        absolute: True to drop the sign of rotations.
 
     Returns:
-        The columns of `by`, aligner, iteration, n_runs where runs are named, and for each error
+        The columns of `by`, aligner, iteration, n_runs if rows have a run_id, and for each error
         NAME_low, NAME (the median) and NAME_high.
     """
-    rows, signed = _far_where_missing(rows, () if absolute else _SIGNED)
+    signed = () if absolute else _SIGNED
+    rows = _infinite_where_missing(rows, signed)
     groups = rows.groupby([*by, "aligner", "iteration"], sort=False)
     parts = [groups["run_id"].nunique().rename("n_runs")] if "run_id" in rows else []
     for column in ERROR_COLUMNS:
@@ -45,43 +49,41 @@ def error_bands(
         found += [high.rename(f"{column}_high")]
         if column in signed:
             parts += [each.where(_mostly_known(groups, column)) for each in found]
-        else:  # between two infinities pandas finds no quantile
+        else:  # pandas returns NaN for a quantile between two infinities
             parts += [each.fillna(np.inf) for each in found]
     return pd.concat(parts, axis=1).reset_index()
 
 
 def medians_of_run(errors: pd.DataFrame) -> pd.DataFrame:
-    """A run's repetitions reduced to their median, as `error_bands` does it, rotations signed.
+    """Reduce a run's repetitions to medians as `error_bands` does, with signed rotations.
 
-    The band of several runs is then over the runs, each of which counts once.
+    Bands of several runs are then over runs, and each run counts once.
     """
     keys = [name for name in RUN_KEYS if name in errors] + setting_columns(errors)
-    errors, signed = _far_where_missing(errors, _SIGNED)
+    errors = _infinite_where_missing(errors, _SIGNED)
     groups = errors.groupby([*keys, *MAP_KEYS, "aligner"], sort=False, dropna=False)
     medians = groups[list(ERROR_COLUMNS)].median()
-    known = {name: medians[name].where(_mostly_known(groups, name)) for name in signed}
+    known = {name: medians[name].where(_mostly_known(groups, name)) for name in _SIGNED}
     parts = [medians.assign(**known), groups[list(alignment_summary.COUNTS)].first()]
     return pd.concat(parts, axis=1).reset_index()
 
 
-def _far_where_missing(
-    rows: pd.DataFrame, signed: Sequence[str]
-) -> tuple[pd.DataFrame, Sequence[str]]:
-    """The rows, infinitely far off where they have no estimate, but for the signed columns."""
+def _infinite_where_missing(rows: pd.DataFrame, signed: Sequence[str]) -> pd.DataFrame:
+    """Return rows with infinite errors where there is no estimate, except in signed columns."""
     unsigned = [name for name in ERROR_COLUMNS if name not in signed]
-    return rows.assign(**how_far_off(rows, unsigned)), signed
+    return rows.assign(**how_far_off(rows, unsigned))
 
 
 def _mostly_known(groups: Any, column: str) -> pd.Series:
-    """Bool by group: whether more than half of its rows have a value."""
+    """Return True for each group in which more than half of the rows have a value."""
     return groups[column].count() > groups.size() / 2
 
 
 def scarce_spans(rows: pd.DataFrame) -> list[tuple[float, float]]:
-    """Stretches of iterations at which most maps have too few true pairs for an answer.
+    """Return intervals of iterations in which most maps have too few true pairs for an answer.
 
-    All methods see the same maps, so any rows of `errors` or `medians_of_run` will do. Each stretch
-    reaches half way to the next iteration.
+    Rows are those of `errors` or `medians_of_run` of any method, as all methods get the same maps.
+    Each interval extends half way to the next iteration.
     """
     maps = rows.drop_duplicates([name for name in ("run_id", *MAP_KEYS) if name in rows])
     scarce = (maps["n_true"] < ANSWERABLE_PAIRS).groupby(maps["iteration"]).mean() > 0.5
@@ -96,14 +98,16 @@ def scarce_spans(rows: pd.DataFrame) -> list[tuple[float, float]]:
 def time_bands(
     timings: pd.DataFrame, column: str = "n_common", groups: int = TIME_GROUPS
 ) -> pd.DataFrame:
-    """Time of one alignment against the overlap, in groups of about equal size.
+    """Return the time of one alignment by overlap, in groups of about equal size.
 
-    Of rows of `aligner_timings`, by n_common or n_correspondences; equal ones stay together.
+    Args:
+        timings: rows of `aligner_timings`.
+        column: n_common or n_correspondences; rows of equal value are in one group.
+        groups: number of groups.
 
     Returns:
-        aligner; COLUMN_low, COLUMN (the median) and COLUMN_high of the group; n_runs where runs
-        are named, n_maps; of the maps' times 10 % elapsed_low_s, median elapsed_s and 90 %
-        elapsed_high_s.
+        aligner; COLUMN_low, COLUMN (the median) and COLUMN_high of the group; n_runs if rows have a
+        run_id, n_maps; elapsed_low_s (10 %), elapsed_s (median) and elapsed_high_s (90 %).
     """
     timed = timings.dropna(subset="elapsed_s")
     rank = timed.groupby("aligner")[column].rank(pct=True)

@@ -1,19 +1,18 @@
 """Confidence intervals (Wilson, bootstrap), and the test whether one of two is better.
 
-Rows of one run depend on each other, and an interval over rows would be several times too narrow:
-the bootstrap resamples whole runs, and Wilson's interval is given as many trials as they are worth.
+Rows of one run depend on each other, so an interval over rows is several times too narrow. The
+bootstrap resamples whole runs, and Wilson's interval uses the effective number of trials.
 
-The unit is the run: what its maps, robot pairs and repetitions share they share with chance, and
-they would pass for more evidence than they are. Each run gives one change, and Student's t tests
-that their mean is 0; its interval is the one that the test inverts, so both say the same. All tests
-that are made together are corrected by Holm's rule.
+The unit is the run: maps, robot pairs and repetitions of one run depend on each other. Each run
+gives one change. Student's t test checks that the mean change is 0, and its interval inverts the
+same test. All tests that are made together are corrected by Holm's method.
 
-Why t: sign and signed-rank tests take no form for granted, but with n runs their p is at least
-2 / 2^n, which after the correction for the dozens of tests of a comparison asks for twelve runs and
-more. The t test asks that the mean of the runs' changes be about normal; changes are differences of
-shares or medians of log ratios over many maps, which are nearly so themselves. Two runs are the
-least; with fewer than FEW_RUNS that cannot be seen from the data and a verdict is weak. Of a single
-run the maps stand in for runs: what they tell is a hint about this run, nothing about other seeds.
+Sign and signed-rank tests assume no distribution. But with n runs their p is at least 2 / 2^n, and
+after the correction for dozens of tests they need twelve runs or more. The t test assumes that the
+mean of the runs' changes is about normal. Changes are differences of shares or medians of log
+ratios over many maps, which are nearly normal. The test needs two runs; with fewer than FEW_RUNS
+the assumption cannot be checked and the result is weak. For a single run, maps take the place of
+runs: the result says nothing about other seeds.
 """
 
 import warnings
@@ -29,19 +28,22 @@ from experiments.evaluation.alignment_summary import MAP_KEYS
 from mapfusion.geometry.numerics import Float
 
 CONFIDENCE = 0.95
-# An interval's end at 2.5 % then rests on 50 draws (Efron & Tibshirani 1993, ch. 14.3).
+# 50 draws lie outside each end of a 95 % interval (Efron & Tibshirani 1993, ch. 14.3).
 RESAMPLES = 2000
 RUN, MAPS_OF_ONE_RUN = "run", "maps of one run"
 
 Statistic = Callable[[Float], Float]
-_MAX_CELLS = 1_000_000  # resamples times rows that are worked on at once: some 8 MB an array
+_MAX_CELLS = 1_000_000  # resamples times rows in one array: 8 MB
 
 
 class Clusters(NamedTuple):
-    """Which rows are resampled together: codes (N,) of rows' clusters, and how many there are.
+    """Clusters of rows that are resampled together.
 
-    The unit is a run, or, where there is one only, its maps: what an interval says then is nothing
-    about other seeds.
+    Attributes:
+        codes: (N,) index of each row's cluster.
+        n: number of clusters.
+        unit: kind of cluster, a run; for a single run its maps, and then an interval says nothing
+            about other seeds.
     """
 
     codes: np.ndarray
@@ -50,19 +52,19 @@ class Clusters(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """A number and how sure it is; the ends are NaN where they cannot be known."""
+    """Value with a confidence interval; the ends are NaN if they are unknown."""
 
     value: float
     low: float
     high: float
 
     def columns(self, name: str) -> dict[str, float]:
-        """As columns NAME, NAME_low and NAME_high of a table."""
+        """Return the columns NAME, NAME_low and NAME_high of a table."""
         return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
 
 
 def clusters_of(frame: pd.DataFrame) -> Clusters:
-    """Rows by run; of a single run, by robot pair and iteration where the table has these."""
+    """Cluster rows by run; rows of a single run by robot pair and iteration, if there are any."""
     codes, runs = pd.factorize(frame["run_id"])
     if len(runs) != 1 or not set(MAP_KEYS) <= set(frame.columns):
         return Clusters(codes, len(runs), RUN)
@@ -71,9 +73,9 @@ def clusters_of(frame: pd.DataFrame) -> Clusters:
 
 
 class WeightedMedian:
-    """The median of rows whose clusters are counted so many times each.
+    """Median of rows whose clusters are counted several times each.
 
-    Infinite values are welcome: a method without an answer is as far off as can be.
+    Values may be infinite: a method without an answer has an infinite error.
     """
 
     def __init__(self, values: Float, codes: np.ndarray) -> None:
@@ -82,7 +84,7 @@ class WeightedMedian:
         self._values, self._codes = values[order], codes[order]
 
     def __call__(self, counts: Float) -> Float:
-        """The medians (B,) for counts (B, n_clusters); NaN where no row counts."""
+        """Return medians (B,) for counts (B, n_clusters); NaN where no row is counted."""
         if not len(self._values):
             return np.full(len(counts), np.nan)
         n_parts = max(1, min(len(counts), len(counts) * len(self._values) // _MAX_CELLS))
@@ -102,11 +104,16 @@ class WeightedMedian:
 def percentile_interval(
     statistic: Statistic, n_clusters: int, rng: np.random.Generator, resamples: int = RESAMPLES
 ) -> Interval:
-    """Percentile interval of numbers (B,) of counts (B, n_clusters), how often each is in a sample.
+    """Return the bootstrap percentile interval of a statistic.
 
-    For medians and their ratios: BCa's correction takes its acceleration from the jackknife, which
-    is not consistent for medians (Efron & Tibshirani 1993, ch. 10.6). With one cluster there is
-    nothing to resample, and the ends are NaN.
+    The method suits medians and their ratios. The BCa interval does not: its acceleration comes
+    from the jackknife, which is not consistent for medians (Efron & Tibshirani 1993, ch. 10.6).
+
+    Args:
+        statistic: maps counts (B, n_clusters) of clusters in B samples to values (B,).
+        n_clusters: number of clusters; the ends are NaN for a single one.
+        rng: generator of the resamples.
+        resamples: number of resamples.
     """
     value = float(statistic(np.ones((1, max(n_clusters, 1))))[0])
     if n_clusters < 2 or np.isnan(value):
@@ -115,20 +122,20 @@ def percentile_interval(
     drawn = statistic(counts.astype(np.float64))
     drawn = drawn[~np.isnan(drawn)]  # resamples in which no row had a value
     tail = (1 - CONFIDENCE) / 2
-    # a quantile that is one of the draws: no arithmetic with infinite ones
+    # a quantile that is one of the draws avoids arithmetic with infinite values
     low, high = np.quantile(drawn, [tail, 1 - tail], method="inverted_cdf")
     return Interval(value, float(low), float(high))
 
 
 def median_interval(values: Float, clusters: Clusters, rng: np.random.Generator) -> Interval:
-    """Median of rows (N,), whole clusters resampled."""
+    """Return the median of rows (N,) with its interval; whole clusters are resampled."""
     return percentile_interval(WeightedMedian(values, clusters.codes), clusters.n, rng)
 
 
 def weighted_mean_interval(
     values: Float, weights: Float, clusters: Clusters, rng: np.random.Generator
 ) -> Interval:
-    """Weighted mean of rows (N,), whole clusters resampled."""
+    """Return the weighted mean of rows (N,) with its interval; whole clusters are resampled."""
     sums = np.bincount(clusters.codes, values * weights, minlength=clusters.n)
     totals = np.bincount(clusters.codes, weights, minlength=clusters.n)
 
@@ -140,10 +147,10 @@ def weighted_mean_interval(
 
 
 def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[Float, Float]:
-    """Lower and upper 95 % ends of the score interval of a binomial proportion (Wilson 1927).
+    """Return both ends of the 95 % score interval of a binomial proportion (Wilson 1927).
 
-    Unlike the textbook interval it keeps its level for few trials and for rates near 0 and 1.
-    Counts need not be whole; where there are no trials, nothing is known: [0, 1].
+    Unlike the Wald interval it keeps its level for few trials and for rates near 0 and 1. Counts
+    need not be integers. Without trials the interval is [0, 1].
 
     Raises:
         ValueError: negative counts, or more successes than trials.
@@ -156,18 +163,18 @@ def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[Float, Float]:
     rate = np.minimum(np.divide(k, n, out=np.full(n.shape, 0.5), where=known), 1.0)
     centre = (n * rate + z2 / 2) / (n + z2)
     half = np.sqrt(z2 * (n * rate * (1 - rate) + z2 / 4)) / (n + z2)
-    # at rates of 0 and 1 centre and half cancel to within rounding
+    # at rates of 0 and 1 centre and half cancel up to rounding
     low = np.where(known & (rate > 0), np.maximum(centre - half, 0.0), 0.0)
     high = np.where(known & (rate < 1), np.minimum(centre + half, 1.0), 1.0)
     return low, high
 
 
 def effective_trials(rows_per_cluster: ArrayLike) -> float:
-    """How many independent trials rows in clusters are worth at the least (Kish 1965).
+    """Return the least effective number of independent trials of rows in clusters (Kish 1965).
 
-    Whatever the dependence inside a cluster, a rate p over rows has a variance of at most
-    p (1 - p) sum m_i^2 / (sum m_i)^2, reached when all rows of a cluster share one fate. So an
-    interval with n = (sum m_i)^2 / sum m_i^2 trials never claims too much.
+    For any dependence inside clusters of m_i rows, the variance of a rate p over rows is at most
+    p (1 - p) sum m_i^2 / (sum m_i)^2. It is reached if all rows of a cluster are equal. So an
+    interval with n = (sum m_i)^2 / sum m_i^2 trials is never too narrow.
     """
     rows = np.asarray(rows_per_cluster, dtype=np.float64)
     total = rows.sum()
@@ -175,15 +182,15 @@ def effective_trials(rows_per_cluster: ArrayLike) -> float:
 
 
 SIGNIFICANCE = 0.05
-# With five, signs all alike would not reach 5 % (2 / 2^5 = 6 %), with six they do.
+# Equal signs of five runs do not reach 5 % (2 / 2^5 = 6 %); those of six runs do.
 FEW_RUNS = 6
-# An error without an estimate is infinitely far off. In a mean it counts as a factor of a thousand,
-# a hall's length over an inch: no larger one says more.
+# An error without an estimate is infinite. In a mean it counts as a factor of a thousand, which is
+# the length of a hall over an inch.
 LARGEST_LOG_RATIO = float(np.log(1e3))
 
 
 class BetterTest(NamedTuple):
-    """A mean change, its 95 % interval, and the two-sided p of there being none."""
+    """Mean change, its 95 % interval, and the two-sided p value of no change."""
 
     change: float
     low: float
@@ -192,17 +199,17 @@ class BetterTest(NamedTuple):
 
 
 def log_ratio(over: Float, under: Float) -> Float:
-    """log(over / under); 0 where they are equal, also where both are 0 or infinite."""
+    """Return log(over / under); 0 where both are equal, including both 0 or both infinite."""
     with np.errstate(divide="ignore", invalid="ignore"):
         change: Float = np.log(over) - np.log(under)
     return np.where(over == under, 0.0, change)
 
 
 def change_of_each_run(changes: Float, run_id: Any, n_runs: int, mean: bool = False) -> Float:
-    """One change a run of changes (N,): the median over its maps (some are just lost), or the mean.
+    """Reduce changes of maps (N,) to one change per run: the median or the mean over its maps.
 
-    Medians are for log ratios, which may be infinite, means for differences of shares. Where only a
-    single run is compared, its maps stand in for runs.
+    Medians are for log ratios, which may be infinite; means are for differences of shares. Changes
+    of a single run are returned as they are.
     """
     if n_runs == 1:
         return changes
@@ -211,9 +218,9 @@ def change_of_each_run(changes: Float, run_id: Any, n_runs: int, mean: bool = Fa
 
 
 def mean_change(changes: Float) -> BetterTest:
-    """Student's t test that independent changes (n,), one a run, have a mean of 0.
+    """Test that independent changes (n,), one per run, have a mean of 0 (Student's t test).
 
-    With fewer than two the interval and p are NaN; where nothing changed at all p is.
+    With fewer than two changes the interval and p are NaN. If all changes are 0, p is NaN.
     """
     changes = np.clip(changes, -LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
     if not len(changes):
@@ -221,12 +228,12 @@ def mean_change(changes: Float) -> BetterTest:
     mean = float(np.mean(changes))
     if len(changes) < 2:
         return BetterTest(mean, np.nan, np.nan, np.nan)
-    if np.ptp(changes) == 0:  # t is infinite; what is left is that all signs agree
+    if np.ptp(changes) == 0:  # t is infinite: use the sign test
         p = float(2.0 ** (1 - len(changes))) if changes.any() else np.nan
         return BetterTest(mean, mean, mean, p)
-    with warnings.catch_warnings():  # changes alike but for rounding
+    with warnings.catch_warnings():  # changes that differ by rounding only
         warnings.simplefilter("ignore", RuntimeWarning)
-        from scipy.stats import ttest_1samp  # the dearest import there is: where it is asked for
+        from scipy.stats import ttest_1samp  # a slow import
 
         tested: Any = ttest_1samp(changes, 0.0)
     low, high = tested.confidence_interval(CONFIDENCE)
@@ -234,9 +241,9 @@ def mean_change(changes: Float) -> BetterTest:
 
 
 def holm(p_values: Float) -> Float:
-    """Adjusted p values (Holm 1979): the chance of any false finding among all stays below p.
+    """Return adjusted p values (Holm 1979), which control the family-wise error rate.
 
-    NaN are no tests: they stay, and do not count.
+    NaN values are not tests: they stay NaN and are not counted.
     """
     adjusted = np.full(len(p_values), np.nan)
     tests = np.flatnonzero(~np.isnan(p_values))

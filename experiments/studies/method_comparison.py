@@ -1,6 +1,6 @@
 """Comparison of aligners: success rates, paired comparison, and a recommendation.
 
-Rows of one run depend on each other: its maps grow from one another, its pairs share robots, the
+Rows of one run depend on each other: maps grow from earlier maps, pairs share robots, and
 repetitions share maps. So the trials of Wilson's interval are runs (`effective_trials`).
 """
 
@@ -41,8 +41,8 @@ from mapfusion.align.alignment import Status
 from mapfusion.geometry.numerics import Float
 
 LAST = "last"
-# Counts roughly double or treble from bin to bin; shares lie dense where methods begin to fail.
-# Below 3 true pairs not even the oracle has an answer worth the name.
+# Counts roughly double or triple from bin to bin; bins of shares are narrow where methods begin to
+# fail. With fewer than 3 true pairs even the oracle has no useful answer.
 _COUNT_EDGES = (0, 3, 10, 30, 100, 300, 1000, np.inf)
 EDGES: dict[str, tuple[float, ...]] = {
     "n_common": _COUNT_EDGES,
@@ -60,24 +60,24 @@ _WITH_TEST = (*_WITHOUT_TEST, "accepted", "false_accepted", "refused_apart")
 def success_rates(
     maps: pd.DataFrame, by: str, edges: Sequence[float] | None = None
 ) -> pd.DataFrame:
-    """Success rates of each method over rows of `maps_of`, binned.
+    """Return binned success rates of each method over rows of `maps_of`.
 
     Args:
-        maps: for overlap_share, only rows that `with_overlap_share` went over.
+        maps: rows of `maps_of`; for overlap_share, rows that `with_overlap_share` returned.
         by: iteration, n_common (landmarks that truly correspond), overlap_share (n_common over
             the smaller map's landmarks), n_true (true pairs among the correspondences),
-            outlier_share (1 - n_true / n_correspondences) or last (the last iteration of each
-            robot pair alone).
-        edges: of the bins, rising; each holds its lower edge, the last one both.
+            outlier_share (1 - n_true / n_correspondences) or last (only the last iteration of each
+            robot pair).
+        edges: increasing edges of the bins; a bin includes its lower edge, the last bin both.
 
     Returns:
-        One row per bin and method: from, to, aligner, n_runs, n_maps, n_apart (those without common
-        ground), unit, and shares with their 95 % interval (_low, _high): of the maps with
-        common ground estimated_success, refined_success and accepted; of all false_accepted; of
-        those without common ground refused_apart. Without a test of acceptance the first two.
+        One row per bin and method: from, to, aligner, n_runs, n_maps, n_apart (maps without common
+        ground), unit, and shares with their 95 % interval (_low, _high): estimated_success,
+        refined_success and accepted among maps with common ground; false_accepted among all maps;
+        refused_apart among maps without common ground. Only the first two without a verdict.
 
     Raises:
-        ValueError: an unknown `by`, or edges that do not rise.
+        ValueError: `by` is unknown, or edges do not increase.
     """
     if by not in BY:
         raise ValueError(f"by: is {by}, expected one of {', '.join(BY)}")
@@ -85,9 +85,13 @@ def success_rates(
         raise ValueError(f"by: these rows have no {by}")
     used = at_the_end(maps) if by == LAST else maps
     clusters = clusters_of(used)
-    # of LAST a single bin holds all
+    # for LAST a single bin holds all rows
     values = used["n_common" if by == LAST else by].to_numpy(dtype=np.float64)
-    chosen = np.asarray(_edges(by, values) if edges is None else edges, dtype=np.float64)
+    if edges is None and by == "iteration":
+        iterations = np.unique(values)
+        groups = np.array_split(iterations, min(_ITERATION_BINS, len(iterations)))
+        edges = [*(group[0] for group in groups), values.max() + 1]
+    chosen = np.asarray(EDGES[by] if edges is None else edges, dtype=np.float64)
     if len(chosen) < 2 or np.any(np.diff(chosen) <= 0):
         raise ValueError("edges: must be two or more that rise")
     place = np.searchsorted(chosen, values, side="right") - 1
@@ -104,16 +108,8 @@ def success_rates(
     return rates.drop(columns=["from", "to"]) if by == LAST else rates
 
 
-def _edges(by: str, values: Float) -> Sequence[float]:
-    if by != "iteration":
-        return EDGES[by]
-    iterations = np.unique(values)
-    groups = np.array_split(iterations, min(_ITERATION_BINS, len(iterations)))
-    return [*(group[0] for group in groups), values.max() + 1]
-
-
 def _rates(rows: pd.DataFrame, codes: np.ndarray) -> dict[str, Any]:
-    """Shares of one bin and method, with their intervals."""
+    """Return the shares of one bin and method, with their intervals."""
     ground = has_common_ground(rows).to_numpy()
     found: dict[str, Any] = {"n_runs": rows["run_id"].nunique(), "n_maps": len(rows)}
     found |= {"n_apart": int(np.count_nonzero(~ground))}
@@ -132,15 +128,15 @@ STAGES = {"estimated": "translation_error_m", "refined": "refined_translation_er
 
 
 def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """Median translation error over the oracle's, for each method, as estimated and refined.
+    """Return each method's median translation error over the oracle's, estimated and refined.
 
-    On the rich ones of rows of `maps_of`: `error_over_oracle` with intervals. Medians run over
-    runs, robot pairs and iterations; whole runs are resampled, the same for method and oracle.
+    Only rich maps of the rows of `maps_of` count. Medians are over runs, robot pairs and
+    iterations. For intervals whole runs are resampled, the same for method and oracle.
 
     Returns:
-        One row a method: aligner, n_runs, n_maps, unit, and for estimated and refined the share of
-        answers with an estimate (_share; without one the error is infinite), the median error in
-        metres (_m), the ratio (_ratio) and its interval (_ratio_low, _ratio_high).
+        One row per method: aligner, n_runs, n_maps, unit, and for estimated and refined the share
+        of answers with an estimate (_share; without one the error is infinite), the median error
+        in metres (_m), the ratio (_ratio) and its interval (_ratio_low, _ratio_high).
     """
     maps = rich(maps)
     clusters = clusters_of(maps)
@@ -170,17 +166,16 @@ def _ratio(above: WeightedMedian, below: WeightedMedian, counts: Float) -> Float
 
 
 def compare_methods(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """Every two methods on the same rich maps: ratio of their errors, and who is nearer how often.
+    """Compare the estimated translation errors of every pair of methods on the same rich maps.
 
-    A method without an estimate on a map is infinitely far off there; where both have none it is a
-    draw. Compared are translation errors as estimated.
+    The error of a method without an estimate is infinite; if both have none it is a draw.
 
     Returns:
-        One row per pair of methods: first, second, n_runs, n_maps, unit; ratio, the median over the
-        maps of the first one's error over the second's, with its interval (whole runs resampled);
-        first_wins, the share of maps on which the first is nearer (draws count half), likewise;
-        p, of the runs' median log ratios (NaN for a single run), and p_holm, corrected for the
-        number of pairs.
+        One row per pair of methods: first, second, n_runs, n_maps, unit; ratio, the median over
+        maps of the first method's error over the second's, with its interval (whole runs are
+        resampled); first_wins, the share of maps on which the first has the smaller error (draws
+        count half), with its interval; p, of the runs' median log ratios (NaN for a single run);
+        and p_holm, corrected for the number of pairs.
     """
     frame = paired_values(rich(maps), "translation_error_m").reset_index()
     clusters = clusters_of(frame)
@@ -202,21 +197,21 @@ def compare_methods(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
 
 
 def paired_values(maps: pd.DataFrame, column: str) -> pd.DataFrame:
-    """A column of `maps_of`: one row per pair of maps, one column a method."""
+    """Return a column of `maps_of` as one row per pair of maps and one column per method."""
     return maps.pivot_table(index=MAP_PAIR, columns="aligner", values=column, dropna=False)
 
 
-# Aligners are equal if the test does not tell them apart and what was measured lies no farther
-# apart than this: what few runs cannot prove they do not disprove either. Shares: by one map, which
-# chance decides, or of many by one in twenty: the robots go on and meet there again, and a merge
-# that now and then comes later costs less than larger errors or more time everywhere.
+# Aligners are equal if the test finds no difference and their measured values differ by at most
+# this: few runs prove neither a difference nor equality. Shares: one map, which is chance, or one
+# in twenty of many maps. Robots go on and meet again, and a merge that is sometimes late costs less
+# than larger errors or more time everywhere.
 _EQUAL_SHARE = 0.05
 _ROUNDING = 1e-9  # in sums of repetitions' shares
-# Errors: by the median map, which a lost one does not move. Good estimates are a few decimetres
-# off: a tenth of that is less than the maps' own drift, and the refinement evens it out.
+# Errors: by the median map, which is robust against failures. Errors of good estimates are a few
+# decimetres: a tenth of that is less than the maps' own drift, and the refinement removes it.
 _EQUAL_LOG_RATIO = math.log(1.1)
 
-# The names that a `Standing` has for columns of `SHOWN`, and for the rates' of `success_rates`.
+# Names in `Standing` of columns of `SHOWN` and of `success_rates`.
 _ERRORS = dict(
     zip(ERROR_COLUMNS, ("estimated_m", "estimated_rad", "refined_m", "refined_rad"), strict=True)
 )
@@ -225,13 +220,19 @@ _RATES = {"refined_success": "rate", "refined_success_low": "low", "refined_succ
 
 @dataclass(frozen=True)
 class Standing:
-    """One aligner's record.
+    """Results of one aligner.
 
-    On `n_maps` pairs of maps with common ground it was right, refined, at the `rate`, with its 95 %
-    Wilson interval (trials are runs, or the maps of one run). Errors are medians over answerable
-    maps, infinite where more than half have no estimate; over the oracle's refined ones on rich
-    maps. On all maps `n_accepted` estimates were accepted, `n_false` of them wrongly. `shown` are
-    the further columns of `SHOWN`.
+    Attributes:
+        aligner: its name.
+        n_maps: number of pairs of maps with common ground.
+        rate: share of these on which the refined result is right; `low` and `high` are the ends of
+            its 95 % Wilson interval (trials are runs, or the maps of one run).
+        estimated_m: median error over answerable maps; it and the next three are infinite where
+            more than half of the maps have no estimate.
+        over_oracle: refined errors over those of the oracle, on rich maps.
+        n_accepted: number of accepted estimates on all maps; `n_false` of them are wrong.
+        time_ms: median time of one alignment.
+        shown: further columns of `SHOWN`.
     """
 
     aligner: str
@@ -252,12 +253,17 @@ class Standing:
 
 @dataclass(frozen=True)
 class Recommendation:
-    """Which aligner to use.
+    """Recommended aligner.
 
-    `best` is None where no aligner was ever right; these data cannot tell the `equals` from it.
-    `standings` are all aligners but the oracle, the best first. Of `n_maps` pairs of maps
-    `n_common` have common ground. Runs of different worlds are the only things here that are
-    independent of each other; runs of one scenario and seed share their world.
+    Attributes:
+        best: the recommended aligner; None if no aligner was ever right.
+        equals: aligners that these data cannot tell from it.
+        standings: all aligners except the oracle, the best first.
+        n_maps: number of pairs of maps, `n_common` of them with common ground.
+        n_runs: number of runs.
+        n_worlds: number of scenarios and seeds; only runs of different worlds are independent.
+        n_scenarios: number of scenarios.
+        oracle_m: median refined error of the oracle; `oracle_rad` its rotation.
     """
 
     best: Standing | None
@@ -275,9 +281,9 @@ class Recommendation:
 def aligner_summary(
     errors: pd.DataFrame, timings: pd.DataFrame, aligners: Sequence[str]
 ) -> pd.DataFrame:
-    """The shown columns of the table `errors`, reduced as `tables.Shown` says, for each aligner.
+    """Return one row per aligner: columns of the table `errors`, reduced as `tables.Shown` says.
 
-    With spread_m, the 10-90 % range of the repetitions, and time_ms, where there are timings.
+    Further columns are spread_m, the 10-90 % range of the repetitions, and time_ms.
     """
     errors = errors[errors["status"] != Status.ABSENT]
     own = {name: answerable(errors[errors["aligner"] == name]) for name in aligners}
@@ -287,7 +293,7 @@ def aligner_summary(
 
 
 def _shown_columns(maps: pd.DataFrame) -> pd.DataFrame:
-    """By aligner, the columns of `SHOWN` from rows of `maps_of`; NaN where these have none."""
+    """Return the columns of `SHOWN` by aligner from rows of `maps_of`; NaN where they have none."""
     names = {
         kind: [name for name, how in SHOWN.items() if how.kind == kind and name in maps]
         for kind in ("error", "given", "share")
@@ -299,18 +305,23 @@ def _shown_columns(maps: pd.DataFrame) -> pd.DataFrame:
 
 
 def _median_times_ms(timings: pd.DataFrame) -> pd.Series:
-    """Median time of one alignment, by aligner."""
+    """Return the median time of one alignment by aligner."""
     if timings.empty:
         return pd.Series(dtype=np.float64)
     return 1e3 * timings.groupby("aligner")["elapsed_s"].median()
 
 
 def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> Recommendation:
-    """Rank the aligners, given in display order, by rows of `maps_of` and of `aligner_timings`.
+    """Rank aligners by rows of `maps_of` and of `aligner_timings`.
 
-    First by the share of right results; among those equal to the first, by the error as estimated,
-    pair of maps by pair of maps; among those still equal, by time, where there are timings.
-    `better` tells what the test takes for a unit; of a single run the ranking is a hint.
+    The first criterion is the share of right results. Aligners equal to the first are ranked by the
+    estimated error on the same pairs of maps, and those that are still equal by time. See `better`
+    for the unit of the test; the ranking of a single run is a hint only.
+
+    Args:
+        maps: rows of `maps_of`.
+        timings: rows of `aligner_timings`, which may be empty.
+        aligners: names in display order.
     """
     ground = maps[has_common_ground(maps)]
     standings = _standings(maps, timings, [name for name in aligners if name != ORACLE])
@@ -354,7 +365,7 @@ def _standings(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -
 def _ranked(
     standings: list[Standing], ground: pd.DataFrame
 ) -> tuple[list[Standing], tuple[str, ...]]:
-    """All standings, the best first, and who is equal to the best."""
+    """Return all standings, the best first, and the names of those equal to the best."""
     by_rate = sorted(
         standings, key=lambda s: (-_or_last(s.rate, 0.0), _or_last(s.estimated_m), s.time_ms)
     )
@@ -370,12 +381,12 @@ def _ranked(
 
 
 def _or_last(value: float, missing: float = math.inf) -> float:
-    """A sorting key for what may not have been measured."""
+    """Return a sorting key that is `missing` for NaN."""
     return missing if math.isnan(value) else value
 
 
 def _equal_to_first(standings: list[Standing], maps: pd.DataFrame, column: str) -> list[Standing]:
-    """The first, and those that neither the test nor the band tells from it in this column."""
+    """Return the first and those that neither test nor tolerance tells from it in a column."""
     values, is_share = paired_values(maps, column), column == "refined_success"
     p_values, near = [], []
     for standing in standings[1:]:

@@ -1,7 +1,7 @@
 """Tables of many runs as one: result folders of `run` and of `sweep`.
 
-Files are read some at a time and only in the columns asked for, so that whoever reduces each batch
-before going on holds that much in memory, however many runs there are.
+Files are read in batches and only in the requested columns. If each batch is reduced before the
+next one is read, memory does not grow with the number of runs.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -22,15 +22,19 @@ from mapfusion.errors import InputError
 from mapfusion.files import read_json, require_version, row_groups, text_attributes
 
 _VERSION = b"mapfusion.schema_version"
-_TOLD = ("status", "reason")  # of each run of a sweep
-# Reducing costs a call what 10 000 rows cost; so many rows of `errors` are some 15 MB.
+_STATUS = ("status", "reason")  # columns of `runs` of a sweep
+# One call to reduce a batch takes as long as 10 000 rows; a batch of `errors` is about 15 MB.
 BATCH_ROWS = 100_000
 
 
 class RunPath(NamedTuple):
-    """A result folder or a table of runs; a run's columns where the rows lack them.
+    """Result folder, or file of a table.
 
-    Of a sweep that goes on, rows of all but the `finished` runs are not complete, and left out.
+    Attributes:
+        path: folder or file.
+        run: columns that describe the run, for files that lack them.
+        finished: ids of the finished runs of a sweep; rows of other runs are incomplete and left
+            out. None if the sweep does not tell.
     """
 
     path: Path
@@ -40,42 +44,42 @@ class RunPath(NamedTuple):
 
 @dataclass(frozen=True)
 class Runs:
-    """The runs of some result and sweep folders."""
+    """Runs of result folders and sweep folders."""
 
     results: tuple[RunPath, ...]
     sweeps: tuple[Path, ...]
 
     def files(self, table: str) -> list[RunPath]:
-        """The files of one table in a fixed order; none where no run has it."""
+        """Return the files of one table in a fixed order."""
         paths = [RunPath(tables.table_path(path, table), run) for path, run, _ in self.results]
         found = [file for file in paths if file.path.is_file()]
         for sweep in self.sweeps:
-            finished = self._finished(sweep)
+            told = self._told[self._told["sweep"] == str(sweep)]
+            finished = None  # an earlier version did not write `runs`
+            if len(told):
+                finished = frozenset(told.loc[told["status"] == "finished", "run_id"])
             if finished is None or finished:
                 found += [RunPath(path, {}, finished) for path in _whole_files(sweep / table)]
         return found
 
-    def _finished(self, sweep: Path) -> frozenset[str] | None:
-        """The runs of a sweep that are in all its tables; None where nothing says so."""
-        told = self._told[self._told["sweep"] == str(sweep)]
-        is_finished = told["status"] == "finished"
-        return None if told.empty else frozenset(told.loc[is_finished, "run_id"])
-
     def has(self, table: str) -> bool:
-        """Whether any run has this table."""
+        """Return True if any run has this table."""
         return bool(self.files(table))
 
     def batches(
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
     ) -> Iterator[pd.DataFrame]:
-        """Rows of a few whole runs at a time, about `BATCH_ROWS`; see `read`."""
+        """Yield rows of whole runs, about `BATCH_ROWS` at a time; see `read`."""
         if not self.has(table):
             where = ", ".join(map(str, [*(result.path for result in self.results), *self.sweeps]))
             what = f"no table {table} (expected the results of `run` or `sweep`)"
             raise InputError(f"{where}: {what}")
         seen: dict[str, RunPath] = {}
         batch: list[pd.DataFrame] = []
-        for file, rows in self._pieces(table, columns, optional):
+        pieces = (
+            (f, rows) for f in self.files(table) for rows in _read(f, table, columns, optional)
+        )
+        for file, rows in pieces:
             for run_id in rows["run_id"].unique():
                 if seen.setdefault(run_id, file) is not file:
                     also = f"run {run_id} is also in {seen[run_id].path}"
@@ -87,36 +91,29 @@ class Runs:
         if batch:
             yield pd.concat(batch, ignore_index=True)
 
-    def _pieces(
-        self, table: str, columns: Sequence[str] | None, optional: Sequence[str]
-    ) -> Iterator[tuple[RunPath, pd.DataFrame]]:
-        for file in self.files(table):
-            for rows in _read(file, table, columns, optional):
-                yield file, rows
-
     def read(
         self, table: str, columns: Sequence[str] | None = None, optional: Sequence[str] = ()
     ) -> pd.DataFrame:
-        """One table of all runs.
+        """Return one table of all runs.
 
         Args:
-            table: its name (see experiments.evaluation.tables).
-            columns: of the table; all by default.
-            optional: further columns, NaN for runs made before these were introduced.
+            table: name of the table (see experiments.evaluation.tables).
+            columns: columns of the table; all by default.
+            optional: further columns, NaN for runs of versions that did not have them.
 
         Returns:
-            Columns run_id, scenario, seed, then what a sweep varied (one text column a setting),
+            Columns run_id, scenario, seed, then one text column per setting that a sweep varied,
             then those of the table.
 
         Raises:
-            InputError: no such table, a damaged file, one made by a newer program, a missing
-                column, or a run given twice.
+            InputError: no run has the table, a file is damaged or was written by a newer version,
+                a column is missing, or a run was given twice.
         """
         return pd.concat(list(self.batches(table, columns, optional)), ignore_index=True)
 
     @cached_property
     def described(self) -> pd.DataFrame:
-        """All runs that have errors or paths: run_id, scenario, seed, and what a sweep varied."""
+        """Runs with errors or paths: run_id, scenario, seed, and the settings of a sweep."""
         tables_there = filter(self.has, ("errors", "robots"))
         every = (rows for table in tables_there for rows in self.batches(table, ["iteration"]))
         parts = [rows.drop(columns="iteration").drop_duplicates("run_id") for rows in every]
@@ -125,25 +122,25 @@ class Runs:
 
     @cached_property
     def _told(self) -> pd.DataFrame:
-        """The tables `runs` of all sweeps that have one, with the sweep's folder."""
+        """Tables `runs` of all sweeps, with the sweep's folder."""
         parts = [
             rows.assign(sweep=str(sweep))
             for sweep in self.sweeps
             for path in _whole_files(sweep / "runs")
-            for rows in _read(RunPath(path, {}), "runs", _TOLD, ())
+            for rows in _read(RunPath(path, {}), "runs", _STATUS, ())
         ]
-        none = pd.DataFrame(columns=["sweep", *RUN_KEYS, *_TOLD])
+        none = pd.DataFrame(columns=["sweep", *RUN_KEYS, *_STATUS])
         return pd.concat(parts, ignore_index=True) if parts else none
 
     @property
     def failed(self) -> pd.DataFrame:
-        """Runs of sweeps that failed: run_id, scenario, seed, reason."""
+        """Failed runs of sweeps: run_id, scenario, seed, reason."""
         is_failed = self._told["status"] == "failed"
         return self._told.loc[is_failed, [*RUN_KEYS, "reason"]].reset_index(drop=True)
 
 
 def find_runs(paths: Path | Sequence[Path]) -> Runs:
-    """What result and sweep folders lie at these paths.
+    """Return the runs of result folders and sweep folders.
 
     Raises:
         InputError: a path is neither, or its description is damaged.
@@ -156,7 +153,10 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
             sweeps.append(path)
         elif (path / "scenario.json").is_file():
             require_tables(path)
-            results.append(RunPath(path, _run_of(path / "scenario.json")))
+            found = read_scenario(path / "scenario.json")  # the folder may have been renamed
+            name, seed = found["name"], int(found["seed"])
+            run = {"run_id": f"{name}-{seed}", "scenario": name, "seed": seed}
+            results.append(RunPath(path, run))
         else:
             what = "no such folder" if not path.is_dir() else "no scenario.json and no sweep.json"
             expected = "a result folder of `run` or a folder of `sweep`"
@@ -165,7 +165,7 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
 
 
 def match_names(frame: pd.DataFrame, apart_from: Collection[str] = ()) -> pd.Series:
-    """What a run is matched by: scenario, seed, settings but for those named."""
+    """Return the names that runs are matched by: scenario, seed and settings, except some."""
     names = frame["scenario"].astype(str) + " seed " + frame["seed"].astype(str)
     for column in sorted(set(setting_columns(frame)).difference(apart_from)):
         names = names + " " + column + "=" + frame[column].astype(str)
@@ -173,21 +173,14 @@ def match_names(frame: pd.DataFrame, apart_from: Collection[str] = ()) -> pd.Ser
 
 
 def _whole_files(folder: Path) -> list[Path]:
-    """The tables in a folder; names with a dot in front are files still being written."""
+    """Return the tables in a folder; a name that begins with a dot is an unfinished file."""
     return sorted(folder.glob("[!.]*.parquet"))
-
-
-def _run_of(path: Path) -> dict[str, Any]:
-    """The run's columns, by its scenario: the folder may have been renamed since."""
-    found = read_scenario(path)
-    name, seed = found["name"], int(found["seed"])
-    return {"run_id": f"{name}-{seed}", "scenario": name, "seed": seed}
 
 
 def _read(
     file: RunPath, table: str, columns: Sequence[str] | None, optional: Sequence[str]
 ) -> Iterator[pd.DataFrame]:
-    """Rows of whole runs, as many at a time as were written together."""
+    """Yield rows of whole runs, one row group at a time."""
 
     def wanted(found: pa.Schema) -> Sequence[str]:
         _require_readable(file.path, table, text_attributes(file.path, found.empty_table()))
@@ -197,7 +190,7 @@ def _read(
             raise InputError(f"{file.path}: has no column {', '.join(missing)} (a table {table})")
         if columns is None:
             return found.names
-        own = set(tables.ALL[table].names) if table in tables.ALL else set(_TOLD)
+        own = set(tables.ALL[table].names) if table in tables.ALL else set(_STATUS)
         leading = [] if file.run else takewhile(lambda name: name not in own, found.names)
         there = (name for name in optional if name in found.names)
         return list(dict.fromkeys([*leading, *columns, *there]))
@@ -213,11 +206,11 @@ def _read(
 
 
 def _require_readable(path: Path, table: str, attributes: Mapping[str, str]) -> None:
-    """The right table, and none of a newer program; older ones may lack columns, no more."""
+    """Raise InputError for another table, or one of a newer version."""
     kind = attributes.get("kind", table)
     if kind.rpartition(".")[2] != table:
         raise InputError(f"{path}: kind is {kind}, expected {table}")
-    if kind != f"result.{table}":  # a sweep has a version of its own
+    if kind != f"result.{table}":  # a sweep has its own version
         return
     known = int(tables.ALL[table].metadata[_VERSION])
     version = attributes.get("schema_version", "0")

@@ -45,11 +45,11 @@ _PATH_KEYS = ["source", "quantity", "delta", "delta_unit"]
 
 
 def path_summary(path_statistics: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """One row per source (final, online, odometry) and quantity (ATE, RPE).
+    """Summarise path errors by source (final, online, odometry) and quantity (ATE, RPE).
 
     Returns:
         source, quantity, delta, delta_unit, n_runs, n_paths, the seven statistics that evo reports
-        (medians over the paths), and the interval of the median rmse, whole runs resampled.
+        (medians over paths), and the interval of the median rmse (whole runs are resampled).
     """
     rows = []
     for keys, own in path_statistics.groupby(_PATH_KEYS, sort=False, dropna=False):
@@ -62,14 +62,14 @@ def path_summary(path_statistics: pd.DataFrame, rng: np.random.Generator) -> pd.
 
 
 def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """Mean NEES per degree of freedom, before merging and after.
+    """Return the mean NEES per degree of freedom, before and after merging.
 
     Returns:
         One row per kind of landmark (see `judge.tables`): landmarks, n_runs, n_landmarks,
-        nees_per_dof with its interval over the runs, band_low and band_high (where the mean of so
-        many independent landmarks would lie 95 times of 100), share_in_gate (0.95 if consistent)
-        with its interval. Landmarks of one map drift together, so a mean outside the band alone is
-        no proof for a single map; the interval over runs is the one to trust.
+        nees_per_dof with its interval over runs, band_low and band_high (95 % band of the mean of
+        n_landmarks independent landmarks), share_in_gate (0.95 if consistent) with its interval.
+        Landmarks of one map drift together, so a mean outside the band does not prove that a
+        single map is inconsistent. The interval over runs is valid.
     """
     rows = []
     known = landmark_nees[landmark_nees["n_landmarks"] > 0]
@@ -88,9 +88,9 @@ def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.Da
 
 
 def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """The same of landmarks fused pair by pair (table `fusion`), with s_drift and without.
+    """Return the same for landmarks fused in pairs (table `fusion`), with and without s_drift.
 
-    True pairs only; the share in the gate is not kept there, and left NaN.
+    Only true pairs count. That table has no share in the gate, so it is NaN.
     """
     labels = {name: f"fused in pairs, {name[5:].replace('_', ' ')}" for name in FUSION_COLUMNS[:2]}
     true = fusion[fusion["true_pair"]].rename(columns=labels)
@@ -100,20 +100,20 @@ def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
 
 
 def smoother_summary(smoother: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """One row: the batch smoother beside the filter (table `smoother`), medians over the robots.
+    """Summarise the batch smoother beside the filter (table `smoother`): medians over robots.
 
     Returns:
-        n_runs, n_robots, and each column of numbers with the interval of its median over the runs.
+        One row: n_runs, n_robots, and each numeric column with the interval of its median.
     """
     about = {"n_runs": intervals.clusters_of(smoother).n, "n_robots": len(smoother)}
     return pd.DataFrame([about | _medians(smoother, SMOOTHER_COLUMNS, rng)])
 
 
 def fuser_summary(fusers: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """One row per fuser (table `fusers`): medians over the runs, each at its last iteration.
+    """Summarise fusers (table `fusers`): medians over runs, each at its last iteration.
 
     Returns:
-        fuser, n_runs, and each column of numbers with the interval of its median over the runs.
+        One row per fuser: fuser, n_runs, and each numeric column with the interval of its median.
     """
     rows = []
     for fuser, own in last_fused(fusers).groupby("fuser", sort=False):
@@ -125,10 +125,10 @@ def fuser_summary(fusers: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
 def _medians(
     rows: pd.DataFrame, names: Sequence[str], rng: np.random.Generator
 ) -> dict[str, float]:
+    """Return the median of each column with its interval over runs."""
     runs, found = intervals.clusters_of(rows), dict[str, float]()
     for name in names:
-        values = intervals.median_interval(rows[name].to_numpy(), runs, rng)
-        found |= dict(zip((name, f"{name}_low", f"{name}_high"), values, strict=True))
+        found |= intervals.median_interval(rows[name].to_numpy(), runs, rng).columns(name)
     return found
 
 
@@ -141,12 +141,12 @@ _ERRORS = {
 
 
 def team_paths(team: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """One row per source (final, online, odometry), of each run's largest set of merged robots.
+    """Summarise the paths of each run's largest set of merged robots by source.
 
     Returns:
-        source, n_runs, n_robots of n_team (sums over the runs), evo's seven statistics of all
-        their positions under one rigid fit (medians over the runs), and the interval of the median
-        rmse.
+        source (final, online, odometry), n_runs, n_robots of n_team (sums over runs), evo's seven
+        statistics of all their positions under one rigid fit (medians over runs), and the interval
+        of the median rmse.
     """
     rows = []
     for source, own in team[team["component"] == 1].groupby("source", sort=False):
@@ -159,14 +159,15 @@ def team_paths(team: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
 
 
 def team_alignments(pairs: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """One row: what became of the alignments of all pairs of robots.
+    """Summarise the alignments of all pairs of robots.
 
     Returns:
-        n_runs, n_pairs, n_met (with common ground), n_believed; precision, the share of right ones
-        of the believed, and recall, the share of those that met whose alignment is right and
-        believed, with Wilson's intervals; medians over the pairs placed in one map of the errors of
-        T_a_b, aligned alone (alone_m, alone_rad) and placed by all (team_m, team_rad), with
-        intervals, whole runs resampled.
+        One row: n_runs, n_pairs, n_met (pairs with common ground), n_believed (pairs whose
+        alignment is used); precision, the share of right ones among the used, and recall, the
+        share of pairs with common ground whose alignment is right and used, with Wilson's
+        intervals; medians of the errors of T_a_b over pairs in one map, aligned alone (alone_m,
+        alone_rad) and by the whole team (team_m, team_rad), with intervals (whole runs are
+        resampled).
     """
     used, met = believed(pairs), has_common_ground(pairs)
     right = pd.Series(right_refined(pairs) & used)
@@ -183,7 +184,7 @@ def team_alignments(pairs: pd.DataFrame, rng: np.random.Generator) -> pd.DataFra
 
 
 def _share(name: str, rows: pd.DataFrame, holds: pd.Series) -> dict[str, float]:
-    """A share of rows with its interval; all rows of a run may share one fate."""
+    """Return the share of rows for which `holds` is True, with its interval."""
     if rows.empty:
         return intervals.Interval(np.nan, np.nan, np.nan).columns(name)
     n = intervals.effective_trials(rows.groupby("run_id").size())
@@ -202,7 +203,7 @@ _FILE_NAMES = {
     LAST: "success_at_the_end",
 }
 _TIMING_COLUMNS = (*MAP_KEYS, "aligner", "n_correspondences", "n_common", "elapsed_s")
-# Of tables that not every run has: what is read, under what name which statistics go, their seed.
+# Optional tables of runs: columns to read, name of the result, statistics, and name of their seed.
 _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "aligner_timings": (_TIMING_COLUMNS, "time_by_overlap", time_bands, ""),
     "path_statistics": (None, "paths", path_summary, "paths"),
@@ -221,13 +222,15 @@ _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
 
 
 class Summary(NamedTuple):
-    """Statistics over some runs.
+    """Statistics over runs.
 
     Attributes:
-        tables: by file name, each with scenario and settings in front; "(all)" is all scenarios.
+        n_runs: number of runs.
+        n_worlds: number of scenarios and seeds.
+        tables: tables by file name, with scenario and settings in front; "(all)" pools scenarios.
         run_medians: each run's medians over its repetitions, for figures 4 and 5.
-        timings: the rows of figure 6.
-        missing: tables that no run had.
+        timings: rows of figure 6.
+        missing: tables that no run has.
         failed: runs that failed, with their reason.
     """
 
@@ -241,13 +244,13 @@ class Summary(NamedTuple):
 
     @property
     def n_configurations(self) -> int:
-        """How many settings the sweeps tried (1 without sweeps)."""
+        """Number of settings that sweeps tried (1 without sweeps)."""
         settings = setting_columns(self.run_medians)
         return len(self.run_medians[settings].drop_duplicates()) if settings else 1
 
 
 def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
-    """Labels and rows by scenario and settings; also of all scenarios, if several."""
+    """Yield labels and rows by scenario and settings, and of all scenarios if there are several."""
     names = ["scenario", *setting_columns(frame)]
     pooled = frame.assign(scenario=ALL_SCENARIOS)
     for each in [frame, pooled] if len(frame["scenario"].unique()) > 1 else [frame]:
@@ -256,7 +259,7 @@ def configurations(frame: pd.DataFrame) -> Iterator[tuple[dict[str, Any], pd.Dat
 
 
 def summarise(runs: Runs) -> Summary:
-    """Everything there is to say about these runs; a table that none of them has is left out."""
+    """Return all statistics of runs; tables that no run has are left out."""
     reduced = reduced_errors(runs)
     maps, medians = reduced.maps, reduced.medians
     made = {name: _each(maps, partial(success_rates, by=by)) for by, name in _FILE_NAMES.items()}
@@ -277,9 +280,9 @@ def summarise(runs: Runs) -> Summary:
 
 
 class ReducedErrors(NamedTuple):
-    """The errors of some runs, read and reduced batch by batch to `maps_of` and `medians_of_run`.
+    """Errors of runs, reduced batch by batch to `maps_of` and `medians_of_run`.
 
-    The absent aligners are those whose package is not installed, which is no failure.
+    `absent` are aligners whose package is not installed, which is not a failure.
     """
 
     maps: pd.DataFrame
@@ -288,7 +291,7 @@ class ReducedErrors(NamedTuple):
 
 
 def reduced_errors(runs: Runs) -> ReducedErrors:
-    """All that statistics, figures and reports say of errors starts from these rows."""
+    """Read and reduce the errors of runs, for statistics, figures and reports."""
     maps, medians, every = [], [], []
     for whole in runs.batches("errors", NEEDED, ("status", *OPTIONAL)):
         every += whole["aligner"].unique().tolist()
@@ -296,7 +299,7 @@ def reduced_errors(runs: Runs) -> ReducedErrors:
         if len(errors):
             maps.append(maps_of(errors))
             medians.append(medians_of_run(errors))
-    if not maps:  # robots that were alone
+    if not maps:  # single robots
         nothing = pd.DataFrame(columns=["run_id", "scenario", "aligner"])
         return ReducedErrors(nothing, nothing, list(dict.fromkeys(every)))
     joined = with_overlap_share(pd.concat(maps, ignore_index=True), runs)
@@ -305,9 +308,9 @@ def reduced_errors(runs: Runs) -> ReducedErrors:
 
 
 def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
-    """Rows of `maps_of` with overlap_share: n_common over the landmarks of the smaller map.
+    """Add overlap_share to rows of `maps_of`: n_common over the landmarks of the smaller map.
 
-    NaN where the runs have no table `robots`. A robot whose log ended earlier keeps its last map.
+    It is NaN if the runs have no table `robots`. A robot whose log has ended keeps its last map.
     """
     if not runs.has("robots"):
         return maps.assign(overlap_share=np.nan)
@@ -320,7 +323,7 @@ def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
     places = (maps[["iteration", "run_id", robot]] for robot in ROBOT_PAIR)
     a, b = (sizes.reindex(pd.MultiIndex.from_frame(own)).to_numpy() for own in places)
     smaller = pd.Series(np.fmin(a, b), maps.index)
-    # a common landmark at least is in both; maps without any have nothing in common
+    # an empty map has nothing in common with another
     share = (maps["n_common"] / smaller.where(smaller > 0)).where(smaller != 0, 0.0)
     return maps.assign(overlap_share=share)
 
@@ -333,9 +336,9 @@ def _error_bands(rows: pd.DataFrame) -> pd.DataFrame:
 def _each(
     frame: pd.DataFrame, made_of: Callable[..., pd.DataFrame], seed: str = ""
 ) -> pd.DataFrame:
-    """A table of each configuration, one below the other, its labels in front.
+    """Concatenate the tables of all configurations, with their labels in front.
 
-    A statistic that draws, and so has a seed, gets a generator of its own for each.
+    A statistic with a seed gets its own random generator for each configuration.
     """
     parts = []
     for labels, rows in configurations(frame):

@@ -7,11 +7,11 @@ import tempfile
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Collection, Sized
+from collections.abc import Callable, Collection, Sequence, Sized
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pandas as pd
 import pyarrow as pa
@@ -27,36 +27,36 @@ from experiments.pipeline.tasks import OnProgress, Task
 from experiments.pipeline.workers import single_threaded
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_plan import PlannedRun, Sweep, planned
-from experiments.studies.sweep_tables import (
-    ALIGNER_TIMINGS,
-    JoinedTables,
-    open_dataset,
-    written_by_nobody_else,
-)
+from experiments.studies.sweep_tables import ALIGNER_TIMINGS, JoinedTables, written_by_nobody_else
 from mapfusion.errors import InputError
-from mapfusion.files import PART, remove_abandoned, temporary_prefix
+from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whole
 
-# Tasks at Dask for each worker. Enough that none waits while this process plans the next run; few
-# enough that memory does not grow with the number of runs.
+# Tasks that Dask holds for each worker. Enough that no worker waits while this process plans the
+# next run; few enough that memory does not grow with the number of runs.
 TASKS_PER_WORKER = 30
-MIN_WORKERS = 4  # counted, while a cluster is still starting
+MIN_WORKERS = 4  # assumed while a cluster is still starting
 _COUNT_WORKERS_EVERY_S = 10.0
-# A worker may be killed for no fault of its task (a machine that goes away); four times in a row
-# while at the same task it is the task.
+# A worker may be killed without a fault of its task, for example with its machine. A task whose
+# worker was killed four times is at fault.
 RETRIES = 3
 _ATTEMPTS = "attempts"
-# Rows that wait are joined, and so can be read, in a minute; or later, as that must not take more
-# than a twentieth of the time: each time a file is written anew.
-_JOIN_EVERY_S, _TIMES_AS_LONG = 60.0, 20.0
-_OLD_S = 24 * 3600  # in a sweep that runs, tasks begin and end in the meantime
+# Rows are written, and can be read, after a minute; or later, because to replace files shall not
+# take more than a twentieth of the time. Rows of this size are always written: memory is bounded.
+_WRITE_EVERY_S, _TIMES_AS_LONG, _MOST_WAITING_BYTES = 60.0, 20.0, 50_000_000
+_OLD_S = 24 * 3600  # a folder of attempts that has not changed for so long is not in use
 
 
 @dataclass
 class SweepProgress:
-    """How far a sweep is; the driver counts on in it.
+    """Progress of a sweep; the driver updates it.
 
-    Runs in all; those `done`, which need nothing more; of these the failed ones, with their reasons
-    by run id, and which of them are defects of ours. Tasks by label, of the runs looked at so far.
+    Attributes:
+        runs: number of all runs.
+        done: number of runs that have ended, finished or failed.
+        failed: reasons by run id.
+        defects: ids of the runs that failed because of a defect of this program.
+        tasks: number of tasks by label, of the runs that were planned so far.
+        tasks_done: number of these that have ended.
     """
 
     runs: int
@@ -71,7 +71,7 @@ OnSweepProgress = Callable[[SweepProgress], None]
 
 
 class SweepDriver:
-    """Runs everything that is not finished; a run that fails does not stop the others."""
+    """Driver of all runs that are not finished; a run that fails does not stop the others."""
 
     def __init__(
         self,
@@ -82,38 +82,40 @@ class SweepDriver:
         on_progress: OnSweepProgress,
         jobs: int | None = None,
     ) -> None:
-        """`jobs` are the workers on this machine; None if they are a cluster's."""
+        """Take the number of workers on this machine as `jobs`; None if a cluster has them."""
         self._client, self._sweep, self._tables = client, sweep, tables
         self._terms, self._jobs = terms, jobs
         self._on_progress = on_progress
-        # Of this sweep alone: another client's tasks of the same key might write elsewhere.
+        # Keys are unique to this sweep: another client's task of the same key may write elsewhere.
         self._suffix = uuid.uuid4().hex[:8]
         self._ended = as_completed(loop=client.loop)
         self._futures: dict[str, Future] = {}  # by name of the task
-        self._open: dict[PlannedRun, set[str]] = {}  # with the tasks at Dask that each waits for
-        self._failures: dict[str, cluster.TaskFailedError] = {}  # by task
+        self._open: dict[PlannedRun, set[str]] = {}  # the tasks at Dask that each run waits for
+        self._failures: dict[str, cluster.TaskFailedError] = {}  # by name of the task
         self._mended = Counter[Path]()  # damaged files of the store
-        self._again: set[PlannedRun] = set()  # to be planned anew, since a stage was damaged
+        self._again: set[PlannedRun] = set()  # runs to be planned again: a stage was damaged
         self._n_workers, self._counted_at = 0, -_COUNT_WORKERS_EVERY_S
         self._left_in = Counter(map(tables.number, sweep.runs))  # runs by the file they go into
-        self._join_at = time.monotonic() + _JOIN_EVERY_S
+        self._write_at = time.monotonic() + _WRITE_EVERY_S
         self.progress = SweepProgress(len(sweep.runs))
 
     def execute(self) -> None:
-        """Bring all runs to an end; how they ended is in `progress`.
+        """Finish all runs; `progress` says how they ended.
 
         Raises:
             InputError: workers cannot take part, or the scheduler was lost.
         """
         todo = iter(self._sweep.runs)
-        while True:
-            while self._has_room() and (run := next(todo, None)) is not None:
-                self._begin(run)
-            self._on_progress(self.progress)
-            if not self._open:
-                break
-            self._task_ended(next(self._ended))
-        self._tables.join()
+        try:
+            while True:
+                while self._has_room() and (run := next(todo, None)) is not None:
+                    self._begin(run)
+                self._on_progress(self.progress)
+                if not self._open:
+                    break
+                self._task_ended(next(self._ended))
+        finally:  # also after Ctrl-C
+            self._tables.write()
 
     def _has_room(self) -> bool:
         if time.monotonic() - self._counted_at > _COUNT_WORKERS_EVERY_S:
@@ -125,9 +127,7 @@ class SweepDriver:
         try:
             laid_out = planned(run, self._sweep.store, self._tables, self._jobs)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
-            reason = " ".join(str(error).split())
-            self.progress.failed[run.run_id] = reason
-            self._sweep.dataset.fail(run, reason)
+            self._failed(run, " ".join(str(error).split()))
             self._run_ended(run)
             return
         self._open[laid_out] = set()
@@ -136,7 +136,7 @@ class SweepDriver:
             if task.name in self._failures or blocked.intersection(task.needs):
                 blocked.add(task.name)
                 continue
-            if task.name not in self._futures:  # else it is there for another run already
+            if task.name not in self._futures:  # else another run has submitted it
                 self._submit(task)
             self._open[laid_out].add(task.name)
         self._end_if_over(laid_out)
@@ -149,10 +149,10 @@ class SweepDriver:
             pickle.dumps(task),
             self._terms,
             *(self._futures[need] for need in task.needs if need in self._futures),
-            # new at each attempt: what failed under a key, Dask does not compute again
+            # new at each attempt: Dask does not repeat a task that failed under the same key
             key=f"{task.label}-{self._suffix}{self.progress.tasks.total()}-{task.name}",
             pure=False,
-            # in order: a run is finished before others begin
+            # earlier tasks first: a run is finished before others begin
             priority=-self.progress.tasks.total(),
         )
         self._futures[task.name] = future
@@ -160,20 +160,36 @@ class SweepDriver:
 
     def _task_ended(self, future: Future) -> None:
         label, name = _label_and_name(future.key)
+        waiting = [each for each, waits_for in self._open.items() if name in waits_for]
+        own = [laid_out.run for laid_out in waiting if laid_out.last == name]
+        rows: Any = None
+        if own and future.status == "finished":
+            try:
+                rows = future.result()
+            except Exception:
+                if future.status == "finished":
+                    raise  # else the worker that held the rows was lost, and it was tried again
         if future.status != "finished":
             failure, store = self._failure(future, name), self._sweep.store
             if failure.damage and store.discard_damaged(failure.damage, self._mended):
                 self._again |= {each for each in self._open if failure.task in each.tasks}
             else:
                 self._failures[failure.task] = failure
+        elif own:
+            self._tables.add(own[0], rows)
+            self._details(own[0]).unlink(missing_ok=True)
         del self._futures[name]
         self.progress.tasks_done[label] += 1
-        for laid_out in [each for each, waits_for in self._open.items() if name in waits_for]:
+        for laid_out in waiting:
             self._open[laid_out].remove(name)
             self._end_if_over(laid_out)
 
     def _failure(self, future: Future, name: str) -> cluster.TaskFailedError:
-        """Which task failed and why: those that needed it fail like it."""
+        """Return the failure of a task or of the task that it needed.
+
+        Raises:
+            InputError: the scheduler was lost, or workers cannot take part.
+        """
         if future.status != "error":
             kept = "what was finished is kept, the same command goes on from there"
             raise InputError(f"the connection to the Dask scheduler was lost; {kept}")
@@ -200,29 +216,38 @@ class SweepDriver:
         # All tasks that could be done were done, so which comes first does not depend on chance.
         failures = (self._failures.get(task.name) for task in laid_out.left)
         if first := next(filter(None, failures), None):
-            run, reason = laid_out.run, first.reason
-            details = self._sweep.dataset.fail(run, reason, first.details, laid_out.stages)
-            if first.details:
-                reason += f"; its traceback: {details}"
-                self.progress.defects.add(run.run_id)
-            self.progress.failed[run.run_id] = reason
+            self._failed(laid_out.run, first.reason, first.details, laid_out.stages)
         self._run_ended(laid_out.run)
 
+    def _failed(
+        self, run: SweepRun, reason: str, traceback: str = "", stages: Sequence[str] = ()
+    ) -> None:
+        self._tables.add(run, self._sweep.dataset.failed(run, reason, stages))
+        path = self._details(run)
+        path.unlink(missing_ok=True)
+        if traceback:
+            text = traceback.encode("utf-8", "backslashreplace")  # an exception's text may be any
+            write_whole(path, lambda file: file.write_bytes(text))
+            reason += f"; its traceback: {path}"
+            self.progress.defects.add(run.run_id)
+        self.progress.failed[run.run_id] = reason
+
+    def _details(self, run: SweepRun) -> Path:
+        return self._sweep.dataset.folder / "failures" / f"{run.run_id}.txt"
+
     def _run_ended(self, run: SweepRun) -> None:
-        """Count it; its rows are joined with those of the last run that goes into their file."""
         self.progress.done += 1
         number, began = self._tables.number(run), time.monotonic()
         self._left_in[number] -= 1
-        if not self._left_in[number]:
-            self._tables.join(number)
-        elif began >= self._join_at:
-            self._tables.join()
+        is_due = began >= self._write_at or self._tables.waiting_bytes > _MOST_WAITING_BYTES
+        if is_due or not self._left_in[number]:  # all runs of a file are done
+            self._tables.write()
             took_s = time.monotonic() - began
-            self._join_at = began + max(_JOIN_EVERY_S, _TIMES_AS_LONG * took_s)
+            self._write_at = began + max(_WRITE_EVERY_S, _TIMES_AS_LONG * took_s)
 
 
 def _label_and_name(key: object) -> tuple[str, str]:
-    """Of the task that Dask knows under this key."""
+    """Return label and name of the task that Dask knows under this key."""
     label, _, name = str(key).split("-", 2)
     return label, name
 
@@ -230,18 +255,22 @@ def _label_and_name(key: object) -> tuple[str, str]:
 def execute(
     sweep: Sweep, jobs: int, scheduler: str | None, on_progress: OnSweepProgress
 ) -> SweepProgress:
-    """Run a sweep; returns how it ended.
+    """Run a sweep on `jobs` processes, or on the scheduler at an address.
+
+    Returns:
+        The final progress.
 
     Raises:
-        InputError: the output folder is of another sweep, or another command is at work in it; no
-            scheduler or no worker is of use.
+        InputError: the output folder holds another sweep, or another command writes into it; no
+            scheduler answers, or no worker can take part.
     """
     folder = sweep.dataset.folder
     with written_by_nobody_else(folder):
-        tables = open_dataset(sweep.dataset, sweep.runs)
-        for left_behind in folder.glob(f".{_ATTEMPTS}.*"):  # by a sweep killed on any machine
-            if time.time() - left_behind.stat().st_mtime > _OLD_S:  # else another may be running
-                shutil.rmtree(left_behind, ignore_errors=True)
+        tables = JoinedTables(sweep.dataset)
+        tables.ask_for(sweep.runs)
+        for abandoned in folder.glob(f".{_ATTEMPTS}.*"):  # by a sweep that was killed
+            if time.time() - abandoned.stat().st_mtime > _OLD_S:  # else it may still be in use
+                shutil.rmtree(abandoned, ignore_errors=True)
         named = PART, temporary_prefix(_ATTEMPTS)
         own = tempfile.TemporaryDirectory(*named, folder, ignore_cleanup_errors=True)
         with own as attempts, connected(jobs, scheduler) as client:
@@ -249,28 +278,30 @@ def execute(
             local = None if scheduler else jobs
             driver = SweepDriver(client, sweep, tables, terms, on_progress, local)
             driver.execute()
-        remove_abandoned(folder)  # by earlier sweeps, and by workers of this one, that were killed
+        remove_abandoned(folder)  # by processes that were killed
     return driver.progress
 
 
 def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress) -> None:
-    """Aligners' times, serial, for all runs without that did not fail: nothing else may run.
+    """Measure the aligners' times for all runs that did not fail and have none yet.
 
-    They are in the store run by run, and go into the table file by file.
+    Measurements are serial; nothing else may run on the machine. The store keeps the times of each
+    run; the table is written file by file.
     """
     single_threaded()
     label, done = "time the aligners", 0
     runs = [run for run in sweep.runs if run.run_id not in failed]
     with written_by_nobody_else(sweep.dataset.folder):
-        tables = open_dataset(sweep.dataset, runs)
-        for number, group in itertools.groupby(sorted(runs, key=tables.place), key=tables.number):
-            timed, rows = tables.runs_in(ALIGNER_TIMINGS, number), dict[int, pa.Table]()
+        tables = JoinedTables(sweep.dataset)
+        tables.ask_for(runs)
+        for number, group in itertools.groupby(sorted(runs, key=tables.number), tables.number):
+            timed, rows = tables.runs_in(ALIGNER_TIMINGS, number), dict[str, pa.Table]()
             for run in group:
                 on_progress(label, done, len(runs))
                 done += 1
                 if run.run_id not in timed:
                     measured = mending(sweep.store, partial(_measured, sweep, run))
-                    rows[tables.place(run)] = sweep.dataset.rows(ALIGNER_TIMINGS, run, measured)
+                    rows[run.run_id] = sweep.dataset.rows(ALIGNER_TIMINGS, run, measured)
             if rows:
                 tables.replace(ALIGNER_TIMINGS, number, rows)
     on_progress(label, len(runs), len(runs))
@@ -278,6 +309,6 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
 
 def _measured(sweep: Sweep, run: SweepRun) -> pd.DataFrame:
     judged = JudgedRun.of(run.load(), sweep.store)
-    judged.execute(1, lambda *_: None)  # what is there already, but for a damaged stage
+    judged.execute(1, lambda *_: None)  # makes damaged stages again; all others exist
     measure_aligners(judged)
     return judged.pair_table(ALIGNER_TIMINGS)

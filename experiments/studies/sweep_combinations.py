@@ -1,4 +1,4 @@
-"""Which runs a sweep is made of: scenarios x seeds x the values of each `--set`."""
+"""Runs of a sweep: scenarios x seeds x the values of each `--set`."""
 
 import hashlib
 import itertools
@@ -17,16 +17,21 @@ _HASH_LENGTH = 8  # hexadecimal digits of a run's values: 32 bits, and clashes a
 _EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
 _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
 
-# The values that each dotted key takes: YAML, in one spelling each (0.10 is 0.1).
+# Values of each dotted key, as YAML in one spelling (0.10 is 0.1).
 Axes = Mapping[str, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One run of a sweep: a scenario's file and name, a seed, and the value of each key.
+    """One run of a sweep.
 
-    `content` is what the file held when the sweep began, one object for all runs of a scenario: who
-    edits the file meanwhile does not change what runs.
+    Attributes:
+        path: file of the scenario.
+        scenario: its name.
+        seed: of the run.
+        settings: key and value of each `--set`.
+        content: content of the file when the sweep began, one object for all runs of a scenario.
+            So a later change of the file does not change the runs.
     """
 
     path: Path
@@ -37,20 +42,20 @@ class SweepRun:
 
     @property
     def run_id(self) -> str:
-        """Names the run's files: the same scenario, seed and values give the same name."""
+        """Name of the run; the same scenario, seed and values give the same name."""
         if not self.settings:
             return f"{self.scenario}-{self.seed}"
         digest = hashlib.sha256(json.dumps(sorted(self.settings)).encode()).hexdigest()
         return f"{self.scenario}-{self.seed}-{digest[:_HASH_LENGTH]}"
 
     def load(self) -> AnyScenario:
-        """The scenario of this run; raises InputError."""
+        """Return the scenario of this run; raises InputError."""
         overrides = [f"{key}={value}" for key, value in self.settings]
         return load_checked(self.path, overrides, self.seed, self.content)
 
 
 def parse_axes(entries: Sequence[str]) -> Axes:
-    """`--set KEY=VALUE,VALUE,...` entries; raises InputError that shows how it is written."""
+    """Parse `--set KEY=VALUE,VALUE,...`; raises InputError that shows the correct form."""
     axes: dict[str, tuple[str, ...]] = {}
     for entry in entries:
         key, _, listed = entry.partition("=")
@@ -61,25 +66,24 @@ def parse_axes(entries: Sequence[str]) -> Axes:
         if key in axes:
             raise InputError(f"--set {key}: given twice; write its values as {key}=A,B")
         values = parse_value(f"[{listed}]", f"--set {entry}: {_EXPECTED}")
-        axes[key] = tuple(map(_one_spelling, values))
+        # Text stays as it is unless YAML would read another type; everything else becomes JSON.
+        axes[key] = tuple(
+            value
+            if isinstance(value, str) and parse_value(value, "--set") == value
+            else json.dumps(value, default=str)
+            for value in values
+        )
         for value in axes[key]:
             if axes[key].count(value) > 1:
                 raise InputError(f"--set {entry}: {value} is given twice")
     return axes
 
 
-def _one_spelling(value: Any) -> str:
-    """Text is itself, unless YAML would read something else in it; all else is JSON."""
-    if isinstance(value, str) and parse_value(value, "--set") == value:
-        return value
-    return json.dumps(value, default=str)
-
-
 def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[SweepRun]:
-    """All combinations; runs that share most come one after the other.
+    """Return all combinations; runs that share many stages follow each other.
 
-    Every scenario's file is read once, here. It is loaded with every combination of values, so that
-    a wrong one is told before anything is computed.
+    Each scenario file is read once. It is loaded with every combination of values, so a wrong value
+    is reported before anything is computed.
 
     Raises:
         InputError: a scenario, key or value is wrong, or two scenarios have the same name.

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+import pyarrow as pa
+
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.result import all_tables, renderer
 from experiments.pipeline.memory import require_memory
@@ -22,7 +24,7 @@ _TABLES += ("smoother", "team", "team_pairs", "fusers")
 
 
 class Sweep(NamedTuple):
-    """What is to be run, the store that it shares with `mapfusion run`, and where tables go."""
+    """Runs of a sweep, the store that it shares with `mapfusion run`, and its tables."""
 
     runs: list[SweepRun]
     store: Store
@@ -36,9 +38,9 @@ def prepare(
     results: Path,
     output: Path | None = None,
 ) -> Sweep:
-    """Check everything a user gave, `settings` as in `--set`; nothing is written.
+    """Check what the user asked for, `settings` as in `--set`; nothing is written.
 
-    The scenario files, names and tags asked for name the sweep's folder, unless there is `output`.
+    Without `output`, the sweep's folder is named after the scenario files, names and tags.
 
     Raises:
         InputError: a scenario, key or value is wrong.
@@ -53,10 +55,13 @@ def prepare(
 
 @dataclass(frozen=True, eq=False)
 class PlannedRun:
-    """A run, the stages it is made from (STAGE/KEY), and its tasks by name.
+    """A run and its tasks.
 
-    The last task writes the run's rows. `left` are those to be done, each after those it needs;
-    none if the dataset holds the run.
+    Attributes:
+        run: scenario, seed and values.
+        stages: STAGE/KEY of all stages that the run is made from.
+        tasks: all tasks by name; the last one, `run/RUN_ID`, returns the run's rows.
+        left: tasks to be done, each after those it needs; none if the tables hold the run.
     """
 
     run: SweepRun
@@ -64,13 +69,25 @@ class PlannedRun:
     tasks: dict[str, Task]
     left: list[Task]
 
+    @property
+    def last(self) -> str:
+        """Name of the last task."""
+        return f"run/{self.run.run_id}"
+
 
 def planned(
     run: SweepRun, store: Store, tables: JoinedTables, jobs: int | None = None
 ) -> PlannedRun:
-    """Lay out a run; nothing is computed. Raises InputError for what cannot be run.
+    """Plan a run; nothing is computed.
 
-    `jobs` are the processes that share this machine's memory; None if other machines run it.
+    Args:
+        run: scenario, seed and values.
+        store: finished stages.
+        tables: finished runs.
+        jobs: number of processes that share this machine's memory; None for a cluster.
+
+    Raises:
+        InputError: the run is impossible.
     """
     judged = JudgedRun.of(run.load(), store)
     if jobs is not None:
@@ -81,30 +98,36 @@ def planned(
     read += pipeline.fusers.values()
     needs = tuple(name for stage in read for name in task_names(stage))
     name, arguments = f"run/{run.run_id}", (run, judged, stages, tables.dataset)
-    last = Task(name, "write the tables", write_rows, arguments, (), needs)
+    last = Task(name, "write the tables", rows_of, arguments, (), needs)
     tasks = judged.tasks | {name: last}
     left = [] if tables.holds(run, stages) else unfinished(tasks, [name])
     return PlannedRun(run, stages, tasks, left)
 
 
-def write_rows(
+def rows_of(
     run: SweepRun, judged: JudgedRun, stages: Sequence[str], dataset: SweepDataset
-) -> None:
-    """Write a run's rows of all tables; no maps, no images."""
+) -> dict[str, pa.Table]:
+    """Return a run's rows of all tables (work of the last task)."""
     made = all_tables(judged, judged.load_team(), _TABLES)
     times = [
         {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
         for folder in judged.folders()
         for name, seconds in folder.figures().items()
     ]
-    dataset.finish(run, renderer(judged.scenario), stages, {**made, RUN_TIMES: times})
+    return dataset.finished(run, renderer(judged.scenario), stages, {**made, RUN_TIMES: times})
 
 
 @dataclass
 class Survey:
-    """What a sweep would do: runs in all, finished, and that cannot be laid out; tasks by label.
+    """Counts of runs, and of tasks by label.
 
-    Tasks are `wanted` over all runs, as if nothing were shared.
+    Attributes:
+        runs: number of all runs.
+        runs_finished: number of runs that the tables hold.
+        runs_refused: number of runs that are impossible.
+        wanted: tasks summed over all runs, without sharing.
+        finished: different tasks that are done.
+        left: different tasks to be done.
     """
 
     runs: int
@@ -116,8 +139,8 @@ class Survey:
 
 
 def survey(sweep: Sweep) -> Survey:
-    """Count the tasks of runs, how many are shared between runs and how many are done."""
-    found, tables = Survey(len(sweep.runs)), JoinedTables.of(sweep.dataset)
+    """Count runs and tasks, and how many of them are done; nothing is computed."""
+    found, tables = Survey(len(sweep.runs)), JoinedTables(sweep.dataset)
     known: set[str] = set()
     for run in sweep.runs:
         try:

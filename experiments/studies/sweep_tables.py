@@ -1,35 +1,30 @@
 """Tables of a sweep: rows of all its runs.
 
-A folder `SWEEP/TABLE` is one Parquet dataset, which pandas and DuckDB read while the sweep goes on.
-Each table's columns come after `run_id`, `scenario`, `seed` and one text column for each `--set`
-key. `runs` has one row a run and is written after all others: what it calls finished is complete.
+A folder `SWEEP/TABLE` is one Parquet dataset, which pandas and DuckDB can read while the sweep
+runs. Each table begins with `run_id`, `scenario`, `seed` and one text column for each `--set` key.
+`runs` has one row per run and is written last: the rows of a finished run are in all tables.
 
-Who makes a run puts its rows into one file, `SWEEP/waiting/RUN_ID.arrow`, which no reader of tables
-finds; the command joins those that wait (`joined_tables`).
-
-Every run of a folder has its place, in the order in which runs were first asked for (`sweep.json`),
-and a file holds the runs of so many places one after the other: the same bytes in whatever order
-they were made. A file is replaced whole by one that holds more, so that no reader finds a run's
-rows twice, and rows that wait go only when they are in the tables.
+Each run has a place: its position in the order in which the folder was first asked for runs
+(`sweep.json`). A file holds the rows of `RUNS_PER_FILE` places in this order, one row group for
+every `_RUNS_PER_GROUP` places. So its bytes do not depend on the order in which the runs ended. A
+file is always replaced as a whole: readers never find half a file or the rows of a run twice.
 """
 
 import fcntl
-import hashlib
-import heapq
-import itertools
 import json
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ValidationError
 
@@ -40,19 +35,15 @@ from experiments.pipeline.tables import FLOAT, TEXT, fields
 from experiments.studies.sweep_combinations import SweepRun
 from mapfusion.errors import DamagedFileError, InputError, MendedWarning
 from mapfusion.files import (
-    UNREADABLE,
     read_json,
     read_parquet,
-    require_file,
     row_groups,
     schema,
-    text_attributes,
     write_json,
     write_whole,
 )
 
-SCHEMA_VERSION = 2
-_DIGEST_BYTES = hashlib.sha256().digest_size
+SCHEMA_VERSION = 3  # since 3 the row groups of a file are those of `joined_tables`
 RUNS, RUN_TIMES, ALIGNER_TIMINGS = "runs", "run_times", "aligner_timings"
 Rows = pd.DataFrame | list[dict[str, Any]]
 
@@ -65,39 +56,29 @@ _OWN_FIELDS = {
         libraries=TEXT,  # JSON object of versions
         source_hash=TEXT,
     ),
-    # Seconds of work behind the run, by stage: also of stages that it shares with other runs. The
-    # figure is elapsed_s, or rendering_s as a part of it. Beside `aligner_timings` the only table
-    # that differs from time to time.
+    # Seconds of work by stage, including stages that are shared with other runs. The figure is
+    # elapsed_s, or its part rendering_s. Only this table and `aligner_timings` contain times.
     RUN_TIMES: fields(stage=TEXT, key=TEXT, figure=TEXT, seconds=FLOAT),
 }
 
 
 @dataclass(frozen=True)
 class SweepDataset:
-    """The folder of a sweep, and the keys of its `--set` options in their order."""
+    """Folder of a sweep and the keys of its `--set` options, in their order."""
 
     folder: Path
     keys: tuple[str, ...]
 
     def path(self, table: str, number: int) -> Path:
-        """Where a table's rows of the runs of that number are."""
+        """Return the path of a table's file of this number."""
         return self.folder / table / f"{number:05d}.parquet"
 
     def files(self, table: str) -> list[Path]:
-        """All files of a table."""
+        """Return all files of a table."""
         return sorted((self.folder / table).glob("[!.]*.parquet"))
 
-    @property
-    def waiting(self) -> Path:
-        """Where the rows of runs wait that are not joined yet."""
-        return self.folder / "waiting"
-
-    def waiting_path(self, run: SweepRun) -> Path:
-        """Where the rows of one run wait."""
-        return self.waiting / f"{run.run_id}.arrow"
-
     def rows(self, table: str, run: SweepRun, rows: Rows) -> pa.Table:
-        """A run's rows of one table, preceded by what run they are of."""
+        """Return a run's rows of one table, with the columns that describe the run in front."""
         own = _OWN_FIELDS[table] if table in _OWN_FIELDS else list(tables.ALL[table])
         told: dict[str, Any] = {"run_id": run.run_id, "scenario": run.scenario, "seed": run.seed}
         told |= dict(run.settings)
@@ -113,66 +94,21 @@ class SweepDataset:
         columns += [pa.array(frame[field.name].to_numpy(), field.type) for field in own]
         return pa.Table.from_arrays(columns, schema=own_schema)
 
-    def finish(
+    def finished(
         self, run: SweepRun, renderer: str, stages: Sequence[str], made: Mapping[str, Rows]
-    ) -> None:
-        """Keep all that a run made; it takes the place of whatever was there of the run."""
+    ) -> dict[str, pa.Table]:
+        """Return the rows of a finished run, by table."""
         row = {"status": "finished", "reason": "", "renderer": renderer} | made_by(stages)
-        self._details(run).unlink(missing_ok=True)
-        self._keep(run, {**made, RUNS: [row]})
+        return {name: self.rows(name, run, rows) for name, rows in {**made, RUNS: [row]}.items()}
 
-    def fail(
-        self, run: SweepRun, reason: str, details: str = "", stages: Sequence[str] = ()
-    ) -> Path:
-        """Say why a run has no rows; those of an earlier, finished one will go.
-
-        Returns:
-            Where the details are, if there are any.
-        """
-        path = self._details(run)
-        path.unlink(missing_ok=True)
+    def failed(self, run: SweepRun, reason: str, stages: Sequence[str]) -> dict[str, pa.Table]:
+        """Return the one row of a failed run, by table."""
         row = {"status": "failed", "reason": reason, "renderer": ""} | made_by(stages)
-        self._keep(run, {RUNS: [row]})
-        if details:
-            text = details.encode("utf-8", "backslashreplace")  # an exception's text may be any
-            write_whole(path, lambda file: file.write_bytes(text))
-        return path
-
-    def _details(self, run: SweepRun) -> Path:
-        return self.folder / "failures" / f"{run.run_id}.txt"
-
-    def _keep(self, run: SweepRun, made: Mapping[str, Rows]) -> None:
-        buffer = pa.BufferOutputStream()
-        for name, rows in made.items():
-            table = self.rows(name, run, rows)
-            with pa.ipc.new_stream(buffer, table.schema) as stream:
-                stream.write_table(table)
-        rows = buffer.getvalue().to_pybytes()
-        whole = rows + hashlib.sha256(rows).digest()  # Arrow's streams have no checksums
-        write_whole(self.waiting_path(run), lambda file: file.write_bytes(whole))
-
-
-def read_waiting(path: Path) -> dict[str, pa.Table]:
-    """The rows of one run by table; raises DamagedFileError."""
-    require_file(path, "file of rows that wait")
-    whole = path.read_bytes()
-    rows, digest = whole[:-_DIGEST_BYTES], whole[-_DIGEST_BYTES:]
-    if hashlib.sha256(rows).digest() != digest:
-        raise DamagedFileError(path, "damaged, it does not fit its digest")
-    source, found = pa.BufferReader(rows), dict[str, pa.Table]()
-    try:
-        while source.tell() < len(rows):
-            with pa.ipc.open_stream(source) as stream:
-                table = stream.read_all()
-            kind = text_attributes(path, table).get("kind", "")
-            found[kind.rpartition(".")[2]] = table
-    except UNREADABLE as error:
-        raise DamagedFileError(path, f"damaged ({' '.join(str(error).split())})") from error
-    return found
+        return {RUNS: self.rows(RUNS, run, [row])}
 
 
 def made_by(stages: Sequence[str]) -> dict[str, str]:
-    """What a run was made from, and by which code: columns of `runs`."""
+    """Return the columns of `runs` that identify the stages, libraries and source of a run."""
     return {
         "stages": json.dumps(list(stages)),
         "libraries": json.dumps(library_versions()),
@@ -180,15 +116,14 @@ def made_by(stages: Sequence[str]) -> dict[str, str]:
     }
 
 
-# Runs a file: of runs of 20 frames up to 1 MB, of long ones some 100 MB.
-RUNS_PER_FILE = 1000
-# Rows that are in memory at one time, some 20 MB; whole runs, so that readers get them whole.
-_ROWS_PER_GROUP = 100_000
-_TOLD = ("status", "stages", "libraries", "source_hash")
+# A table of 1000 runs is about 1 MB for runs of 20 frames and about 100 MB for long runs. A row
+# group is what is in memory at a time. It holds whole runs, so readers get whole runs.
+RUNS_PER_FILE, _RUNS_PER_GROUP = 1000, 50
+_MADE_FROM = ("status", "stages", "libraries", "source_hash")
 
 
 class _Description(BaseModel):
-    """What `sweep.json` holds."""
+    """Content of `sweep.json`."""
 
     schema_version: int
     settings: tuple[str, ...]
@@ -196,164 +131,169 @@ class _Description(BaseModel):
 
 
 class JoinedTables:
-    """The tables of a sweep, which one command alone writes."""
+    """Tables of a sweep, and the rows that are to be written into them.
 
-    def __init__(self, dataset: SweepDataset, runs: Iterable[str] = ()) -> None:
-        """`runs` are all the folder's, by their names, in the order of their places."""
-        self.dataset = dataset
-        self._place = {run_id: place for place, run_id in enumerate(runs)}
-        self._held: dict[int, dict[str, str]] = {}  # by file: what its runs were made from
-        self._damaged: set[int] = set()  # files that go before others take their place
+    Attributes:
+        dataset: folder of the tables.
+        run_ids: all runs of the folder, in the order of their places.
+        waiting_bytes: size in memory of the rows that wait for `write`.
+    """
 
-    @classmethod
-    def of(cls, dataset: SweepDataset) -> "JoinedTables":
-        """As they are on disk; nothing is written.
+    def __init__(self, dataset: SweepDataset) -> None:
+        """Open the tables of a new or an existing sweep; nothing is written.
 
         Raises:
             InputError: the folder holds something else, or a sweep over other settings.
         """
-        folder, path = dataset.folder, dataset.folder / "sweep.json"
-        if path.exists():
-            return cls(dataset, _described(path, dataset.keys))
-        if folder.exists() and any(folder.iterdir()):
-            what = "is no folder of a sweep (no sweep.json); give another --output"
-            raise InputError(f"{folder}: {what}")
-        return cls(dataset)
+        self.dataset, self._path = dataset, dataset.folder / "sweep.json"
+        self.run_ids = list(self._described().runs)
+        self._place = {run_id: place for place, run_id in enumerate(self.run_ids)}
+        self._waiting = defaultdict[int, dict[str, Mapping[str, pa.Table]]](dict)  # by number, run
+        self.waiting_bytes = 0
+        self._made_from: dict[int, dict[str, int]] = {}  # hash of `_MADE_FROM` by number, run
+        self._damaged: set[int] = set()
 
-    @property
-    def run_ids(self) -> list[str]:
-        """All runs of the folder, in the order of their places."""
-        return list(self._place)
+    def _described(self) -> _Description:
+        folder, path, keys = self.dataset.folder, self._path, self.dataset.keys
+        if not path.exists():
+            if folder.exists() and any(folder.iterdir()):
+                what = "is no folder of a sweep (no sweep.json); give another --output"
+                raise InputError(f"{folder}: {what}")
+            return _Description(schema_version=SCHEMA_VERSION, settings=keys)
+        try:
+            found = _Description.model_validate(read_json(path, "description of a sweep"))
+        except ValidationError as error:
+            raise InputError(f"{path}: damaged or no description of a sweep") from error
+        if found.schema_version != SCHEMA_VERSION:
+            reads = f"this program adds to {SCHEMA_VERSION} alone; give it another --output"
+            raise InputError(f"{path}: schema_version is {found.schema_version}, {reads}")
+        if found.settings != keys:
+            was, now = (", ".join(names) or "seeds alone" for names in (found.settings, keys))
+            raise InputError(
+                f"{folder}: is a sweep over {was}, this one is over {now}; "
+                "tables of both would not fit together, give this one another --output"
+            )
+        return found
 
-    def place(self, run: SweepRun) -> int:
-        """Where a run is in the folder's order."""
-        return self._place[run.run_id]
+    def ask_for(self, runs: Sequence[SweepRun]) -> None:
+        """Add runs to the folder, behind those that were asked for before."""
+        for run_id in dict.fromkeys(run.run_id for run in runs):
+            if run_id not in self._place:
+                self._place[run_id] = len(self.run_ids)
+                self.run_ids.append(run_id)
+        told = {"schema_version": SCHEMA_VERSION, "kind": "sweep", "settings": self.dataset.keys}
+        write_json(self._path, told | {"runs": self.run_ids})
 
     def number(self, run: SweepRun) -> int:
-        """Which of the files holds a run."""
-        return self.place(run) // RUNS_PER_FILE
+        """Return the number of the files that hold a run's rows."""
+        return self._place[run.run_id] // RUNS_PER_FILE
 
     def holds(self, run: SweepRun, stages: Sequence[str]) -> bool:
-        """Whether the run is finished, made from these stages by the source as it is now.
+        """Return True if a run is finished and was made from these stages by the current source.
 
-        And whether its tables are as they were written: damaged ones are told, and made again.
+        Damaged files hold no run: a warning names them, and `write` replaces them.
         """
-        wanted = {"status": "finished"} | made_by(stages)
-        return self._told(run) == _digest(wanted[name] for name in _TOLD)
-
-    def _told(self, run: SweepRun) -> str | None:
-        path = self.dataset.waiting_path(run)
-        if path.is_file() and (tables := _waiting_or_none(path)):
-            return _digests(tables[RUNS])[run.run_id]
         if run.run_id not in self._place:
-            return None
-        number = self.number(run)
-        if number not in self._held:
-            self._held[number] = self._checked(number)
-        return self._held[number].get(run.run_id)
+            return False
+        wanted = {"status": "finished"} | made_by(stages)
+        found = self._runs_made(self.number(run)).get(run.run_id)
+        return found == hash(tuple(wanted[name] for name in _MADE_FROM))
 
-    def _checked(self, number: int) -> dict[str, str]:
-        """What the runs in the files of that number were made from; none if one is damaged."""
-        path, files = self.dataset.path(RUNS, number), self._files(number)
-        if not path.is_file():
-            return {}
-        try:
-            for file in files:
-                read_parquet(file, "table of a sweep")
-            return _digests(read_parquet(path, RUNS, ["run_id", *_TOLD]))
-        except DamagedFileError as error:
-            told = f"{error}; the runs in it are made again, when a sweep asks for them"
-            warnings.warn(told, MendedWarning, stacklevel=2)
-            self._damaged.add(number)
-            return {}
+    def _runs_made(self, number: int) -> dict[str, int]:
+        """Return a hash of what each run in the files of this number was made from."""
+        if number not in self._made_from:
+            self._made_from[number] = {}
+            try:
+                for path in self._files(number):
+                    for group in row_groups(path, "table of a sweep"):  # checks all values
+                        if path.parent.name == RUNS:
+                            self._made_from[number] |= _hashes(group)
+            except DamagedFileError as error:
+                told = f"{error}; the runs in it are made again, when a sweep asks for them"
+                warnings.warn(told, MendedWarning, stacklevel=2)
+                self._damaged.add(number)
+                self._made_from[number] = {}
+        return self._made_from[number]
 
     def _files(self, number: int) -> list[Path]:
         return sorted(self.dataset.folder.glob(f"*/{self.dataset.path('', number).name}"))
 
-    def join(self, only: int | None = None) -> None:
-        """Put rows that wait into the tables: all, or those of the files of one number.
+    def add(self, run: SweepRun, made: Mapping[str, pa.Table]) -> None:
+        """Take a run's rows by table; `write` puts them in place of the run's earlier rows."""
+        number = self.number(run)
+        self._runs_made(number).update(_hashes(made[RUNS]))
+        self._waiting[number][run.run_id] = made
+        self.waiting_bytes += sum(table.nbytes for table in made.values())
+
+    def write(self) -> None:
+        """Write the rows that wait.
 
         Raises:
             DamagedFileError: a table is not as it was written.
         """
-        waiting: dict[int, dict[int, Path]] = {}
-        for path in self.dataset.waiting.glob("[!.]*.arrow"):
-            place = self._place.get(path.stem)
-            if place is not None and only in (None, place // RUNS_PER_FILE):
-                waiting.setdefault(place // RUNS_PER_FILE, {})[place] = path
-        for number in sorted(waiting):
-            self._join(number, waiting[number])
-        if self.dataset.waiting.is_dir() and not any(self.dataset.waiting.iterdir()):
-            self.dataset.waiting.rmdir()
-
-    def _join(self, number: int, waiting: Mapping[int, Path]) -> None:
-        if number in self._damaged:
-            for file in (self.dataset.path(RUNS, number), *self._files(number)):
-                file.unlink(missing_ok=True)
-            self._damaged.remove(number)
-        made = {place: _waiting_or_none(path) for place, path in waiting.items()}
-        names = {path.parent.name for path in self._files(number)}
-        names |= {name for tables in made.values() for name in tables}
-        if not self.runs_in(RUNS, number).isdisjoint(path.stem for path in waiting.values()):
-            # of runs that were made again nothing is said until all their tables are there
-            self.replace(RUNS, number, dict.fromkeys(made))
-        for name in [*sorted(names - {RUNS}), RUNS]:
-            self.replace(name, number, {place: made[place].get(name) for place in made})
-        for path in waiting.values():
-            path.unlink(missing_ok=True)
+        for number, made in self._waiting.items():
+            if number in self._damaged:
+                for file in (self.dataset.path(RUNS, number), *self._files(number)):
+                    file.unlink(missing_ok=True)
+                self._damaged.remove(number)
+            if not made.keys().isdisjoint(self.runs_in(RUNS, number)):
+                # runs that were made again are not in `runs` until all their tables are written
+                self.replace(RUNS, number, dict.fromkeys(made))
+            names = {path.parent.name for path in self._files(number)}.union(*made.values())
+            for name in [*sorted(names - {RUNS}), RUNS]:
+                self.replace(name, number, {run_id: own.get(name) for run_id, own in made.items()})
+        self._waiting.clear()
+        self.waiting_bytes = 0
 
     def runs_in(self, table: str, number: int) -> set[str]:
-        """Names of the runs that have rows in a file."""
+        """Return the ids of the runs that have rows in a file."""
         path = self.dataset.path(table, number)
-        found = read_parquet(path, table, ["run_id"]) if path.is_file() else None
-        return set() if found is None else set(found["run_id"].to_pylist())
+        groups = row_groups(path, table, lambda _: ["run_id"]) if path.is_file() else ()
+        return {run_id for group in groups for run_id in group["run_id"].to_pylist()}
 
-    def replace(self, table: str, number: int, rows: Mapping[int, pa.Table | None]) -> None:
-        """Write a file of a table anew, with these rows in place of those it had of their runs.
-
-        Rows by their run's place, None for a run that has none.
-        """
-        path = self.dataset.path(table, number)
-        new = [(place, own) for place, own in sorted(rows.items()) if own is not None]
-        old = self._rows_in(path, table) if path.is_file() else iter(())
-        kept = ((place, own) for place, own in old if place not in rows)
-        parts = (own for _, own in heapq.merge(kept, new, key=itemgetter(0)))
+    def replace(self, table: str, number: int, rows: Mapping[str, pa.Table | None]) -> None:
+        """Replace the rows that a file holds of these runs, by run id; None stands for no rows."""
+        path, what = self.dataset.path(table, number), "table of a sweep"
+        new = [own for own in rows.values() if own is not None]
         if new:
-            _write(path, new[0][1].schema, parts)
+            own_schema = new[0].schema
         elif path.is_file():
-            _write(path, next(row_groups(path, table)).schema, parts)
-        self._held.pop(number, None)
+            own_schema = next(row_groups(path, what)).schema
+        else:
+            return
+        groups = row_groups(path, what) if path.is_file() else iter(())
+        nothing, stays = own_schema.empty_table(), ~pc.field("run_id").isin(list(rows))
 
-    def _rows_in(self, path: Path, table: str) -> Iterator[tuple[int, pa.Table]]:
-        """The rows of each run by its place; the file holds them in this order."""
-        for rows in row_groups(path, f"table {table}"):
-            of = rows["run_id"].to_numpy()
-            starts = np.flatnonzero(np.append(True, of[1:] != of[:-1])[: len(of)])
-            for start, end in itertools.pairwise([*starts.tolist(), len(of)]):
-                yield self._place[of[start]], rows.slice(start, end - start)
+        def merged(run_ids: Sequence[str]) -> pa.Table:
+            """Return the next row group with the new rows of these runs."""
+            made = (rows.get(run_id) for run_id in run_ids)
+            parts = [next(groups, nothing).filter(stays), *(own for own in made if own is not None)]
+            # rows of an earlier version may lack columns, which become null, or have more
+            every = pa.concat_tables([nothing, *parts], promote_options="permissive")
+            place = [self._place[run_id] for run_id in every["run_id"].to_pylist()]
+            ordered = every.take(np.argsort(place, kind="stable"))
+            return ordered.select(own_schema.names).cast(own_schema)
+
+        buffer, of_file = pa.BufferOutputStream(), self.run_ids[number * RUNS_PER_FILE :]
+        options = {"compression": "zstd", "write_page_checksum": True}
+        with pq.ParquetWriter(buffer, own_schema, **options) as writer:
+            for start in range(0, len(of_file[:RUNS_PER_FILE]), _RUNS_PER_GROUP):
+                writer.write_table(merged(of_file[start:][:_RUNS_PER_GROUP]))
+        write_whole(path, lambda file: file.write_bytes(buffer.getvalue()))
 
 
-def open_dataset(dataset: SweepDataset, runs: Sequence[SweepRun] = ()) -> JoinedTables:
-    """A new or an existing sweep's folder, to which these runs may be added.
-
-    Raises:
-        InputError: the folder holds something else, or a sweep over other settings.
-    """
-    path = dataset.folder / "sweep.json"
-    known = JoinedTables.of(dataset).run_ids
-    every = list(dict.fromkeys([*known, *(run.run_id for run in runs)]))
-    if len(every) > len(known) or not path.exists():
-        own = {"schema_version": SCHEMA_VERSION, "kind": "sweep", "settings": dataset.keys}
-        write_json(path, own | {"runs": every})
-    return JoinedTables(dataset, every)
+def _hashes(runs: pa.Table) -> dict[str, int]:
+    """Return a hash of `_MADE_FROM` by run: the texts of many runs would fill the memory."""
+    columns = (runs[name].to_pylist() for name in _MADE_FROM)
+    return dict(zip(runs["run_id"].to_pylist(), map(hash, zip(*columns, strict=True)), strict=True))
 
 
 @contextmanager
 def written_by_nobody_else(folder: Path) -> Iterator[None]:
-    """For a `with` block; it ends with the process, however that does.
+    """Lock a folder during a `with` block; the lock also ends with the process.
 
     Raises:
-        InputError: another process is in such a block.
+        InputError: another process has locked it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     handle = os.open(folder, os.O_RDONLY)
@@ -363,79 +303,11 @@ def written_by_nobody_else(folder: Path) -> Iterator[None]:
         except BlockingIOError as error:
             others = "another sweep writes into it; wait for its end, or give another --output"
             raise InputError(f"{folder}: {others}") from error
-        except OSError:  # a file system that knows no locks
+        except OSError:  # a file system without locks
             pass
         yield
     finally:
         os.close(handle)
-
-
-def _described(path: Path, keys: tuple[str, ...]) -> tuple[str, ...]:
-    try:
-        found = _Description.model_validate(read_json(path, "description of a sweep"))
-    except ValidationError as error:
-        raise InputError(f"{path}: damaged or no description of a sweep") from error
-    if found.schema_version != SCHEMA_VERSION:
-        reads = f"this program adds to {SCHEMA_VERSION} alone; give it another --output"
-        raise InputError(f"{path}: schema_version is {found.schema_version}, {reads}")
-    if found.settings != keys:
-        was, now = (", ".join(listed) or "seeds alone" for listed in (found.settings, keys))
-        raise InputError(
-            f"{path.parent}: is a sweep over {was}, this one is over {now}; "
-            "tables of both would not fit together, give this one another --output"
-        )
-    return found.runs
-
-
-def _waiting_or_none(path: Path) -> dict[str, pa.Table]:
-    """Rows that wait; of a damaged file, which is told, none."""
-    try:
-        return read_waiting(path)
-    except DamagedFileError as error:
-        told = f"{error}; the same command makes its run again"
-        warnings.warn(told, MendedWarning, stacklevel=2)
-        return {}
-
-
-def _write(path: Path, table_schema: pa.Schema, parts: Iterable[pa.Table]) -> None:
-    """Write the rows of runs one after the other, whole runs in a row group."""
-    buffer, group, n_rows = pa.BufferOutputStream(), list[pa.Table](), 0
-    with pq.ParquetWriter(
-        buffer, table_schema, compression="zstd", write_page_checksum=True
-    ) as writer:
-        for rows in parts:
-            group.append(_fitted(rows, table_schema))
-            n_rows += len(rows)
-            if n_rows >= _ROWS_PER_GROUP:
-                writer.write_table(pa.concat_tables(group).combine_chunks())
-                group, n_rows = [], 0
-        if group:
-            writer.write_table(pa.concat_tables(group).combine_chunks())
-    write_whole(path, lambda temporary: temporary.write_bytes(buffer.getvalue()))
-
-
-def _fitted(rows: pa.Table, table_schema: pa.Schema) -> pa.Table:
-    """With the columns of that schema; null where an earlier version had none of the name."""
-    if rows.schema == table_schema:
-        return rows
-    columns = [
-        rows[field.name].cast(field.type)
-        if field.name in rows.column_names
-        else pa.nulls(len(rows), field.type)
-        for field in table_schema
-    ]
-    return pa.Table.from_arrays(columns, schema=table_schema)
-
-
-def _digests(runs: pa.Table) -> dict[str, str]:
-    """What rows of `runs` say by run, in few bytes: a sweep may have very many."""
-    columns = [runs[name].to_pylist() for name in _TOLD]
-    of_rows = map(_digest, zip(*columns, strict=True))
-    return dict(zip(runs["run_id"].to_pylist(), of_rows, strict=True))
-
-
-def _digest(texts: Iterable[str]) -> str:
-    return hashlib.sha256("\0".join(texts).encode()).hexdigest()
 
 
 ERRORS = ["translation_error_m", "refined_translation_error_m"]
@@ -443,11 +315,13 @@ GIVEN = ["estimated_share", "refined_share"]
 
 
 def medians_over_runs(dataset: SweepDataset, runs: Sequence[SweepRun]) -> pd.DataFrame:
-    """A sweep's errors in short: medians over runs of each run's own medians.
+    """Return medians over runs of each run's own median errors.
 
-    One row for each scenario with its values (`setting`) and aligner: ERRORS, infinite without an
-    estimate, GIVEN, the shares of answers with one, and the number of runs. Read file by file, so
-    that memory does not grow with the rows of a sweep.
+    Files are read one by one, so memory does not grow with the number of runs.
+
+    Returns:
+        One row per scenario with its values (`setting`) and aligner: ERRORS (infinite without an
+        estimate), GIVEN (shares of answers with an estimate) and the number of runs.
     """
     wanted, leading = {run.run_id for run in runs}, ["scenario", *dataset.keys]
     parts = []

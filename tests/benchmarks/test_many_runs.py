@@ -1,4 +1,4 @@
-"""What a sweep costs beside its runs: handing out a task, joining the rows of runs."""
+"""Cost of a sweep beside its runs: to hand out tasks, and to write the rows of runs."""
 
 import pickle
 from pathlib import Path
@@ -12,7 +12,7 @@ from experiments.pipeline.cluster import connected
 from experiments.pipeline.tables import TEXT
 from experiments.pipeline.tasks import Task
 from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import JoinedTables, SweepDataset, open_dataset
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset
 
 N_TASKS, N_RUNS = 200, 500
 
@@ -38,15 +38,16 @@ def _row(table: str, number: int) -> dict[str, object]:
     return {each.name: "R1" if each.type == TEXT else number for each in columns}
 
 
-def test_joining_500_runs_of_20_frames(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
+def test_writing_500_runs_of_20_frames(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
     runs = [SweepRun(Path("x.yaml"), "x", seed) for seed in range(N_RUNS)]
     made = {name: [_row(name, k) for k in range(20)] for name in ("robots", "path_statistics")}
 
     def wait() -> tuple[tuple[JoinedTables], dict[str, object]]:
         dataset = SweepDataset(tmp_path, ())
-        joined = open_dataset(dataset, runs)
+        joined = JoinedTables(dataset)
+        joined.ask_for(runs)
         for run in runs:
-            dataset.finish(run, "none", ["slam/1"], made)
+            joined.add(run, dataset.finished(run, "none", ["slam/1"], made))
         return (joined,), {}
 
-    benchmark.pedantic(JoinedTables.join, setup=wait, rounds=3)
+    benchmark.pedantic(JoinedTables.write, setup=wait, rounds=3)

@@ -15,7 +15,7 @@ from experiments.pipeline.store import StageFolder, require_sound
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.studies.run_tables import find_runs
 from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import JoinedTables, SweepDataset, open_dataset
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset
 from mapfusion.datasets.mrclam import MrclamSettings, import_mrclam
 from mapfusion.files import write_json
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
@@ -115,14 +115,14 @@ def _of_a_result(folder: Path, rng: np.random.Generator) -> list[Door]:
     write_json(result / "scenario.json", {"name": "x", "seed": 3, "description": "a\ud800"})
     write_json(result / "provenance.json", {"stages": {}, "libraries": {"numpy": "2"}})
     write_json(result / "world.json", {"walls": [[[0, 0], [1, 0]]], "robots": {"R1": [0, 1, 0.5]}})
-    open_dataset(sweep, [SweepRun(folder, "x", 0)])
+    JoinedTables(sweep).ask_for([SweepRun(folder, "x", 0)])
     return [
         Door(fits, partial(tables.read, fits, "map_fits")),
         Door(fits, lambda: find_runs(result).read("map_fits")),
         Door(result / "scenario.json", lambda: find_runs(result).results[0].run),
         Door(result / "provenance.json", lambda: read_provenance(result / "provenance.json")),
         Door(result / "world.json", lambda: (ResultTables(result).walls, _start(result))),
-        Door(sweep.folder / "sweep.json", lambda: JoinedTables.of(sweep).run_ids),
+        Door(sweep.folder / "sweep.json", lambda: JoinedTables(sweep).run_ids),
     ]
 
 

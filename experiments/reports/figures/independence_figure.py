@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from experiments.evaluation.tables import UNKNOWN
 from experiments.reports.figures import style
 from experiments.reports.figures.result_tables import NothingToDraw
-from experiments.studies.independence.strategies import STRATEGIES
+from experiments.studies.independence.independence_trial import STRATEGIES
 
 _HEIGHT_IN = 8.6
 # Panels from above: label, the column drawn with markers, and what of it is the team's alone.

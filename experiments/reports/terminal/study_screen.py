@@ -73,7 +73,7 @@ def _benchmark_cell(row: dict[Any, Any]) -> str:
 def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[str]) -> None:
     """Costs and errors of each way to one map (rows of `at_the_end`), and where the rest is."""
     from experiments.reports.study_files import SHOWN, shown_numbers
-    from experiments.studies.independence.strategies import STRATEGIES
+    from experiments.studies.independence.independence_trial import STRATEGIES
 
     headings = [("way", ""), *((heading, ">") for _, heading in SHOWN.values())]
     note = "; ".join(f"{strategy.name}: {strategy.label}" for strategy in STRATEGIES)
@@ -89,7 +89,7 @@ def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[st
 
 def print_methods() -> None:
     """Every alignment method by name, whose it is, and what is wrong where something is."""
-    from experiments.methods.catalogue import known_methods, name_clashes
+    from experiments.plugins.discovery import known_methods, name_clashes
 
     methods = known_methods().values()
     rows = [

@@ -1,32 +1,72 @@
-"""What independence costs, for some seeds and sizes of teams: the tables, from the store.
+"""Study of what independence costs: maps made alone and fused, beside one smoother of all logs.
 
-What is measured is measured in this process, one piece after the other, when all else is done; each
-piece is kept under a key of all it depends on, so an interrupted study goes on where it was.
+Costs are measured in this process, one piece after the other, when all other work is done. Each
+piece is kept under a key of everything it depends on, so an interrupted study continues.
+
+Robots of a team of three are also robots of a team of five: they drove in the same world and are
+visible in each other's pictures. Only the use of their logs differs, so logs are taken as recorded.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
+from experiments.evaluation.alignment_errors import EvaluatedRobot, first_shared_iteration
 from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
+from experiments.evaluation.map_consistency import rmse
+from experiments.evaluation.path_errors import STATISTICS
+from experiments.evaluation.smoothed_robots import SmoothedRobot
+from experiments.evaluation.tables import UNKNOWN
+from experiments.evaluation.team_errors import PlacedPath, team_ate_m
+from experiments.evaluation.truth import why_no_truth
+from experiments.pipeline.stage import Stage
+from experiments.pipeline.stages.aligner import AlignerSettings
+from experiments.pipeline.stages.fuse import FuseSettings, read_fusions
+from experiments.pipeline.stages.match import MatchSettings
+from experiments.pipeline.stages.slam import SlamSettings
+from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.store import Store, mending
-from experiments.pipeline.tables import FLOAT, INT, TEXT, fields
+from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows
 from experiments.pipeline.tasks import OnProgress, run_tasks, tasks_of
 from experiments.pipeline.workers import workers
-from experiments.scenario.settings import AnyScenario
-from experiments.studies.independence.recorded_teams import RecordedTeam, team_of
-from experiments.studies.independence.strategies import STRATEGIES
-from experiments.studies.independence.team_accounts import cost_rows, sent_rows
-from experiments.studies.independence.team_errors import error_rows
+from experiments.scenario.settings import AnyScenario, Recording, Scenario
+from experiments.studies.independence.measured_work import (
+    ALIGNMENT,
+    COSTS_FILE,
+    FILTER,
+    FILTER_MAP,
+    FUSION,
+    LOG,
+    ROBOT_WRITES,
+    SENT,
+    SENT_FILE,
+    SMOOTHED_MAP,
+    SMOOTHING,
+    TEAM_WRITES,
+    WORK_COSTS,
+    PairCostSettings,
+    RobotCostSettings,
+    measure_pair,
+    measure_robot,
+    measure_team,
+    read_paths,
+)
+from mapfusion.errors import InputError
 from mapfusion.files import schema
+from mapfusion.fusion.fusers import REFERENCE, USUAL, make_fuser
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import IDENTITY
 
 _KEYS = {"scenario": TEXT, "seed": INT, "n_robots": INT, "strategy": TEXT, "iteration": INT}
-# One row a strategy and iteration; the same, bit for bit, in every run. first_shared: the first
-# evaluated iteration at which two maps have common ground, -1 for never; n_merged: robots whose
-# maps became one. Errors are of that map and of these robots' paths, NaN where nothing was merged;
-# fallback: as in the table `fusers` (else empty). sent: by all robots; most_sent: by one.
+# One row per strategy and iteration; equal bit for bit in every run. first_shared: first evaluated
+# iteration at which two maps have common ground, -1 for never; n_merged: number of robots in the
+# merged map. Errors are those of this map and of these robots' paths, NaN without a merged map;
+# fallback: as in the table `fusers` (else empty). sent: by all robots; most_sent: by one robot.
 TEAMS = schema(
     "independence.teams",
     1,
@@ -38,9 +78,9 @@ TEAMS = schema(
         fallback=TEXT,
     ),
 )
-# CPU time and memory, which differ from run to run and from machine to machine. Of all robots
-# together: filter_s, smoothing_s; busiest_robot_s: of the one that works most. Peaks are of one
-# robot, and of what is done for the team.
+# CPU time and memory, which differ between runs and machines. filter_s and smoothing_s are sums
+# over robots; busiest_robot_s is that of the robot with the most work. Peaks are those of one
+# robot, and of the work for the team.
 COSTS = schema(
     "independence.costs",
     1,
@@ -51,11 +91,336 @@ COSTS = schema(
     ),
 )
 _COLUMNS = list(_KEYS)
+_TEAM_LABEL = "measure the team's work"
+_LEAST = 2  # robots in a team
+_MB = 1e6
+_Paths = Mapping[str, Mapping[int, Float]]  # (T, 3) by robot and iteration
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """A team's strategy to obtain one map.
+
+    Attributes:
+        name: name in tables.
+        label: name in figures and on the screen.
+        fuser: fuser that makes the map.
+        sends: message that each robot sends.
+        often: True if messages are sent at every fused iteration up to the given one; False if only
+            at the given iteration, as if the drive ended there.
+    """
+
+    name: str
+    label: str
+    fuser: str
+    sends: str
+    often: bool = False
+
+    @property
+    def smooths(self) -> bool:
+        """True if robots smooth their logs."""
+        return make_fuser(self.fuser).smoothed
+
+    def asked(self, iterations: tuple[int, ...], at: int) -> list[int]:
+        """Return the iterations with messages and fusion, for the map of iteration `at`."""
+        return [k for k in iterations if k <= at] if self.often else [at]
+
+
+STRATEGIES = (
+    Strategy("filters", "filters alone, fused once", "kalman-drift", FILTER_MAP),
+    Strategy("once", "smoothed alone, fused once", USUAL, SMOOTHED_MAP),
+    Strategy("anew", "smoothed alone, fused anew", USUAL, SMOOTHED_MAP, often=True),
+    Strategy("together", "all logs in one smoother", REFERENCE, LOG),
+)
+FUSERS = tuple(dict.fromkeys(strategy.fuser for strategy in STRATEGIES))
+
+
+def team_sizes(text: str | None, scenario: AnyScenario) -> list[int]:
+    """Parse numbers of robots such as `3,5`; None stands for all robots of the scenario.
+
+    Raises:
+        InputError: the text is no list of numbers, or asks for more robots than there are.
+    """
+    names = scenario.logs if isinstance(scenario, Recording) else scenario.robots
+    there = len(names)
+    if there < _LEAST:
+        raise InputError(f"{scenario.name}: has one robot; independence is of two and more")
+    if text is None:
+        return [there]
+    parts = text.split(",")
+    sizes = sorted({int(part) for part in parts if part.strip().isdecimal()})
+    if len(sizes) < len(parts) or not _LEAST <= sizes[0] <= sizes[-1] <= there:
+        wanted = f"expected different numbers of robots from {_LEAST} to {there}, as 2,{there}"
+        raise InputError(f"--robots {text}: {wanted}; {scenario.name} has {there} robots")
+    return sizes
+
+
+@dataclass(frozen=True)
+class RecordedTeam:
+    """A team's stages: those that make its maps, and those that measure their cost."""
+
+    run: JudgedRun
+
+    @property
+    def n_robots(self) -> int:
+        """Number of robots."""
+        return len(self.run.pipeline.robots)
+
+    @property
+    def iterations(self) -> tuple[int, ...]:
+        """Iterations at which maps are fused."""
+        return self._fuse_settings(USUAL).iterations
+
+    @property
+    def estimates(self) -> list[Stage]:
+        """Stages that must be finished, in any number of processes, before measurements."""
+        pipeline = self.run.pipeline
+        smoothed = [robot.smooth for robot in pipeline.robots]
+        return [*smoothed, *(pair.estimates for pair in pipeline.pairs)]
+
+    @property
+    def measured(self) -> list[Stage]:
+        """Stages that measure, to be run one after the other."""
+        return [*self.by_robot.values(), *self.by_pair, *self.by_fuser.values()]
+
+    @cached_property
+    def by_robot(self) -> Mapping[str, Stage]:
+        """Measurement of each robot's own work."""
+        found = dict[str, Stage]()
+        for robot in self.run.pipeline.robots:
+            filtered, smoothed = robot.slam.settings, robot.smooth.settings
+            assert isinstance(filtered, SlamSettings)
+            assert isinstance(smoothed, SmoothSettings)
+            found[robot.name] = Stage(
+                "robot_costs",
+                "measure the robots' work",
+                RobotCostSettings(filtered, smoothed),
+                measure_robot,
+                ROBOT_WRITES,
+                {"log": robot.log, "slam": robot.slam, "smooth": robot.smooth},
+            )
+        return found
+
+    @cached_property
+    def by_pair(self) -> list[Stage]:
+        """Measurement of the alignment of each pair of maps."""
+        found = list[Stage]()
+        for pair in self.run.pipeline.pairs:
+            aligned = next(iter(pair.aligners.values()))
+            matched, own = pair.match.settings, aligned.settings
+            assert isinstance(matched, MatchSettings)
+            assert isinstance(own, AlignerSettings)
+            # the batches of iterations in which the aligner ran do not change its cost
+            own = replace(own, iterations=())
+            before = {
+                "log_a": pair.a.log,
+                "slam_a": pair.a.slam,
+                "log_b": pair.b.log,
+                "slam_b": pair.b.slam,
+            }
+            found.append(
+                Stage(
+                    "pair_costs",
+                    _TEAM_LABEL,
+                    PairCostSettings(matched.match, own, self.iterations),
+                    measure_pair,
+                    (COSTS_FILE,),
+                    before,
+                    loads=aligned.loads,
+                )
+            )
+        return found
+
+    @cached_property
+    def by_fuser(self) -> Mapping[str, Stage]:
+        """Measurement of fusion by each fuser."""
+        return {
+            name: Stage(
+                "team_costs",
+                _TEAM_LABEL,
+                self._fuse_settings(name),
+                measure_team,
+                TEAM_WRITES,
+                stage.before,
+                loads=stage.loads,
+            )
+            for name, stage in self.run.pipeline.fusers.items()
+        }
+
+    def _fuse_settings(self, fuser: str) -> FuseSettings:
+        settings = self.run.pipeline.fusers[fuser].settings
+        assert isinstance(settings, FuseSettings)
+        return settings
+
+    def folder(self, stage: Stage) -> Path:
+        """Return the folder of a stage."""
+        return self.run.store.path(stage)
+
+
+def team_of(run: JudgedRun, n_robots: int) -> RecordedTeam:
+    """Return the first robots of a run as a team; their logs must exist.
+
+    Raises:
+        InputError: the truth of recorded logs is not known.
+    """
+    scenario, robots = run.scenario, run.pipeline.robots[:n_robots]
+    merge = scenario.merge
+    chosen = [entry for entry in scenario.align.aligners if entry.name == merge.aligner]
+    changed = {
+        "align": scenario.align.model_copy(update={"aligners": chosen, "repetitions": 1}),
+        "fuse": scenario.fuse.model_copy(update={"fusers": list(FUSERS)}),
+        "merge": merge.model_copy(update={"fuser": USUAL}),
+        "expect": {},
+    }
+    kept = {name: value for name, value in scenario if name in Scenario.model_fields}
+    logs = [str(run.store.path(robot.log)) for robot in robots]
+    recorded = Recording(**kept | changed, logs=logs)
+    if reason := why_no_truth(recorded):
+        raise InputError(f"scenario {scenario.name}: {reason}; errors cannot be told")
+    return RecordedTeam(JudgedRun.of(recorded, run.store))
+
+
+def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
+    """Yield CPU time and peak memory of each strategy at each iteration.
+
+    They are sums from the first iteration on, over robots, pairs and iterations. A robot's own work
+    is its filter and the smoothing that the strategy asks for. The team's work is to align all
+    pairs of maps and to fuse them.
+    """
+
+    def costs_of(stage: Stage) -> pd.DataFrame:
+        return read_rows(team.folder(stage) / COSTS_FILE, WORK_COSTS)
+
+    robots = [costs_of(stage) for stage in team.by_robot.values()]
+    pairs = [costs_of(stage) for stage in team.by_pair]
+    fusers = {name: costs_of(stage) for name, stage in team.by_fuser.items()}
+    for strategy in STRATEGIES:
+        for k in team.iterations:
+            own = [_robot_costs(costs, strategy, team.iterations, k) for costs in robots]
+            asked = strategy.asked(team.iterations, k)
+            aligned = pd.concat([_of(costs, ALIGNMENT, asked) for costs in pairs])
+            fused = _of(fusers[strategy.fuser], FUSION, asked)
+            filtered, smoothed = (pd.concat(parts) for parts in zip(*own, strict=True))
+            busiest = max(float(each["cpu_s"].sum()) for each in map(pd.concat, own))
+            yield {
+                "strategy": strategy.name,
+                "iteration": k,
+                "filter_s": filtered["cpu_s"].sum(),
+                "smoothing_s": smoothed["cpu_s"].sum(),
+                "busiest_robot_s": busiest,
+                "alignment_s": aligned["cpu_s"].sum(),
+                "fusion_s": fused["cpu_s"].sum(),
+                "robot_peak_mb": pd.concat([filtered, smoothed])["peak_mb"].max(),
+                "team_peak_mb": pd.concat([aligned, fused])["peak_mb"].max(),
+            }
+
+
+def sent_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
+    """Yield the sizes of the robots' messages for each strategy at each iteration."""
+    sent = [read_rows(team.folder(stage) / SENT_FILE, SENT) for stage in team.by_robot.values()]
+    for strategy in STRATEGIES:
+        for k in team.iterations:
+            asked = strategy.asked(team.iterations, k)
+            own_mb = []
+            for rows in sent:
+                what = rows[rows["what"] == strategy.sends]
+                when = _own_iterations(what["iteration"], asked)
+                own_mb.append(float(what[what["iteration"].isin(when)]["n_bytes"].sum()) / _MB)
+            about = {"strategy": strategy.name, "iteration": k}
+            yield about | {"sent_mb": sum(own_mb), "most_sent_mb": max(own_mb)}
+
+
+def _robot_costs(
+    costs: pd.DataFrame, strategy: Strategy, iterations: tuple[int, ...], k: int
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return the rows of the filter at an iteration and of the smoothing that was asked for."""
+    filtered = _of(costs, FILTER, _own_iterations(costs["iteration"], [k]))
+    asked = strategy.asked(iterations, k) if strategy.smooths else []
+    return filtered, _of(costs, SMOOTHING, _own_iterations(costs["iteration"], asked))
+
+
+def _own_iterations(known: pd.Series, asked: list[int]) -> list[int]:
+    """Limit iterations to a robot's own: its log may end before those of others."""
+    last = int(known.max())
+    return sorted({min(k, last) for k in asked})
+
+
+def _of(costs: pd.DataFrame, work: str, iterations: list[int]) -> pd.DataFrame:
+    return costs[(costs["work"] == work) & costs["iteration"].isin(iterations)]
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Robots and paths of a team whose maps are evaluated."""
+
+    robots: list[EvaluatedRobot]
+    smoothed: list[SmoothedRobot]
+    filter_paths: _Paths
+
+
+def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
+    """Yield errors of map and paths of each strategy; NaN where no two maps were merged."""
+    run, names = team.run, list(team.by_robot)
+    robots = run.load_robots()
+    filter_paths = dict[str, Mapping[int, Float]]()
+    for stage in team.by_robot.values():
+        filter_paths |= read_paths(team.folder(stage))
+    known = _Known(robots, run.load_smoothed(robots), filter_paths)
+    first = first_shared_iteration(robots, run.scenario.evaluate.true_pair_radius_m)
+    about = {"first_shared": UNKNOWN if first is None else first}
+    judged: dict[tuple[str, int], dict[str, Any]] = {}
+    for fuser, stage in team.by_fuser.items():
+        folder = team.folder(stage)
+        anew = read_paths(folder)
+        for k, fusion in read_fusions(folder, names).items():
+            beside = known.smoothed if make_fuser(fuser).smoothed else [None] * len(robots)
+            given = [GivenMap.at(*both, k) for both in zip(robots, beside, strict=True)]
+            judged[fuser, k] = _errors(JudgedFusion(fuser, k, fusion, given), known, anew)
+    for strategy in STRATEGIES:
+        for k in team.iterations:
+            row = {"strategy": strategy.name, "iteration": k} | about
+            yield row | judged[strategy.fuser, k]
+
+
+def _errors(fusion: JudgedFusion, known: _Known, anew: _Paths) -> dict[str, Any]:
+    """Return the errors of one fused map; paths that its fuser estimated anew take precedence."""
+    fused = fusion.fusion
+    row = {"n_merged": len(fused.members), "fallback": fusion.fallback}
+    if len(fused.members) < 2:
+        return row
+    fit, paths = fusion.fit, []
+    for k in fused.members:
+        robot, T_first_map = known.robots[k], fused.T_first_map[k]
+        poses = anew.get(robot.name, {}).get(fusion.iteration)
+        if poses is None:
+            poses = _own_path(known, fusion, int(k))
+        else:
+            T_first_map = IDENTITY
+        truth = robot.path
+        placed = PlacedPath(poses, truth.T_map_robot[: len(poses)], T_first_map, truth.T_world_map)
+        paths.append(placed)
+    return row | {
+        "n_landmarks": len(fused.landmarks),
+        "landmark_rmse_m": rmse(fit.frame_error_m[~fit.gross]),
+        "fitted_rmse_m": fit.rmse_m,
+        "gross_share": fit.gross_share,
+        "path_rmse_m": STATISTICS["rmse"](team_ate_m(paths)),
+    }
+
+
+def _own_path(known: _Known, fusion: JudgedFusion, place: int) -> Float:
+    """Return the path (T, 3) of the map that a robot gave: of the smoother or of the filter."""
+    given, smoothed = fusion.given[place], known.smoothed[place]
+    for k, landmarks in smoothed.maps.items():
+        if given.landmarks is landmarks:
+            return smoothed.paths[k]
+    own = known.filter_paths[given.robot.name]
+    return own[max(k for k in own if k <= fusion.iteration)]
 
 
 @dataclass(frozen=True)
 class Independence:
-    """The tables `TEAMS` and `COSTS`."""
+    """Tables `TEAMS` and `COSTS`."""
 
     teams: pd.DataFrame
     costs: pd.DataFrame
@@ -68,17 +433,17 @@ def run_independence(
     jobs: int,
     on_progress: OnProgress,
 ) -> Independence:
-    """Make logs and maps, measure, and judge.
+    """Make logs and maps, measure their cost, and evaluate them.
 
     Args:
-        scenarios: of one name and different seeds.
-        sizes: numbers of robots; each team is the first so many.
-        store: where everything is kept.
-        jobs: processes, for what is not measured.
-        on_progress: is told label, done and total.
+        scenarios: scenarios of one name and different seeds.
+        sizes: numbers of robots; a team consists of the first robots.
+        store: store of all stages.
+        jobs: number of processes for work that is not measured.
+        on_progress: called with label, done and total.
 
     Raises:
-        InputError: what is recorded cannot be read, or its truth is not known.
+        InputError: a recording cannot be read, or its truth is not known.
     """
     teams, costs = [], []
     for scenario in scenarios:
@@ -94,7 +459,7 @@ def run_independence(
 def _tables(
     run: JudgedRun, sizes: Sequence[int], jobs: int, on_progress: OnProgress
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Of one seed."""
+    """Return the two tables of one seed."""
     if logs := [robot.log for robot in run.pipeline.simulated]:
         run.execute(jobs, on_progress, logs)
     teams = [team_of(run, n_robots) for n_robots in sizes]
@@ -103,22 +468,20 @@ def _tables(
     stages = {stage.key: stage for team in teams for stage in team.measured}
     with workers(1) as this_process:
         run_tasks(list(tasks_of(stages.values(), run.store).values()), this_process, on_progress)
-    made = [_rows(team) for team in teams]
-    return pd.concat([each[0] for each in made]), pd.concat([each[1] for each in made])
-
-
-def _rows(team: RecordedTeam) -> tuple[pd.DataFrame, pd.DataFrame]:
-    errors, sent = (pd.DataFrame(list(rows)) for rows in (error_rows(team), sent_rows(team)))
-    both = errors.merge(sent, "left", ["strategy", "iteration"])
-    costs = pd.DataFrame(list(cost_rows(team)))
-    return both.assign(n_robots=team.n_robots), costs.assign(n_robots=team.n_robots)
+    found, costs = [], []
+    for team in teams:
+        errors, sent = (pd.DataFrame(list(rows)) for rows in (error_rows(team), sent_rows(team)))
+        both = errors.merge(sent, "left", ["strategy", "iteration"])
+        found.append(both.assign(n_robots=team.n_robots))
+        costs.append(pd.DataFrame(list(cost_rows(team))).assign(n_robots=team.n_robots))
+    return pd.concat(found), pd.concat(costs)
 
 
 def at_the_end(found: Independence) -> pd.DataFrame:
-    """One row a size of team and strategy: medians over seeds, at the last iteration.
+    """Return medians over seeds at the last iteration, one row per size of team and strategy.
 
-    Columns: those of the tables; n_seeds; n_whole, at how many of them all robots' maps became one;
-    robots_s and team_s, the sums of a team's own columns.
+    Columns: those of the tables; n_seeds; n_whole, the number of seeds with one map of all robots;
+    robots_s and team_s, sums of the columns of robots and of the team.
     """
     both = found.teams.merge(found.costs, "left", _COLUMNS)
     last = both[

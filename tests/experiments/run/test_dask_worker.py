@@ -37,6 +37,12 @@ def test_it_runs_and_leaves_no_mark(terms: Terms, tmp_path: Path) -> None:
     assert not list(terms.attempts.iterdir())
 
 
+def test_it_returns_what_the_function_returns(terms: Terms, tmp_path: Path) -> None:
+    assert perform("drive/k", packed(int, "7"), terms) == 7
+    done = packed(acting.break_down, outputs=(Path(__file__),))  # done before: it is not called
+    assert perform("drive/k", done, terms) is None
+
+
 @pytest.mark.parametrize(
     ("function", "reason", "with_details"),
     [

@@ -22,8 +22,9 @@ from experiments.studies.independence.independence_trial import (
     Independence,
     at_the_end,
     run_independence,
+    team_of,
+    team_sizes,
 )
-from experiments.studies.independence.recorded_teams import team_of, team_sizes
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2
 from tests.helpers.tiny_scenario import assert_refused, command

@@ -7,12 +7,20 @@ from typing import Any
 import pytest
 
 from experiments.pipeline.tables import write_rows
-from experiments.studies.independence.measured_work import COSTS_FILE, WORK_COSTS
-from experiments.studies.independence.pair_costs import ALIGNMENT
-from experiments.studies.independence.robot_costs import FILTER, SENT, SENT_FILE, SMOOTHING
-from experiments.studies.independence.strategies import FILTER_MAP, LOG, SMOOTHED_MAP, STRATEGIES
-from experiments.studies.independence.team_accounts import cost_rows, sent_rows
-from experiments.studies.independence.team_costs import FUSION
+from experiments.studies.independence.independence_trial import STRATEGIES, cost_rows, sent_rows
+from experiments.studies.independence.measured_work import (
+    ALIGNMENT,
+    COSTS_FILE,
+    FILTER,
+    FILTER_MAP,
+    FUSION,
+    LOG,
+    SENT,
+    SENT_FILE,
+    SMOOTHED_MAP,
+    SMOOTHING,
+    WORK_COSTS,
+)
 
 ITERATIONS = (10, 20, 30)
 FIRST, LAST = 10, 30

@@ -2,7 +2,7 @@
 
 import itertools
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import duckdb
@@ -13,12 +13,7 @@ from experiments.studies import sweep_tables as dataset_module
 from experiments.studies import sweep_tables as joined_module
 from experiments.studies.run_tables import find_runs
 from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import (
-    JoinedTables,
-    SweepDataset,
-    open_dataset,
-    written_by_nobody_else,
-)
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset, written_by_nobody_else
 from mapfusion.errors import InputError, MendedWarning
 from mapfusion.files import write_json
 
@@ -37,7 +32,7 @@ RUNS = [run(seed) for seed in range(7)]
 def few_runs_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three runs a file, of which two are a row group."""
     monkeypatch.setattr(joined_module, "RUNS_PER_FILE", 3)
-    monkeypatch.setattr(joined_module, "_ROWS_PER_GROUP", 5)
+    monkeypatch.setattr(joined_module, "_RUNS_PER_GROUP", 2)
 
 
 @pytest.fixture
@@ -45,12 +40,19 @@ def dataset(tmp_path: Path) -> SweepDataset:
     return SweepDataset(tmp_path / "sweep", KEYS)
 
 
-def finish(dataset: SweepDataset, runs: Iterable[SweepRun], n_landmarks: int = 9) -> None:
-    """As many fits as the seed tells, so that files differ; a table without any row, too."""
+def opened(dataset: SweepDataset, runs: Sequence[SweepRun]) -> JoinedTables:
+    """Return the tables as a new command opens them."""
+    joined = JoinedTables(dataset)
+    joined.ask_for(runs)
+    return joined
+
+
+def finish(joined: JoinedTables, runs: Iterable[SweepRun], n_landmarks: int = 9) -> None:
+    """Add runs: as many fits as the seed says, so that files differ; and a table without a row."""
     for each in runs:
         fits = [{"map": f"R{i}", "n_landmarks": n_landmarks, "rmse_m": 0.1 * i} for i in range(3)]
         made = {"map_fits": fits[: 1 + each.seed % 3], "errors": []}
-        dataset.finish(each, "TinyRenderer", STAGES, made)
+        joined.add(each, joined.dataset.finished(each, "TinyRenderer", STAGES, made))
 
 
 def files(dataset: SweepDataset) -> dict[str, bytes]:
@@ -62,9 +64,9 @@ def _all(dataset: SweepDataset) -> Iterator[Path]:
 
 
 def test_runs_stand_in_their_order_and_nothing_waits(dataset: SweepDataset) -> None:
-    joined = open_dataset(dataset, RUNS)
-    finish(dataset, RUNS[::-1])
-    joined.join()
+    joined = opened(dataset, RUNS)
+    finish(joined, RUNS[::-1])
+    joined.write()
     assert [path.name for path in dataset.files("map_fits")] == [
         f"0000{i}.parquet" for i in (0, 1, 2)
     ]
@@ -74,7 +76,7 @@ def test_runs_stand_in_their_order_and_nothing_waits(dataset: SweepDataset) -> N
     assert counted == [(len(fits),)]
     assert pd.read_parquet(dataset.folder / "runs")["seed"].tolist() == list(range(7))
     assert pd.read_parquet(dataset.folder / "errors")["n_true"].dtype == "int32"
-    assert not dataset.waiting.exists()
+    assert joined.waiting_bytes == 0
 
 
 @pytest.mark.parametrize("steps", [[7], [1] * 7, [2, 4, 1]])
@@ -82,26 +84,26 @@ def test_the_same_bytes_in_whatever_order_and_steps(
     steps: list[int], dataset: SweepDataset, tmp_path: Path
 ) -> None:
     other = SweepDataset(tmp_path / "other", KEYS)
-    at_once = open_dataset(other, RUNS)
-    finish(other, RUNS)
-    at_once.join()
-    left = [RUNS[place] for place in (5, 0, 6, 3, 2, 1, 4)]
+    at_once = opened(other, RUNS)
+    finish(at_once, RUNS)
+    at_once.write()
+    left = [RUNS[place] for place in (4, 1, 6, 3, 2, 0, 5)]
     for step in steps:
-        joined = open_dataset(dataset, RUNS)  # as by a new command each time
-        finish(dataset, left[:step])
-        joined.join()
+        joined = opened(dataset, RUNS)
+        finish(joined, left[:step])
+        joined.write()
         left = left[step:]
     assert files(dataset) == files(other)
 
 
 def test_more_runs_come_behind_and_others_stay(dataset: SweepDataset) -> None:
-    joined = open_dataset(dataset, RUNS[:2])
-    finish(dataset, RUNS[:2])
-    joined.join()
+    joined = opened(dataset, RUNS[:2])
+    finish(joined, RUNS[:2])
+    joined.write()
     more = [run(0, "3"), RUNS[1], RUNS[5]]
-    finish(dataset, [more[0], more[2]])
-    joined = open_dataset(dataset, more)
-    joined.join()
+    joined = opened(dataset, more)
+    finish(joined, [more[0], more[2]])
+    joined.write()
     expected = [run.run_id for run in (*RUNS[:2], more[0], more[2])]
     assert joined.run_ids == expected
     assert pd.read_parquet(dataset.folder / "runs")["run_id"].tolist() == expected
@@ -111,10 +113,10 @@ def test_readers_find_whole_runs_once_at_any_moment(
     dataset: SweepDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Looked at after each file that is put into place or removed, as after a kill there."""
-    joined = open_dataset(dataset, RUNS)
-    finish(dataset, RUNS[:2])
-    joined.join()
-    finish(dataset, RUNS[1:5], n_landmarks=4)  # one of them made again, with other rows
+    joined = opened(dataset, RUNS)
+    finish(joined, RUNS[:2])
+    joined.write()
+    finish(joined, RUNS[1:5], n_landmarks=4)  # one of them made again, with other rows
     looks = []
 
     def look(path: Path) -> None:
@@ -130,7 +132,7 @@ def test_readers_find_whole_runs_once_at_any_moment(
 
     for name in ("replace", "unlink"):
         monkeypatch.setattr(Path, name, _then(getattr(Path, name), look))
-    joined.join()
+    joined.write()
     monkeypatch.undo()
     assert looks[-1] == [0, 1, 2, 3, 4]
     assert [0] in looks  # while the tables of the other one were replaced
@@ -148,23 +150,25 @@ def _then(work: object, look: object) -> object:
     return both
 
 
-def test_a_join_that_is_killed_anywhere_is_made_up_for(
+def test_writing_that_is_killed_anywhere_is_made_up_for(
     dataset: SweepDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = SweepDataset(tmp_path / "other", KEYS)
     for one in (dataset, other):
-        joined = open_dataset(one, RUNS[:5])
-        finish(one, RUNS[:2])
-        joined.join()
-        finish(one, RUNS[1:5], n_landmarks=4)
-    open_dataset(other, RUNS[:5]).join()
+        joined = opened(one, RUNS[:5])
+        finish(joined, RUNS[:2])
+        joined.write()
+    finish(joined, RUNS[1:5], n_landmarks=4)
+    joined.write()
     for n_files in itertools.count():
         left = iter(range(n_files))
         with monkeypatch.context() as patch:
             for name in ("replace", "unlink"):
                 patch.setattr(os, name, _killed_when_none_is(left, getattr(os, name)))
+            joined = JoinedTables(dataset)  # the next command makes the same runs again
+            finish(joined, RUNS[1:5], n_landmarks=4)
             try:
-                open_dataset(dataset, RUNS[:5]).join()
+                joined.write()
             except KeyboardInterrupt:
                 continue
         break
@@ -185,54 +189,44 @@ def _killed_when_none_is(left: Iterator[int], work: object) -> object:
 def test_a_run_is_held_once_it_is_finished_from_the_same_stages(
     dataset: SweepDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    joined = open_dataset(dataset, RUNS)
+    joined = opened(dataset, RUNS)
     assert not joined.holds(RUNS[0], STAGES)
-    finish(dataset, RUNS[:2])
-    for _ in ("waiting", "joined"):
+    finish(joined, RUNS[:2])
+    for _ in ("waiting", "written"):
         assert joined.holds(RUNS[0], STAGES)
         assert not joined.holds(RUNS[0], ["drive/1", "judge/3"])
         assert not joined.holds(RUNS[2], STAGES)
         assert not joined.holds(run(99), STAGES)
-        joined.join()
+        joined.write()
+        joined = JoinedTables(dataset)
     monkeypatch.setattr(dataset_module, "source_hash", lambda: "other")
     assert not joined.holds(RUNS[0], STAGES)
 
 
 @pytest.mark.parametrize("table", ["runs", "map_fits"])
 def test_damaged_tables_are_told_and_made_again(dataset: SweepDataset, table: str) -> None:
-    joined = open_dataset(dataset, RUNS)
-    finish(dataset, RUNS)
-    joined.join()
+    joined = opened(dataset, RUNS)
+    finish(joined, RUNS)
+    joined.write()
     before, path = files(dataset), dataset.path(table, 1)
     path.write_bytes(path.read_bytes()[:-20] + b"!" + path.read_bytes()[-19:])
-    joined = open_dataset(dataset, RUNS)
+    joined = JoinedTables(dataset)
     with pytest.warns(MendedWarning, match=rf"{table}/00001\.parquet: damaged"):
         held = [joined.holds(each, STAGES) for each in RUNS]
     assert held == [True] * 3 + [False] * 3 + [True]
     assert path.is_file()  # only looked at, as by --dry-run
-    finish(dataset, RUNS[3:6])
-    joined.join()
+    finish(joined, RUNS[3:6])
+    joined.write()
     assert files(dataset) == before
 
 
-def test_rows_that_are_damaged_while_they_wait_are_made_again(dataset: SweepDataset) -> None:
-    joined = open_dataset(dataset, RUNS)
-    for find in (lambda: joined.holds(RUNS[0], STAGES), joined.join):
-        finish(dataset, RUNS[:1])
-        dataset.waiting_path(RUNS[0]).write_bytes(b"half a file")
-        with pytest.warns(MendedWarning, match="makes its run again"):
-            assert not find()
-    assert not dataset.waiting.exists()
-    assert not joined.holds(RUNS[0], STAGES)
-
-
 def test_a_failed_run_is_one_row_and_nothing_else(dataset: SweepDataset) -> None:
-    joined = open_dataset(dataset, RUNS)
-    finish(dataset, RUNS[:2])
-    joined.join()
-    dataset.fail(RUNS[0], "R1 drove into a wall")
-    dataset.fail(RUNS[2], "no reason\nin one line")
-    joined.join()
+    joined = opened(dataset, RUNS)
+    finish(joined, RUNS[:2])
+    joined.write()
+    joined.add(RUNS[0], dataset.failed(RUNS[0], "R1 drove into a wall", []))
+    joined.add(RUNS[2], dataset.failed(RUNS[2], "no reason\nin one line", []))
+    joined.write()
     read = pd.read_parquet(dataset.folder / "runs").set_index("seed")
     assert read["status"].tolist() == ["failed", "finished", "failed"]
     assert read.loc[0, "reason"] == "R1 drove into a wall"
@@ -245,33 +239,33 @@ def test_rows_of_an_earlier_version_lack_its_columns(
 ) -> None:
     own = dataset_module._OWN_FIELDS
     fewer = {name: fields[:-1] for name, fields in own.items() if name == "run_times"}
-    joined = open_dataset(dataset, RUNS)
+    joined = opened(dataset, RUNS)
     times = {"run_times": [{"stage": "slam", "key": "k", "figure": "elapsed_s", "seconds": 1.5}]}
     for each, known in ((RUNS[0], own | fewer), (RUNS[1], own)):
         monkeypatch.setattr(dataset_module, "_OWN_FIELDS", known)
-        dataset.finish(each, "", STAGES, times)
-        joined.join()
+        joined.add(each, dataset.finished(each, "", STAGES, times))
+        joined.write()
     read = pd.read_parquet(dataset.folder / "run_times")
     assert read["seconds"].fillna(-1).tolist() == [-1, 1.5]
 
 
 def test_a_folder_is_opened_again_for_the_same_settings_alone(dataset: SweepDataset) -> None:
-    open_dataset(dataset, RUNS)
-    assert JoinedTables.of(dataset).run_ids == [each.run_id for each in RUNS]
+    opened(dataset, RUNS)
+    assert JoinedTables(dataset).run_ids == [each.run_id for each in RUNS]
     with pytest.raises(InputError, match=r"sweep over slam\.min_count, .* over seeds alone"):
-        open_dataset(SweepDataset(dataset.folder, ()))
+        JoinedTables(SweepDataset(dataset.folder, ()))
     write_json(dataset.folder / "sweep.json", {})
     with pytest.raises(InputError, match=r"sweep\.json: damaged"):
-        open_dataset(dataset)
+        JoinedTables(dataset)
     write_json(dataset.folder / "sweep.json", {"schema_version": 1, "settings": []})
     with pytest.raises(InputError, match=r"schema_version is 1, .*; give it another --output"):
-        open_dataset(dataset)
+        JoinedTables(dataset)
 
 
 def test_a_folder_of_other_things_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(InputError, match="no folder of a sweep"):
-        open_dataset(SweepDataset(tmp_path, ()))
+        JoinedTables(SweepDataset(tmp_path, ()))
 
 
 def test_one_command_alone_writes(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_tables import (
     ERRORS,
     GIVEN,
+    JoinedTables,
     SweepDataset,
     medians_over_runs,
-    open_dataset,
 )
 
 EMPTY = {pa.string(): "", pa.bool_(): False}
@@ -28,10 +28,11 @@ def _joined(
     folder: Path, keys: tuple[str, ...], made: dict[SweepRun, list[dict[str, object]]]
 ) -> SweepDataset:
     dataset = SweepDataset(folder / "sweep", keys)
-    tables_of = open_dataset(dataset, list(made))
+    tables_of = JoinedTables(dataset)
+    tables_of.ask_for(list(made))
     for run, rows in made.items():
-        dataset.finish(run, "", [], {"errors": rows})
-    tables_of.join()
+        tables_of.add(run, dataset.finished(run, "", [], {"errors": rows}))
+    tables_of.write()
     return dataset
 
 

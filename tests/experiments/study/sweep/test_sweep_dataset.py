@@ -1,4 +1,4 @@
-"""A run's rows on their way into a sweep's tables."""
+"""Rows of one run of a sweep."""
 
 from pathlib import Path
 
@@ -8,8 +8,7 @@ import pytest
 
 from experiments.evaluation import tables
 from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import SweepDataset, read_waiting
-from mapfusion.errors import DamagedFileError
+from experiments.studies.sweep_tables import SweepDataset
 
 RUN = SweepRun(Path("x.yaml"), "x", 7, (("slam.min_count", "2"), ("align.repetitions", "1")))
 FITS = [{"map": "R1", "n_landmarks": 5, "rmse_m": 0.1}, {"map": "R2", "n_landmarks": 6}]
@@ -35,31 +34,22 @@ def test_empty_tables_keep_their_types(dataset: SweepDataset, none: object) -> N
     assert rows.schema.field("n_true").type == pa.int32()
 
 
-def test_rows_wait_as_they_were_given(dataset: SweepDataset) -> None:
-    dataset.finish(RUN, "TinyRenderer", ["judge/2"], {"map_fits": FITS, "errors": []})
-    found = read_waiting(dataset.waiting_path(RUN))
+def test_a_finished_run_has_a_row_in_runs_and_its_tables(dataset: SweepDataset) -> None:
+    found = dataset.finished(RUN, "TinyRenderer", ["judge/2"], {"map_fits": FITS, "errors": []})
     assert list(found) == ["map_fits", "errors", "runs"]
     given = dataset.rows("map_fits", RUN, FITS)
     assert found["map_fits"].schema.equals(given.schema, check_metadata=True)
     assert found["map_fits"].to_pandas().equals(given.to_pandas())
     (run,) = found["runs"].to_pylist()
-    assert (run["status"], run["renderer"]) == ("finished", "TinyRenderer")
+    assert (run["status"], run["renderer"], run["stages"]) == (
+        "finished",
+        "TinyRenderer",
+        '["judge/2"]',
+    )
 
 
-def test_of_a_failed_run_its_reason_alone_waits(dataset: SweepDataset) -> None:
-    dataset.finish(RUN, "TinyRenderer", [], {"map_fits": FITS})
-    details = dataset.fail(RUN, "R1 drove\ninto a wall", "a traceback")
-    assert details.read_text() == "a traceback"
-    (run,) = read_waiting(dataset.waiting_path(RUN)).pop("runs").to_pylist()
+def test_a_failed_run_has_its_reason_alone(dataset: SweepDataset) -> None:
+    found = dataset.failed(RUN, "R1 drove\ninto a wall", [])
+    assert list(found) == ["runs"]
+    (run,) = found["runs"].to_pylist()
     assert (run["status"], run["reason"]) == ("failed", "R1 drove\ninto a wall")
-    dataset.finish(RUN, "TinyRenderer", [], {})
-    assert not details.exists()
-
-
-@pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: b"x" + data[1:]])
-def test_damaged_rows_are_named(dataset: SweepDataset, damage: object) -> None:
-    dataset.finish(RUN, "TinyRenderer", [], {})
-    path = dataset.waiting_path(RUN)
-    path.write_bytes(damage(path.read_bytes()))  # type: ignore[operator]
-    with pytest.raises(DamagedFileError, match=r"\.arrow: damaged"):
-        read_waiting(path)

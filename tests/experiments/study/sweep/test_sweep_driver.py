@@ -2,6 +2,8 @@
 
 import contextlib
 import http.client
+import os
+import signal
 import socket
 import ssl
 import time
@@ -14,7 +16,7 @@ import dask.config
 import pandas as pd
 import psutil
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, Future, LocalCluster
 from distributed.security import Security
 
 from experiments.pipeline.cluster import Terms, code_version, connected
@@ -25,7 +27,7 @@ from experiments.studies import sweep_plan as plan_module
 from experiments.studies.sweep import OnSweepProgress, SweepDriver, SweepProgress
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_plan import PlannedRun, Sweep
-from experiments.studies.sweep_tables import JoinedTables, SweepDataset, open_dataset
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset
 from mapfusion.errors import InputError, MendedWarning
 from tests.helpers import acting
 
@@ -66,8 +68,8 @@ class Scene:
     ) -> PlannedRun:
         tasks = {task.name: task for task in self.tasks[run.seed]}
         name = f"run/{run.run_id}"
-        finish = self.dataset.finish
-        tasks[name] = Task(name, "tables", finish, (run, "", [], {}), (), tuple(tasks))
+        rows_of = self.dataset.finished
+        tasks[name] = Task(name, "tables", rows_of, (run, "", [], {}), (), tuple(tasks))
         left = [] if joined.holds(run, []) else unfinished(tasks, [name])
         return PlannedRun(run, [], tasks, left)
 
@@ -75,7 +77,8 @@ class Scene:
         return self.execute_telling(client, self.told.append)
 
     def execute_telling(self, client: Client, tell: OnSweepProgress) -> SweepDriver:
-        joined = open_dataset(self.dataset, self.sweep.runs)
+        joined = JoinedTables(self.dataset)
+        joined.ask_for(self.sweep.runs)
         driver = SweepDriver(client, self.sweep, joined, self.terms, tell)
         driver.execute()
         return driver
@@ -208,6 +211,60 @@ def test_killed_workers_are_replaced_and_only_the_killer_gives_up(
     assert rows.pop(0) == ("failed", "slam: its worker was killed 4 times (out of memory?)")
     assert set(rows.values()) == {("finished", "")}
     assert deaths.read_text().split() == ["died"] * 4
+
+
+def test_rows_that_died_with_their_worker_are_made_again(
+    scene: Scene, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task_ended, killed = SweepDriver._task_ended, list[int]()
+
+    def lose_the_first(driver: SweepDriver, future: Future) -> None:
+        if "run/" in future.key and not killed:
+            (holders,) = client.who_has([future]).values()
+            killed.extend(client.run(os.getpid, workers=list(holders)).values())
+            os.kill(killed[0], signal.SIGKILL)
+        task_ended(driver, future)
+
+    monkeypatch.setattr(SweepDriver, "_task_ended", lose_the_first)
+    for seed in range(3):
+        scene.write(seed, f"slam/{seed}")
+    assert not scene.execute(client).progress.failed
+    assert len(killed) == 1
+    assert scene.rows() == dict.fromkeys(range(3), ("finished", ""))
+
+
+def test_what_is_done_is_written_when_the_sweep_is_interrupted(
+    scene: Scene, client: Client
+) -> None:
+    for seed in range(3):
+        scene.write(seed, f"slam/{seed}")
+
+    def interrupt(progress: SweepProgress) -> None:
+        if progress.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        scene.execute_telling(client, interrupt)
+    assert list(scene.rows().values()) == [("finished", "")] * 2
+
+
+@pytest.mark.parametrize("limit", ["_WRITE_EVERY_S", "_MOST_WAITING_BYTES"])
+def test_rows_are_written_while_the_sweep_runs(
+    scene: Scene, client: Client, monkeypatch: pytest.MonkeyPatch, limit: str
+) -> None:
+    """After a time, and when they fill the memory."""
+    monkeypatch.setattr(driver_module, limit, 0)
+    monkeypatch.setattr(driver_module, "_TIMES_AS_LONG", 0)
+    for seed in range(3):
+        scene.write(seed, f"slam/{seed}")
+    written = Counter[int]()
+
+    def look(progress: SweepProgress) -> None:
+        if progress.done:
+            written[len(scene.rows())] += 1
+
+    scene.execute_telling(client, look)
+    assert sorted(written) == [1, 2, 3]
 
 
 def test_the_scheduler_holds_a_window_of_tasks_alone(
