@@ -1,1 +1,1 @@
-"""The report of a result: one HTML file that shows it all and needs nothing else."""
+"""HTML report of a result, complete in one file."""
