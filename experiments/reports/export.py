@@ -14,7 +14,7 @@ from mapfusion.files import write_whole
 from mapfusion.geometry.joint_covariance import RANK
 from mapfusion.tables import HEIGHT, about, default_of
 
-# What a reader of a page can use; the CSV keeps every digit.
+# The CSV keeps every digit.
 _SIGNIFICANT_DIGITS = 4
 
 
@@ -28,25 +28,25 @@ def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file as a whole."""
-    data = text.encode("utf-8", "backslashreplace")  # what a user gave may hold half characters
+    data = text.encode("utf-8", "backslashreplace")  # text of users may hold half characters
     write_whole(path, lambda file: file.write_bytes(data))
 
 
 def to_markdown(table: pd.DataFrame) -> str:
-    """A pipe table; pipes inside names are escaped."""
+    """Return a Markdown pipe table; pipes inside names are escaped."""
     shown = rounded(table).map(lambda text: text.replace("|", "\\|"))
     alignment = ["right" if name in _numbers(table) else "left" for name in table]
     return shown.to_markdown(index=False, disable_numparse=True, colalign=alignment) + "\n"
 
 
 def to_latex(table: pd.DataFrame) -> str:
-    """A booktabs table; names are escaped."""
+    """Return a LaTeX booktabs table; names are escaped."""
     alignment = "".join("r" if name in _numbers(table) else "l" for name in table)
     return rounded(table).to_latex(index=False, escape=True, column_format=alignment)
 
 
 def rounded(table: pd.DataFrame) -> pd.DataFrame:
-    """All cells as text: four significant digits, a dash for what is not known."""
+    """Return all cells as text: four significant digits, and a dash for unknown values."""
     return table.astype(object).map(_text).where(table.notna(), "-")
 
 
@@ -83,7 +83,7 @@ _OPEN = {
 
 
 def page(text: str) -> str:
-    """The page with its tables as the schemas say; what stands before them is kept."""
+    """Return the page with the tables of the schemas; text before the tables is kept."""
     return "\n".join([text.partition(TABLES_BEGIN)[0] + TABLES_BEGIN, *_lines(), ""])
 
 

@@ -6,7 +6,7 @@ from functools import partial
 
 
 def plain(text: str) -> str:
-    """What a terminal would obey, or could not print, written as Python writes it."""
+    """Replace control and unprintable characters by their escapes in Python."""
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
@@ -15,7 +15,7 @@ UNKNOWN = "–"
 
 
 def percent(share: float) -> str:
-    """A share as a percentage; 100 % and 0 % only where they are exact."""
+    """Write a share as a percentage; only exact values give 100 % and 0 %."""
     if math.isnan(share):
         return UNKNOWN
     value = 100 * share
@@ -27,7 +27,7 @@ def percent(share: float) -> str:
 
 
 def two_digits(value: float) -> str:
-    """A figure with about two significant digits; its unit stands in the heading."""
+    """Write a number with about two significant digits and without its unit."""
     if not math.isfinite(value):
         return UNKNOWN if math.isnan(value) else str(value)
     digits = 0 if value >= 100 else max(0, min(5, 1 - math.floor(math.log10(abs(value) or 1))))
@@ -35,7 +35,7 @@ def two_digits(value: float) -> str:
 
 
 def with_unit(unit: str, value: float) -> str:
-    """Two digits and the unit; what is not known or infinite has none."""
+    """Write a number with two digits and its unit; unknown and infinite values have no unit."""
     return f"{two_digits(value)}{_SPACE}{unit}" if math.isfinite(value) else two_digits(value)
 
 
@@ -43,19 +43,19 @@ metres, radians, milliseconds = (partial(with_unit, unit) for unit in ("m", "rad
 
 
 def ratio(value: float) -> str:
-    """How many times larger."""
+    """Write a ratio of two quantities."""
     if math.isnan(value):
         return UNKNOWN
     return f"{value:.2f}" if value < 10 else f"{value:.0f}"
 
 
 def number(value: float, layout: str) -> str:
-    """A number in a format."""
+    """Write a number in a format; NaN is unknown."""
     return UNKNOWN if math.isnan(value) else format(value, layout)
 
 
 def interval(value: float, low: float, high: float, layout: str) -> str:
-    """A number with its interval, where that says anything, in brackets that repeat no unit."""
+    """Write a number with its interval, if known, in brackets without units."""
     text = number(value, layout)
     if math.isnan(low) or math.isnan(high) or (math.isinf(low) and math.isinf(high)):
         return text
@@ -64,5 +64,5 @@ def interval(value: float, low: float, high: float, layout: str) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names in a sentence: "a, b and c"."""
+    """Join names for a sentence: "a, b and c"."""
     return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names)

@@ -1,4 +1,4 @@
-"""`mapfusion inspect`: what a file or folder is, of which version, and what it holds."""
+"""Command `inspect`: kind, version and contents of a file or folder."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ class Contents(NamedTuple):
 
 
 def inspect(path: Path) -> None:
-    """Print what a file or folder is and holds; raises InputError as `contents_of` does."""
+    """Print kind and contents of a file or folder; raises InputError as `contents_of` does."""
     found = contents_of(path)
     facts = {name: f"  {name}: {value}" for name, value in found.facts.items()}
     version = f", schema version {found.facts[_VERSION]}" if facts.pop(_VERSION, "") else ""
@@ -78,7 +78,7 @@ def inspect(path: Path) -> None:
 
 
 def contents_of(path: Path) -> Contents:
-    """What a file or folder is; raises InputError if missing, damaged, or none of mapfusion's."""
+    """Describe a file or folder; raises InputError if missing, damaged, or none of mapfusion's."""
     if path.is_dir():
         return _folder(path)
     if not path.exists():
@@ -102,7 +102,7 @@ def _resolved(path: Path) -> dict[str, Any]:
 
 
 def unit_of(name: str) -> str:
-    """The unit that a column's name ends in; empty for none."""
+    """Return the unit at the end of a column's name; empty if there is none."""
     stem, _, end = name.rpartition("_")
     return (_OF_AXES if stem == "cov" else _UNITS).get(end, "") if stem else ""
 
@@ -137,7 +137,7 @@ def _open_schema(path: Path) -> pa.Schema:
 
 
 def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
-    """A table whoever wrote it, read as `align`, `merge` and `slam` do; raises InputError."""
+    """Describe a table of any writer, read as `align`, `merge` and `slam` do; raises InputError."""
     table, facts = read_open_table(path, table_schema)
     kind = table_schema.metadata[f"{_PREFIX}{_KIND}".encode()].decode()
     known: dict[str, Any] = {name: value for name, value in facts.items() if name != _KIND}
@@ -159,7 +159,7 @@ def _json(path: Path) -> Contents:
 
 
 def _brief(found: dict[str, Any]) -> dict[str, Any]:
-    """What can be read at a glance: single values and names; the file itself shows the rest."""
+    """Select single values and names; the file itself shows the rest."""
     facts = {}
     for name, value in found.items():
         is_names = isinstance(value, list) and all(isinstance(each, str) for each in value)

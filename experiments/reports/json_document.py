@@ -1,4 +1,4 @@
-"""What `--json` prints: one document a command, with the same names whatever was found.
+"""Documents of `--json`: one for each command, always with the same names.
 
 Units are in the names. Null is what is not known; an estimate that was refused is null, and a
 `reason` stands beside it. So is a median error where most have no estimate: it is infinite.
@@ -28,7 +28,7 @@ _AXES = ("xx_m2", "xy_m2", "xt_m_rad", "yy_m2", "yt_m_rad", "tt_rad2")  # those 
 
 
 def publish(kind: str, content: Mapping[str, Any], shown: bool, path: Path | None = None) -> None:
-    """Print the document of a command where it is to be shown, write it where there is a path."""
+    """Print the document of a command if it is shown, and write it if there is a path."""
     document = {"schema_version": SCHEMA_VERSION, "kind": kind} | _json_able(content)
     text = json.dumps(document, indent=1, allow_nan=False) + "\n"
     if path is not None:
@@ -64,7 +64,7 @@ def _covariance(upper: Iterable[float]) -> dict[str, float]:
 def of_alignment(
     maps: Sequence[Path], seed: int, rows: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Every aligner's T_a_b, from the rows of `user_files.align`."""
+    """Return every aligner's T_a_b, from the rows of `user_files.align`."""
     return {"map_a": maps[0], "map_b": maps[1], "seed": seed, "aligners": list(map(_aligner, rows))}
 
 
@@ -118,7 +118,7 @@ def of_fusion(
 
 
 def _fused(path: Path | None, fused: FusedMap, maps: Sequence[Path]) -> dict[str, Any]:
-    """What a fused map was made of; `T_first_map` is null for a map that was left out."""
+    """Return the sources of a fused map; `T_first_map` is null for a map that was left out."""
     reasons = (reason for _, reason in fused.left_out)
     sources = []
     for name, T, S in zip(maps, fused.T_first_map, fused.motion_covariance, strict=True):
@@ -134,7 +134,7 @@ def _fused(path: Path | None, fused: FusedMap, maps: Sequence[Path]) -> dict[str
 
 
 def of_checks(checks: Sequence[CheckedScenario]) -> dict[str, Any]:
-    """What was expected of scenarios, what was measured, and which could not be run."""
+    """Return expected and measured values of scenarios, and the runs that failed."""
     return {"passed": all(each.passed for each in checks), "scenarios": list(map(_check, checks))}
 
 

@@ -1,4 +1,4 @@
-"""Checks as a JUnit report, as continuous integration reads it."""
+"""Checks as a JUnit report for continuous integration."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,7 @@ from mapfusion.files import write_whole
 
 
 def write_junit(path: Path, checks: Sequence[CheckedScenario]) -> None:
-    """One suite a scenario: a case for each seed's run, with its seconds, and each expectation."""
+    """Return one suite for each scenario, with a case for each run and for each expectation."""
     root = ET.Element("testsuites", name="mapfusion check")
     for check in checks:
         suite = ET.SubElement(root, "testsuite", name=plain(check.scenario))
@@ -49,7 +49,7 @@ def _add_outcome(case: ET.Element, outcome: Outcome) -> None:
 
 
 def _count(node: ET.Element) -> None:
-    """How many cases there are below, with what in them, and their seconds."""
+    """Count cases, failures and seconds of the elements below."""
     cases = list(node.iter("testcase"))
     node.set("tests", str(len(cases)))
     for plural, tag in (("failures", "failure"), ("errors", "error"), ("skipped", "skipped")):

@@ -1,4 +1,4 @@
-"""A result as one recording of the Rerun viewer: what robots saw, believed and shared, over time.
+"""Recording of a result for the Rerun viewer: pictures, maps, paths and alignments over time.
 
 The timeline `frame` is the iteration. What lies where, `experiments/docs/export.md` says. The
 viewer's package is an extra of 500 MB, and imported here alone.
@@ -26,7 +26,7 @@ _TIMELINE = "frame"
 
 
 def write_rerun(data: ResultTables, path: Path) -> None:
-    """Write the recording; raises InputError where the viewer's package is not installed."""
+    """Write the recording; raises InputError if the viewer's package is not installed."""
     if find_spec("rerun") is None:
         remedy = "pip install 'mapfusion[rerun]' installs it"
         raise InputError(f"--format rerun: the package rerun-sdk is not installed; {remedy}")
@@ -113,7 +113,7 @@ def _add_images(recording: _Recording, data: ResultTables, robot: str) -> None:
 
 
 def _add_robot(recording: _Recording, data: ResultTables, robot: str) -> None:
-    """Path, particles and map in the robot's own frame, at each evaluated iteration."""
+    """Log path, particles and map in the robot's own frame at each evaluated iteration."""
     where, colour = f"robots/{robot}", data.colours[robot]
     path = _in_plan(*data.path_of(robot).T)
     for iteration, landmarks in _history(data, robot).items():
@@ -136,7 +136,7 @@ def _history(data: ResultTables, robot: str) -> dict[int, Float]:
 
 
 def _add_pair(recording: _Recording, data: ResultTables, pair: Pair) -> None:
-    """Both maps by the alignment that is merged by, its pairs, and what is fused of them."""
+    """Log both maps as aligned for the merge, their pairs, and the fused landmarks."""
     rows = of_pair(data.rows("estimates"), pair)
     used = rows["aligner"] == data.scenario.get("merge", {}).get("aligner")
     rows = rows[used & (rows["repetition"] == 0)].sort_values("iteration")
@@ -163,7 +163,7 @@ def _add_pair(recording: _Recording, data: ResultTables, pair: Pair) -> None:
 
 
 def _add_fused(recording: _Recording, data: ResultTables) -> None:
-    """The fused map at the end, by how many robots know a landmark, and the walls if known."""
+    """Log the fused map at the end, coloured by the number of robots, and the walls if known."""
     fused: pd.DataFrame = data.fused_map()
     recording.at(int(data.table("paths")["iteration"].max()))
     position = fused[["x_m", "y_m", "z_m"]].to_numpy(np.float64)

@@ -41,7 +41,7 @@ _RERUN = "rerun"
 
 
 def export_result(result: Path, kind: str, folder: Path | None = None) -> list[Path]:
-    """Write a result's files of one format, by default to `RESULT/export`; returns them.
+    """Write a result's files of one format, by default to `RESULT/export`, and return them.
 
     Raises:
         InputError: an unknown format, no result folder, or one that lacks what the format needs.
@@ -66,7 +66,7 @@ def export_result(result: Path, kind: str, folder: Path | None = None) -> list[P
 
 
 def _tum_files(data: ResultTables) -> Iterator[tuple[str, str]]:
-    """A file a robot and path, with the log's times."""
+    """Yield one file for each robot and path, with the times of the log."""
     if not data.has("frame_times"):
         raise InputError(f"{data.folder}: holds no times of frames; run it again")
     for robot, source, frame, path in _paths(data):
@@ -75,14 +75,14 @@ def _tum_files(data: ResultTables) -> Iterator[tuple[str, str]]:
 
 
 def _kitti_files(data: ResultTables) -> Iterator[tuple[str, str]]:
-    """A file a robot and path that is known in every frame: the layout can leave none out."""
+    """Yield one file for each robot and path that is known in every frame, as KITTI requires."""
     for robot, source, _, path in _paths(data):
         if np.isfinite(path).all():
             yield f"{robot}.{source}.kitti.txt", kitti_text(path)
 
 
 def _paths(data: ResultTables) -> Iterator[tuple[str, str, str, Float]]:
-    """Robot, path, its frame in words, and poses (T, 3): in its own, the fused map's, the world."""
+    """Yield robot, path, description of its frame, and poses (T, 3) in that frame."""
     for robot in data.robots:
         paths = {source: _path(data, robot, source) for source in _SOURCES}
         placed, start = _placed(data, robot), data.start_pose(robot)
@@ -99,13 +99,13 @@ def _paths(data: ResultTables) -> Iterator[tuple[str, str, str, Float]]:
 
 
 def _path(data: ResultTables, robot: str, source: str) -> Float:
-    """Poses (T, 3) in the robot's own frame."""
+    """Return poses (T, 3) in the robot's own frame."""
     columns = [f"{source}_{name}" for name in POSE_FIELDS]
     return data.of_robot("paths", robot)[columns].to_numpy(dtype=np.float64)
 
 
 def _placed(data: ResultTables, robot: str) -> Float | None:
-    """T_fused_robot (3,), or None for a robot that is in no map with others."""
+    """Return T_fused_robot (3,), or None for a robot that shares no map with others."""
     motions = data.rows("fused_motions").set_index("robot")
     if robot not in motions.index or motions["tx_m"].notna().sum() < 2:
         return None
@@ -114,7 +114,7 @@ def _placed(data: ResultTables, robot: str) -> Float | None:
 
 
 def _g2o_files(data: ResultTables) -> Iterator[tuple[str, str]]:
-    """All robots' poses and landmarks, odometry, and the alignments that the team believes."""
+    """Yield poses, landmarks and odometry of all robots, and the alignments that the team uses."""
     graph, first, noise = G2oGraph(), dict[str, int](), _motion_noise(data)
     for robot in data.robots:
         T = _placed(data, robot)
@@ -132,7 +132,7 @@ def _g2o_files(data: ResultTables) -> Iterator[tuple[str, str]]:
 
 
 def _motion_noise(data: ResultTables) -> MotionNoise:
-    """What the filter took odometry for."""
+    """Return the motion noise that the filter assumed."""
     try:
         return MotionNoise(**data.scenario["slam"]["filter"]["motion"])
     except (KeyError, TypeError, ValueError) as error:
@@ -148,14 +148,14 @@ def _add_odometry(graph: G2oGraph, poses: np.ndarray, path: Float, noise: Motion
 
 
 def _add_map(graph: G2oGraph, pose: int, T: Float, position: Float, covariance: Float) -> None:
-    """Landmarks (N, 3) of a robot as seen from its first pose, where its map has its origin."""
+    """Return landmarks (N, 3) in the frame of the robot's first pose, the origin of its map."""
     points = graph.add_points(se2.transform_points(T, position)[:, :2])
     for point, p, S in zip(points.tolist(), position[:, :2], covariance[:, :2, :2], strict=True):
         graph.add_sighting(pose, point, p, S)
 
 
 def _believed_alignments(data: ResultTables) -> Iterator[tuple[str, str, dict[Any, Any]]]:
-    """Robots a and b, and the row of `estimates` that their maps were merged by."""
+    """Yield robots a and b with the row of `estimates` that merged their maps."""
     edges, estimates = data.rows("team_edges"), data.rows("estimates")
     used = estimates["aligner"] == data.scenario.get("merge", {}).get("aligner")
     used &= estimates["repetition"] == 0
@@ -166,7 +166,7 @@ def _believed_alignments(data: ResultTables) -> Iterator[tuple[str, str, dict[An
 
 
 def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:
-    """A file a map, as many as the result has."""
+    """Yield one file for each map of the result."""
     files = sorted((data.folder / "maps").glob("*.parquet"))
     # what a map's landmarks have in common, and how they were seen, is no map
     beside = {each for path in files for each in (joint_path(path), *viewing_paths(path))}
@@ -180,7 +180,7 @@ def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:
 
 
 def _colour_single(colours: np.ndarray, data: ResultTables, landmarks: LandmarkMap) -> None:
-    """Give fused landmarks that are of one robot alone its colour."""
+    """Colour fused landmarks of a single robot in its colour."""
     rows: pd.DataFrame = data.fused_map().sort_values("landmark")
     if len(rows) != len(landmarks):
         counts = f"{len(rows)} rows, the fused map has {len(landmarks)} landmarks"
@@ -191,7 +191,7 @@ def _colour_single(colours: np.ndarray, data: ResultTables, landmarks: LandmarkM
 
 
 def _rgb(colour: str) -> np.ndarray:
-    """Of #RRGGBB, (3,) from 0 to 255."""
+    """Convert #RRGGBB to three values from 0 to 255."""
     return np.array([int(colour[place : place + 2], 16) for place in (1, 3, 5)])
 
 

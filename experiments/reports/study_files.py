@@ -75,7 +75,7 @@ def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = F
 
 
 def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
-    """Draw what several runs of each scenario and setting share; yields what was not drawn.
+    """Draw the figures over several runs of each scenario and setting; yield those not drawn.
 
     With one such configuration the pictures go to `folder`, with more to a folder each in it.
     """
@@ -135,7 +135,7 @@ def write_benchmark(
 
 
 def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
-    """The whole table for people: one section for each number of pairs."""
+    """Return the whole table in Markdown, one section for each number of pairs."""
     parts = [
         f"# Aligners on made-up maps\n\n"
         f"Planar maps of landmarks uniform in {SIZE_M:g} x {SIZE_M:g} m, residuals of true pairs "
@@ -162,7 +162,7 @@ def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
 
 
 def cell_text(cell: pd.Series) -> str:
-    """One cell in words: success, error over the oracle, time."""
+    """Write one cell: success, error over the oracle, time."""
     if cell["status"] == Status.ABSENT:
         return "absent"
     low, high = (f"{100 * cell[name]:.0f}" for name in ("success_low", "success_high"))
@@ -178,7 +178,7 @@ def cell_text(cell: pd.Series) -> str:
 
 
 def draw(summary: pd.DataFrame) -> Figure:
-    """One column of panels for each number of pairs; the rows as in `_ROWS`.
+    """Draw one column of panels for each number of pairs, with the rows of `_ROWS`.
 
     Bands: Wilson's 95 % interval of the success, 10-90 % of the trials' times. The shares are
     spaced evenly and the methods set a little apart, as most lie on one another.
@@ -283,7 +283,7 @@ def _provenance(scenarios: Sequence[AnyScenario]) -> dict[str, object]:
 
 
 def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFrame) -> str:
-    """The table for people: one section for each size of team."""
+    """Return the table in Markdown, one section for each size of team."""
     seeds = ", ".join(str(scenario.seed) for scenario in scenarios)
     parts = [
         f"# What independence costs\n\n"
@@ -310,7 +310,7 @@ def _for_people(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def shown_numbers(rows: pd.DataFrame, name: str) -> pd.Series:
-    """A column of `SHOWN` in the unit of its headings: errors in mm."""
+    """Return a column of `SHOWN` in the unit of its heading: errors in mm."""
     return rows[name] * (_MM_A_M if name.endswith("rmse_m") else 1.0)
 
 
@@ -375,7 +375,7 @@ def draw_refusals(
     false_alarms: float,
     held: Reliability | None,
 ) -> list[Path]:
-    """Draw the figures that there is data for; returns their files."""
+    """Draw the figures that have data, and return their files."""
     place, files = folder / "figures", []
     if len(ordinary(refusals)):
         data = (refusals, calibration, false_alarms)

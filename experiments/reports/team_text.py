@@ -11,9 +11,10 @@ from mapfusion.fusion.team_graph import Place
 
 
 def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -> Iterator[str]:
-    """From the tables `fused_motions`, `team` and `team_pairs` of one run; nothing of one robot.
+    """Describe a team by the tables `fused_motions`, `team` and `team_pairs` of one run.
 
-    Without truth the last two have no rows, and what they tell is not said.
+    A single robot gives no lines. Without truth the last two tables have no rows, and their lines
+    are left out.
     """
     final = team[team["source"] == "final"]
     for row in final[final["n_team"] > 1].to_dict("records"):
@@ -36,7 +37,7 @@ def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -
 
 
 def edge_lines(edges: pd.DataFrame) -> Iterator[str]:
-    """From `team_edges`, what the others say of some alignments; of two robots nobody else is."""
+    """Describe by `team_edges` how alignments agree; a single alignment gives no lines."""
     if len(edges) > 1:
         told = edges[edges["place"] != Place.REFUSED]
         for place, rows in told.groupby("place", sort=True):

@@ -1,8 +1,12 @@
 """A report as a parser reads it, and a result whose names would like to be HTML."""
 
+import base64
 import json
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from experiments.evaluation import tables
 from experiments.reports.report.document import write_report
@@ -22,6 +26,11 @@ class Page(HTMLParser):
         self._within = ""
         self.feed(text)
 
+    @property
+    def charts(self) -> dict[str, Any]:
+        """The Plotly figures by name."""
+        return json.loads(self.json)["charts"]
+
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
         kind = dict(attrs).get("type")
@@ -35,6 +44,14 @@ class Page(HTMLParser):
             self.json += data
         elif self._within not in {"script", "style"}:
             self.words += data
+
+
+def numbers(values: Any) -> np.ndarray:
+    """Return numbers as Plotly's JSON holds them: a list, or the bytes of an array."""
+    if isinstance(values, dict):
+        found = np.frombuffer(base64.b64decode(values["bdata"]), values["dtype"])
+        return found.reshape([int(n) for n in values.get("shape", "-1").split(",")])
+    return np.array(values, dtype=float)
 
 
 def page_of(result: Path, output: Path) -> Page:

@@ -1,17 +1,22 @@
-"""The summaries behind the interactive charts, as JSON-able values."""
+"""Charts of errors, success rates and times: their values, and the Plotly figures of these."""
 
+import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
 
 from experiments.evaluation.alignment_summary import MAP_PAIR
+from experiments.reports.report.theme import NEUTRAL, faint
 from experiments.studies.error_bands import error_bands, scarce_spans, time_bands
 from experiments.studies.method_comparison import success_rates
 
-_DIGITS = 5  # significant; more than any chart can show, and a third of the bytes of all of them
+_DIGITS = 5  # significant digits; more than a chart can show
 _MAX_POINTS = 400  # of a curve: a chart is about a thousand pixels wide
 _MAX_TIMES = 40  # points of an aligner in the chart of times
 _OFFERED = ["n_true", "n_correspondences"]
@@ -21,29 +26,46 @@ _ERRORS = {
     "rotation_estimated": "rotation_error_rad",
     "rotation_refined": "refined_rotation_error_rad",
 }
+# Row and column of each curve's panel in the error chart
+_PANELS = {
+    "translation_estimated": (1, 1),
+    "translation_refined": (1, 2),
+    "rotation_estimated": (2, 1),
+    "rotation_refined": (2, 2),
+}
+_DODGE = 0.055  # share of a bin by which the intervals of two methods are apart
+
+_PANELS_APART = 0.09  # share of the figure's width
+
+Attributes = dict[str, Any]
+Styles = Mapping[str, dict[str, Any]]  # of each aligner, by `theme.chart_style`
+
+
+# Plotly takes a few tags and entities in texts for markup: names must not be able to use them
+escaped = partial(html.escape, quote=False)
 
 
 def rounded(values: Any) -> list[float | None]:
-    """Floats with a few significant digits; None for what is not finite."""
+    """Round floats to a few significant digits; None stands for values that are not finite."""
     return [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in np.ravel(values)]
 
 
 def thinned(values: np.ndarray, n: int) -> np.ndarray:
-    """At most n of some values, evenly spread; the last one stays."""
+    """Return at most n of the values, evenly spread, with the last one among them."""
     last = len(values) - 1
     return values[np.linspace(last, 0, min(n, last + 1)).round().astype(int)[::-1]]
 
 
 def _band(rows: pd.DataFrame, column: str, scale: float = 1.0) -> dict[str, list[float | None]]:
-    """Low, median and high, from columns named with "_low", "" and "_high" in their braces."""
+    """Return low, median and high, from columns with "_low", "" and "_high" in their braces."""
     ends = {"low": "_low", "median": "", "high": "_high"}
     return {name: rounded(scale * rows[column.format(end)]) for name, end in ends.items()}
 
 
 def error_curves(rows: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
-    """Median and band of the errors of each aligner against the iteration, and what was offered.
+    """Compute each aligner's median error with its band, and the offered pairs, by iteration.
 
-    Of rows of the table `errors`, or of `medians_of_run`; those of one iteration are pooled.
+    `rows` are of the table `errors` or of `medians_of_run`; rows of one iteration are pooled.
     """
     iterations = thinned(np.unique(rows["iteration"]), _MAX_POINTS)
     rows = rows[rows["iteration"].isin(iterations)]
@@ -63,10 +85,10 @@ def error_curves(rows: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
 
 
 def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str, Any]]:
-    """Success rates with their intervals against what makes an alignment hard.
+    """Compute success rates with their intervals against each quantity that makes aligning hard.
 
-    Of rows of `maps_of` with the column overlap_share, which may be unknown. Bins whose maps have
-    no common ground, where there is nothing to be right about, are left out.
+    `maps` are rows of `maps_of` with the column overlap_share, which may be unknown. Bins without
+    maps that have common ground are left out: no answer is right there.
     """
     curves = []
     for by, (label, name) in _SUCCESS_AGAINST.items():
@@ -87,7 +109,7 @@ def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str
 
 
 def _counts(low: float, high: float) -> str:
-    """A bin of whole numbers, which holds its lower end alone."""
+    """Name a bin of whole numbers from `low` to below `high`."""
     if math.isinf(high):
         return f"≥ {low:g}"
     return f"{low:g}" if high == low + 1 else f"{low:g}–{high - 1:g}"
@@ -106,10 +128,10 @@ _SUCCESS_AGAINST = {
 
 
 def time_curves(timings: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
-    """Time of one alignment against the number of correspondences, in milliseconds.
+    """Compute the time of one alignment in ms against the number of correspondences.
 
-    Where there are too many maps to tell apart, those of similar numbers are taken together, and
-    the band holds their medians in place of the repeats.
+    If an aligner has many maps, those with similar numbers of correspondences become one point,
+    and its band holds their medians instead of the repeats of one map.
     """
     curves = {}
     for aligner in aligners:
@@ -121,3 +143,173 @@ def time_curves(timings: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any
             band = _band(rows, "elapsed{}_s", scale=1e3)
             curves[aligner] = band | {"n": rounded(rows["n_correspondences"])}
     return curves
+
+
+def error_figure(groups: Sequence[tuple[str, dict[str, Any]]], styles: Styles) -> go.Figure:
+    """Draw the `error_curves` of labelled groups of maps; a menu selects the group.
+
+    Estimates stand on the left and refined estimates on the right.
+    """
+    titles: Attributes = {"column_titles": ["as estimated", "refined"]}
+    titles |= {"x_title": "FastSLAM iteration k"}
+    grid: Attributes = {"vertical_spacing": 0.05, "horizontal_spacing": _PANELS_APART}
+    grid |= {"row_heights": [0.4, 0.4, 0.2], "shared_xaxes": "all"}
+    figure = make_subplots(3, 2, **titles, **grid)
+    for name, style in styles.items():
+        for curve, (row, col) in _PANELS.items():
+            own = {"name": escaped(name), "legendgroup": name, "line_color": style["hex"]}
+            band = {"fill": "toself", "fillcolor": faint(style["hex"]), "hoverinfo": "skip"}
+            trace = go.Scatter(mode="none", showlegend=False, meta="band", **own, **band)
+            figure.add_trace(trace, row, col)
+            said = "%{y:.3g} (%{customdata[0]:.3g}–%{customdata[1]:.3g})"
+            median = go.Scatter(
+                **own,
+                mode="lines+markers",
+                line_dash=style["dash"],
+                marker={"size": 5, "symbol": style["marker"]},
+                meta=curve,
+                hovertemplate=said,
+                showlegend=(row, col) == (1, 1),
+            )
+            figure.add_trace(median, row, col)
+    for col in (1, 2):
+        for name, text, look in (
+            ("n_correspondences", "offered pairs", {"line_dash": "dot"}),
+            ("n_true", "true pairs", {"fill": "tozeroy", "fillcolor": faint(NEUTRAL)}),
+        ):
+            shared = {"legendgroup": name, "showlegend": col == 1, "line_color": NEUTRAL}
+            line = go.Scatter(mode="lines", name=text, meta=name, **shared, **look)
+            figure.add_trace(line, 3, col)
+    contents = [_errors_shown(curves, styles) for _, curves in groups]
+    values, shading = contents[0]
+    traces: Any = figure.data
+    for place, trace in enumerate(traces):
+        trace.update({name: each[place] for name, each in values.items()})
+    if len(groups) > 1:
+        buttons = [
+            {"label": escaped(label), "method": "update", "args": [each, {"shapes": shapes}]}
+            for (label, _), (each, shapes) in zip(groups, contents, strict=True)
+        ]
+        place = {"x": 0, "xanchor": "left", "y": 1.05, "yanchor": "bottom"}
+        figure.update_layout(updatemenus=[{"buttons": buttons, **place}], margin_t=80)
+    log: Attributes = {
+        "type": "log",
+        "tickformat": "~g",
+        "exponentformat": "none",
+        "minor_showgrid": False,
+    }
+    figure.update_yaxes(**log, row=1, title_text="translation error (m)", dtick=1)
+    figure.update_yaxes(**log, row=2, title_text="rotation error (rad)", dtick=1)
+    figure.update_yaxes(row=3, title_text="pairs", rangemode="tozero", nticks=3)
+    figure.update_yaxes(title_text="", col=2)
+    figure.update_xaxes(hoverformat="d")
+    return figure.update_layout(
+        height=760,
+        hovermode="x unified",
+        hoverdistance=-1,  # however far the pointer is
+        shapes=shading,
+    )
+
+
+def _errors_shown(curves: dict[str, Any], styles: Styles) -> tuple[Attributes, list[Any]]:
+    """Return the values of all traces of the error chart for one group, and its shading."""
+    x = curves["iteration"]
+    traces: list[tuple[list[Any], list[Any], Any]] = []
+    for name in styles:
+        for curve in _PANELS:
+            own = curves["aligners"][name][curve]
+            traces.append((*_outline(x, own), None))
+            traces.append((x, own["median"], list(zip(own["low"], own["high"], strict=True))))
+    traces += [(x, curves[name], None) for name in ("n_correspondences", "n_true")] * 2
+    attributes = zip(*traces, strict=True)
+    shading = {"type": "rect", "yref": "paper", "y0": 0, "y1": 1, "layer": "below"}
+    shading |= {"fillcolor": faint(NEUTRAL), "line_width": 0}
+    shapes = [
+        go.layout.Shape(**shading, xref=axis, x0=first, x1=last).to_plotly_json()
+        for axis in ("x", "x2")
+        for first, last in curves["scarce"]
+    ]
+    names = ("x", "y", "customdata")
+    return {n: list(each) for n, each in zip(names, attributes, strict=True)}, shapes
+
+
+def _outline(x: Sequence[float], band: dict[str, Any]) -> tuple[list[Any], list[Any]]:
+    """Return the outline of a band, one polygon for each stretch with estimates."""
+    there = np.array([median is not None for median in band["median"]], dtype=int)
+    edges = np.flatnonzero(np.diff(there, prepend=0, append=0))
+    outline_x: list[Any] = []
+    outline_y: list[Any] = []
+    for first, last in edges.reshape(-1, 2):
+        outline_x += [*x[first:last], *x[first:last][::-1], None]
+        outline_y += [*band["low"][first:last], *band["high"][first:last][::-1], None]
+    return outline_x, outline_y
+
+
+def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figure | None:
+    """Draw `success_curves`, one panel for each quantity; None if there are none."""
+    if not curves:
+        return None
+    n_rows = -(-len(curves) // 2)
+    figure = make_subplots(
+        n_rows,
+        min(len(curves), 2),
+        vertical_spacing=0.36 / n_rows,
+        horizontal_spacing=_PANELS_APART,
+    )
+    for place, each in enumerate(curves):
+        row, col = place // 2 + 1, place % 2 + 1
+        bins = np.arange(len(each["bins"]))
+        for number, (name, style) in enumerate(styles.items()):
+            own = each["aligners"][name]
+            rate, low, high = (
+                100 * np.array(own[end], dtype=float) for end in ("rate", "low", "high")
+            )
+            shown = escaped(name)
+            said = "%{y:.0f} % (%{customdata[0]:.0f} to %{customdata[1]:.0f} %), "
+            interval = {"type": "data", "array": rounded(high - rate), "width": 0}
+            interval |= {"arrayminus": rounded(rate - low), "thickness": 1.5}
+            trace = go.Scatter(
+                x=bins + _DODGE * (number - (len(styles) - 1) / 2),
+                y=rounded(rate),
+                customdata=list(zip(rounded(low), rounded(high), own["n"], strict=True)),
+                name=shown,
+                legendgroup=name,
+                showlegend=place == 0,
+                mode="lines+markers",
+                line={"color": style["hex"], "dash": style["dash"], "width": 1.5},
+                marker={"size": 6, "symbol": style["marker"]},
+                error_y=interval | {"color": faint(style["hex"], 0.45)},
+                hovertemplate=f"{shown}: {said}%{{customdata[2]}} maps<extra></extra>",
+            )
+            figure.add_trace(trace, row, col)
+        ticks = {"tickvals": bins.tolist(), "ticktext": each["bins"], "showgrid": False}
+        figure.update_xaxes(**ticks, title_text=each["label"], row=row, col=col)
+    figure.update_yaxes(range=[-3, 103], ticksuffix=" %")
+    figure.update_yaxes(title_text="correct", col=1)
+    return figure.update_layout(height=60 + 330 * n_rows, hovermode="closest")
+
+
+def time_figure(curves: dict[str, Any], styles: Styles) -> go.Figure | None:
+    """Draw `time_curves`; None if nothing was measured."""
+    if not curves:
+        return None
+    figure = go.Figure()
+    for name, own in curves.items():
+        low, median, high = (np.array(own[end], dtype=float) for end in ("low", "median", "high"))
+        shown, style = escaped(name), styles[name]
+        band = {"type": "data", "array": rounded(high - median), "width": 0, "thickness": 1.2}
+        figure.add_scatter(
+            x=own["n"],
+            y=own["median"],
+            customdata=list(zip(own["low"], own["high"], strict=True)),
+            name=shown,
+            mode="markers",
+            marker={"size": 8, "color": style["hex"], "symbol": style["marker"]},
+            error_y=band | {"arrayminus": rounded(median - low)},
+            hovertemplate=f"{shown}: %{{y:.3g}} ms (%{{customdata[0]:.3g}}–%{{customdata[1]:.3g}})"
+            " for %{x} pairs<extra></extra>",
+        )
+    log: Attributes = {"type": "log", "tickformat": "~g", "exponentformat": "none", "dtick": "D2"}
+    figure.update_xaxes(**log, title_text="correspondences")
+    figure.update_yaxes(**log, title_text="time (ms)")
+    return figure.update_layout(height=420, hovermode="closest")

@@ -22,8 +22,15 @@ from experiments.evaluation.result import require_result
 from experiments.reports.figures.drawing import FIGURES
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.reports.figures.style import aligner_styles
-from experiments.reports.report.charts import error_curves, success_curves, time_curves
-from experiments.reports.report.map_view import MAP_TABLES, map_view
+from experiments.reports.report.charts import (
+    error_curves,
+    error_figure,
+    success_curves,
+    success_figure,
+    time_curves,
+    time_figure,
+)
+from experiments.reports.report.map_view import MAP_TABLES, map_figure
 from experiments.reports.report.origin import natural, provenance_of, stage_times
 from experiments.reports.report.theme import chart_style
 from experiments.reports.team_text import team_lines
@@ -34,11 +41,11 @@ from experiments.studies.statistics import ALL_SCENARIOS, configurations, reduce
 from mapfusion.errors import InputError
 
 _BETWEEN = "a b"  # of rivals; the others lay a map onto itself
-_MOTION = ("tx_m", "ty_m", "theta_rad")
+_PLACE = ["tx_m", "ty_m", "theta_rad", "n_support", "n_confirmed", "n_contradicted"]
 
 
 def verdicts_and_places(data: ResultTables) -> Iterator[dict[str, Any]]:
-    """For each two robots, of the aligner that maps are fused by: verdict, reason, places.
+    """Yield verdict, reason and places of every pair of robots, by the aligner that fuses maps.
 
     Places are the distinct motions that correspondences support, the best first.
     """
@@ -51,6 +58,8 @@ def verdicts_and_places(data: ResultTables) -> Iterator[dict[str, Any]]:
         if last.empty:
             continue
         answer = last.iloc[0]
+        places = _last(of_pair(rivals, pair))
+        places = places[places["of"] == _BETWEEN].sort_values("log10_false_alarms", kind="stable")
         yield {
             "robots": f"{robot_a} – {robot_b}",
             "verdict": str(answer["verdict"]).replace("_", " "),
@@ -58,18 +67,12 @@ def verdicts_and_places(data: ResultTables) -> Iterator[dict[str, Any]]:
             "n_confirmed": answer["n_confirmed"],
             "n_contradicted": answer["n_contradicted"],
             "reason": answer["acceptance_reason"] or answer["refined_reason"] or answer["reason"],
-            "places": _places(_last(of_pair(rivals, pair))),
+            "places": places[_PLACE].to_dict("records"),
         }
 
 
 def _last(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["iteration"] == rows["iteration"].max()]
-
-
-def _places(rivals: pd.DataFrame) -> list[dict[str, Any]]:
-    between = rivals[rivals["of"] == _BETWEEN].sort_values("log10_false_alarms", kind="stable")
-    columns = [*_MOTION, "n_support", "n_confirmed", "n_contradicted"]
-    return between[columns].to_dict("records")  # pyright: ignore[reportReturnType]
 
 
 # Figures that stand beside the table of fusers, and how they are to be read.
@@ -84,9 +87,13 @@ _TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
 
 
 def contents_of(path: Path) -> dict[str, Any]:
-    """What the report of a result folder, or of a sweep, shows.
+    """Collect what the report of a result folder, or of a sweep, shows.
 
-    Raises InputError where the path is neither, or a table is damaged.
+    `charts` holds the Plotly figures by the name of their place in the page; a figure without
+    data is None.
+
+    Raises:
+        InputError: The path is neither, or a table is damaged.
     """
     runs = find_runs(path)
     if not runs.sweeps:
@@ -102,7 +109,8 @@ def contents_of(path: Path) -> dict[str, Any]:
         data = ResultTables(path)
         own, groups = _of_result(data), _by_robots(runs.read("errors"), data.pairs)
     aligners = methods_in(maps, oracle=True)
-    styles = aligner_styles(aligners)
+    drawn_in = aligner_styles(aligners)
+    styles = {name: chart_style(drawn_in[name]) for name in aligners}
     timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
     provenance, stages = provenance_of(path, runs)
     return own | {
@@ -110,10 +118,13 @@ def contents_of(path: Path) -> dict[str, Any]:
         "ranking": recommend(maps, timings, aligners),
         "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
         "settings": setting_columns(maps),
-        "aligners": [{"name": name, **chart_style(styles[name])} for name in aligners],
-        "groups": [{"label": label, "curves": error_curves(r, aligners)} for label, r in groups],
-        "success": success_curves(maps, aligners),
-        "times": time_curves(timings, aligners) if len(timings) else {},
+        "styles": styles,
+        "charts": own["charts"]
+        | {
+            "errors": error_figure([(n, error_curves(r, aligners)) for n, r in groups], styles),
+            "success": success_figure(success_curves(maps, aligners), styles),
+            "times": time_figure(time_curves(timings, aligners) if len(timings) else {}, styles),
+        },
         "absent": reduced.absent,
         "provenance": provenance,
         "stages": stages,
@@ -123,17 +134,18 @@ def contents_of(path: Path) -> dict[str, Any]:
 
 
 def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]:
-    """What a result shows whose answers cannot be judged: all but errors and success."""
-    styles, timings = data.styles, runs.read("aligner_timings")
+    """Collect what a result without truth shows: all but errors and success."""
+    styles = {name: chart_style(style) for name, style in data.styles.items()}
+    times = time_curves(runs.read("aligner_timings"), data.aligners)
     provenance, stages = provenance_of(path, runs)
-    return _of_result(data) | {
+    own = _of_result(data)
+    return own | {
         "no_truth": True,
         "outcomes": (),
         "ranking": None,
-        "aligners": [{"name": name, **chart_style(styles[name])} for name in data.aligners],
-        "groups": [],
-        "success": [],
-        "times": time_curves(timings, data.aligners),
+        "styles": styles,
+        "charts": own["charts"]
+        | {"errors": None, "success": None, "times": time_figure(times, styles)},
         "absent": [name for name, label in data.labels.items() if label != name],
         "provenance": provenance,
         "stages": stages,
@@ -143,20 +155,19 @@ def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]
 
 
 def _of_sweep(path: Path, maps: pd.DataFrame) -> dict[str, Any]:
-    """Title of a sweep, and the sections that it has not."""
+    """Return the title of a sweep; the sections of single results are empty."""
     none = ("outcomes", "robots", "fits", "smoother", "team", "edges", "figures", "missing")
     none += ("scenario_text", "fusers", "fuser_figures", "places", "findings")
     return dict.fromkeys(none, ()) | {
         "title": f"{path.name}, {maps['run_id'].nunique()} runs",
         "description": ", ".join(maps["scenario"].unique()),
         "spread_text": "runs; each run is the median of its repetitions",
-        "map": None,
-        "robot_colours": {},
+        "charts": {"map": None},
     }
 
 
 def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Runs of each scenario and setting, with a label each."""
+    """Yield the runs of each scenario and setting with a label."""
     ordered = sorted(configurations(spread), key=lambda each: [*map(natural, each[0].values())])
     for labels, rows in ordered:
         scenario = labels.pop("scenario")
@@ -168,13 +179,12 @@ def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]
 
 
 def _of_result(data: ResultTables) -> dict[str, Any]:
-    """Title and sections of a result; what builds on tables that it does not hold is empty."""
+    """Return the title and the sections of a result; a section without its tables is empty."""
     return {
         "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
         "description": data.scenario.get("description", ""),
         "spread_text": "repetitions on the same maps",
-        "map": map_view(data),
-        "robot_colours": data.colours,
+        "charts": {"map": map_figure(data, {n: chart_style(s) for n, s in data.styles.items()})},
         "outcomes": list(_outcomes(data)),
         "findings": list(lines_of(data.rows("findings"))),
         "robots": path_rms(data.table("robots")).to_dict("records"),
@@ -192,7 +202,7 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
 
 
 def _by_robots(errors: pd.DataFrame, pairs: list[Pair]) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Errors of each pair of robots, and of all together, with a label each."""
+    """Yield the errors of each pair of robots, then of all pairs, with a label."""
     for a, b in pairs:
         yield f"{a} – {b}", of_pair(errors, (a, b))
     if len(pairs) > 1:
@@ -200,7 +210,7 @@ def _by_robots(errors: pd.DataFrame, pairs: list[Pair]) -> Iterator[tuple[str, p
 
 
 def _outcomes(data: ResultTables) -> Iterator[Outcome]:
-    """The scenario's expectations, measured on this run alone."""
+    """Compare this run alone with the scenario's expectations."""
     needed = set(metrics.USED_TABLES) - {"smoother", "fusers"}  # which older results lack
     if all(map(data.has, needed)):
         used = {name: data.rows(name).assign(seed=0) for name in metrics.USED_TABLES}
@@ -210,7 +220,7 @@ def _outcomes(data: ResultTables) -> Iterator[Outcome]:
 
 
 def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
-    """Those of the figures that are drawn; a reference folder keeps them beside its tables."""
+    """Yield the figures that are drawn; a reference folder keeps them beside its tables."""
     for name in names:
         files = (folder / "figures" / f"{name}.png", folder / f"{name}.png")
         if file := next(filter(Path.is_file, files), None):

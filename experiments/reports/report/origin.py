@@ -1,4 +1,4 @@
-"""Where a report's numbers come from: runs, versions, stages and their times."""
+"""Provenance of a report: runs, versions, stages and their times."""
 
 import math
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ _SOURCE_DIGITS = 16
 
 
 def natural(text: object) -> tuple[float, str]:
-    """A sorting key that puts 50 before 200."""
+    """Return a sorting key that puts 50 before 200."""
     try:
         return float(str(text)), ""
     except ValueError:
@@ -22,10 +22,10 @@ def natural(text: object) -> tuple[float, str]:
 
 
 def provenance_of(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
-    """Seeds, settings, versions, renderer and sources of the finished runs; all where they differ.
+    """Collect seeds, settings, versions, renderer and sources of the finished runs.
 
-    Texts by name, and the keys of the stages of a single run; raises InputError where a
-    description is damaged.
+    Returns texts by name, which list all values if runs differ, and the stage keys of a single
+    run. Raises InputError if a description is damaged.
     """
     found: dict[str, dict[str, None]] = {}
     stages: list[str] = []
@@ -37,7 +37,7 @@ def provenance_of(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
 
 
 def _joined(texts: list[str]) -> str:
-    """Three or more consecutive whole numbers as `--seeds` takes them, or all texts."""
+    """Write three or more consecutive whole numbers as `--seeds` takes them, others as a list."""
     if len(texts) > 2 and all(text.isdigit() for text in texts):
         first, last = int(texts[0]), int(texts[-1])
         if last - first == len(texts) - 1:
@@ -46,7 +46,7 @@ def _joined(texts: list[str]) -> str:
 
 
 def _descriptions(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
-    """What is said of each finished run."""
+    """Yield the description of each finished run."""
     file = path / "provenance.json"
     if runs.has("runs"):
         rows = runs.read("runs", ["status", "renderer", "source_hash", "libraries"])
@@ -64,7 +64,7 @@ def _descriptions(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
 
 
 def _flat(described: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Names and values; those of a mapping (libraries, aligners) under their own names."""
+    """Yield names and values; those inside a mapping (libraries, aligners) have their own names."""
     for name, value in described.items():
         if isinstance(value, dict):
             for key, inner in value.items():
@@ -75,7 +75,7 @@ def _flat(described: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def stage_times(runs: Runs) -> list[dict[Any, Any]]:
-    """Seconds of work by stage, all its tasks together; a stage that runs share counts once."""
+    """Sum the seconds of work of each stage; a stage that several runs share counts once."""
     if runs.has("timings"):
         rows = runs.read("timings", ["stage", "name", "elapsed_s"])
     elif runs.has("run_times"):

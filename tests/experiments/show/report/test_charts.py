@@ -1,17 +1,23 @@
 """The values behind the report's charts, worked out by hand."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from experiments.evaluation.alignment_summary import maps_of
+from experiments.reports.figures.style import aligner_styles
 from experiments.reports.report.charts import (
     error_curves,
+    error_figure,
     rounded,
     success_curves,
     thinned,
     time_curves,
+    time_figure,
 )
+from experiments.reports.report.theme import chart_style
 from tests.helpers.made_up_runs import many_errors
 
 
@@ -97,3 +103,40 @@ def test_a_rate_counts_the_maps_with_common_ground() -> None:
     rows["n_common"] = np.where(rows["iteration"] <= 25, 2, 9)  # one iteration of four
     curves = success_curves(maps_of(rows).assign(overlap_share=np.nan), ["ransac"])
     assert curves[0]["aligners"]["ransac"]["n"] == [2 * 2 * 3]
+
+
+def styles(*names: str) -> dict[str, dict[str, str]]:
+    return {name: chart_style(aligner_styles(names)[name]) for name in names}
+
+
+def test_the_error_chart_holds_each_group_with_its_bands_and_gaps() -> None:
+    """A band is one polygon for each stretch of iterations with estimates."""
+    gap = [errors(30, 7, [np.nan] * 3), errors(40, 7, [0.1, 0.2, 0.4])]
+    near = error_curves(
+        pd.concat([errors(10, 2, [0.1] * 3), errors(20, 7, [0.2] * 3), *gap]), ["icp"]
+    )
+    far = error_curves(errors(10, 9, [5.0] * 3), ["icp"])
+    figure: Any = error_figure([("near", near), ("far", far)], styles("icp"))
+    medians = {trace.meta: trace for trace in figure.data if trace.name == "icp"}
+    assert list(medians["translation_estimated"].y) == [0.1, 0.2, None, 0.2]
+    assert list(medians["rotation_refined"].y) == [0.01, 0.02, None, 0.02]
+    assert list(medians["translation_estimated"].customdata[3]) == [0.12, 0.36]
+    band = figure.data[0]
+    assert list(band.x) == [10, 20, 20, 10, None, 40, 40, None]
+    assert list(band.y) == [0.1, 0.2, 0.2, 0.1, None, 0.12, 0.36, None]
+    spans = [(shape.x0, shape.x1) for shape in figure.layout.shapes if shape.xref == "x"]
+    assert spans == near["scarce"] == [(5.0, 15.0)]
+    other = figure.layout.updatemenus[0].buttons[1]
+    assert other.label == "far"
+    assert other.args[0]["y"][1] == [5.0]
+    assert not other.args[1]["shapes"]
+    assert {trace.legendgroup for trace in figure.data} == {"icp", "n_true", "n_correspondences"}
+
+
+def test_the_time_chart_holds_the_spread() -> None:
+    curves = {"icp": {"n": [10.0], "median": [2.0], "low": [1.0], "high": [5.0]}}
+    figure: Any = time_figure(curves, styles("icp"))
+    (trace,) = figure.data
+    assert (trace.x, trace.y) == ((10.0,), (2.0,))
+    assert (trace.error_y.array, trace.error_y.arrayminus) == ((3.0,), (1.0,))
+    assert time_figure({}, styles()) is None

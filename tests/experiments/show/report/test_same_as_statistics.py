@@ -54,23 +54,25 @@ def with_ground(table: pd.DataFrame) -> pd.DataFrame:
 
 def test_the_same_aligners_are_judged(contents: dict[str, Any], summary: Summary) -> None:
     printed = summary.tables["success_at_the_end"]["aligner"].unique().tolist()
-    assert printed == [aligner["name"] for aligner in contents["aligners"]]
+    assert printed == list(contents["styles"])
     assert printed[-1] == "oracle"
     assert contents["absent"] == ["svd"]
     assert "svd" not in printed
 
 
 def test_success_in_the_charts(contents: dict[str, Any], summary: Summary) -> None:
-    assert {curves["label"] for curves in contents["success"]} == set(SUCCESS_TABLES)
-    for curves in contents["success"]:
-        table = with_ground(summary.tables[SUCCESS_TABLES[curves["label"]]])
-        for aligner, own in curves["aligners"].items():
-            rows = table[table["aligner"] == aligner]
-            there = [place for place, n in enumerate(own["n"]) if n]
-            for shown, column in (("rate", ""), ("low", "_low"), ("high", "_high")):
-                printed = rounded(rows[f"refined_success{column}"])
-                assert [own[shown][place] for place in there] == printed, (aligner, column)
-            assert [own["n"][place] for place in there] == list(rows["n_maps"] - rows["n_apart"])
+    figure = contents["charts"]["success"]
+    labels = {axis.anchor: axis.title.text for axis in figure.select_xaxes()}
+    assert set(labels.values()) == set(SUCCESS_TABLES)
+    for trace in figure.data:
+        table = with_ground(summary.tables[SUCCESS_TABLES[labels[trace.yaxis]]])
+        rows = table[table["aligner"] == trace.name]
+        low, high, n = np.array(trace.customdata, dtype=float).T
+        there = n > 0
+        for shown, column in ((np.array(trace.y, float), ""), (low, "_low"), (high, "_high")):
+            printed = 100 * rows[f"refined_success{column}"]
+            np.testing.assert_allclose(shown[there], printed, rtol=1e-4, err_msg=trace.name)
+        assert n[there].tolist() == list(rows["n_maps"] - rows["n_apart"])
 
 
 def test_success_in_the_ranking(contents: dict[str, Any], summary: Summary) -> None:
@@ -84,16 +86,20 @@ def test_success_in_the_ranking(contents: dict[str, Any], summary: Summary) -> N
 
 def test_median_errors_against_the_iteration(contents: dict[str, Any], summary: Summary) -> None:
     table = summary.tables["errors_by_iteration"]
-    for group in contents["groups"][:-1]:  # the last one pools the pairs of robots
-        pair = group["label"].split(" – ")
+    figure = contents["charts"]["errors"]
+    buttons = figure.layout.updatemenus[0].buttons
+    for button in buttons[:-1]:  # the last one pools the pairs of robots
+        pair = button.label.split(" – ")
         of_pair = table[(table["robot_a"] == pair[0]) & (table["robot_b"] == pair[1])]
-        for aligner, curves in group["curves"]["aligners"].items():
-            rows = of_pair[of_pair["aligner"] == aligner].sort_values("iteration")
-            for curve, column in (
-                ("translation_estimated", "translation_error_m"),
-                ("translation_refined", "refined_translation_error_m"),
-            ):
-                assert curves[curve]["median"] == rounded(rows[column]), (aligner, column)
+        for place, trace in enumerate(figure.data):
+            rows = of_pair[of_pair["aligner"] == trace.name].sort_values("iteration")
+            column = {
+                "translation_estimated": "translation_error_m",
+                "translation_refined": "refined_translation_error_m",
+            }.get(trace.meta)
+            if column:
+                assert list(button.args[0]["y"][place]) == rounded(rows[column]), trace.name
+                assert list(button.args[0]["x"][place]) == list(rows["iteration"])
 
 
 def test_errors_over_the_oracle(contents: dict[str, Any], summary: Summary) -> None:

@@ -3,7 +3,15 @@
 import pytest
 
 from experiments.reports.figures.style import aligner_styles
-from experiments.reports.report.theme import MIN_CONTRAST, chart_style, contrast, lightened, palette
+from experiments.reports.report.theme import (
+    MIN_CONTRAST,
+    NEUTRAL,
+    chart_style,
+    contrast,
+    css_name,
+    lightened,
+    palette,
+)
 
 NAMES = ["ransac", "svd", "svd-solved", "icp", "impicp", "gnc", "clique", "opencv"]
 NAMES += ["ransac_mahalanobis", "kiss_matcher", "oracle", *(f"plug-in {k}" for k in range(12))]
@@ -28,6 +36,13 @@ def test_lines_stand_out_from_a_dark_page() -> None:
     dark = palette(style["hex"] for style in styles)["dark"]
     for style in styles:
         assert contrast(dark[style["colour"]], dark["page"]) >= MIN_CONTRAST, style
+        assert contrast(dark[css_name(style["hex"])], dark["page"]) >= MIN_CONTRAST, style
+
+
+def test_charts_draw_black_in_a_colour_that_both_pages_show() -> None:
+    style = chart_style(aligner_styles(["oracle"])["oracle"])
+    assert style["hex"] == NEUTRAL
+    assert contrast(NEUTRAL, palette([])["light"]["page"]) >= MIN_CONTRAST
 
 
 def test_a_colour_that_stands_out_stays_as_it_is() -> None:
