@@ -97,7 +97,6 @@ def contents_of(path: Path) -> Contents:
 
 def _resolved(path: Path) -> dict[str, Any]:
     """Return all settings of a scenario; raises InputError."""
-
     return load_scenario(path).resolved()
 
 
