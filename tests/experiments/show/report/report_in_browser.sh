@@ -17,4 +17,4 @@ if [ $# -gt 0 ]; then
     RESULT="$1"
     export RESULT
 fi
-exec "${PYTHON:-.venv/bin/python}" -m pytest tests/experiments/show/report/report_in_browser.py -s
+exec "${PYTHON:-.venv/bin/python}" -m pytest tests/experiments/reports/report/report_in_browser.py -s
