@@ -42,7 +42,7 @@ seeded-faults: $(STAMP)
 
 # Installs Debian's chromium where it is missing (needs root for that).
 browser-test: $(STAMP)
-	PYTHON=$(BIN)/python tests/experiments/show/report/report_in_browser.sh $(RESULT)
+	PYTHON=$(BIN)/python tests/experiments/reports/report/report_in_browser.sh $(RESULT)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

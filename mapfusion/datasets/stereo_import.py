@@ -59,7 +59,7 @@ _AREA_PX = 300  # of the image for one corner at most: they keep 10 px apart, on
 _MOST_CORNERS = 5000  # that the setting allows
 # Share of true surfaces that keep all limits: a choice of how many to give up for those near edges,
 # whose two pictures differ for another reason than noise. What passes is held against SGBM on KITTI
-# (tests/mapfusion/recordings/test_real_recordings.py: 97 % within a pixel, 300 a frame).
+# (tests/mapfusion/datasets/test_real_recordings.py: 97 % within a pixel, 300 a frame).
 _TRUE_SHARE = 0.8
 _WANTED = 100  # observations a frame: a filter's step takes as long as it has of them
 _MEDIAN_ERROR = 0.6745  # of a normal variable, in standard deviations

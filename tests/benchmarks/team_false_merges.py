@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from mapfusion.fusion.team_graph import TeamParameters, Unconfirmed, team_graph
-from tests.mapfusion.team.teams import falsely_placed, team
+from tests.mapfusion.fusion.teams import falsely_placed, team
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from mapfusion.datasets.formats import read_recording
 from mapfusion.datasets.stereo_import import StereoImport
 from mapfusion.vision import tracking
 from mapfusion.vision.front_end import FrontEnd, Observer
-from tests.mapfusion.recordings.extracts import laid_out_as_kitti, needs_recordings
+from tests.mapfusion.datasets.extracts import laid_out_as_kitti, needs_recordings
 
 # of the processor: others may be at work on the machine
 pytestmark = [needs_recordings, pytest.mark.benchmark(timer=time.process_time)]

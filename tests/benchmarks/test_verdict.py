@@ -13,7 +13,7 @@ from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import match
 from mapfusion.align.oracle import Oracle
 from mapfusion.verification.verdict import Judge
-from tests.mapfusion.evidence.two_rooms import Wall, mapped
+from tests.mapfusion.verification.two_rooms import Wall, mapped
 
 PER_M = 40  # landmarks along a wall, as in rooms
 

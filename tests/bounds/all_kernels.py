@@ -23,35 +23,37 @@ from sim.floorplan import FloorPlan, Wall
 from sim.raycast.caster import RayCaster
 from sim.stereo_head import RadiometricNoise, depth_at, expose
 from sim.world import write_faces
-from tests.experiments.study.refusal.test_refusal import (
+from tests.experiments.studies.refusal.test_refusal import (
     test_calibration_counts_every_motion_of_two_pairs,
 )
 from tests.mapfusion.align.map_pairs import given_pairs
-from tests.mapfusion.align.test_box_tree import (
-    test_each_box_holds_its_points_and_halves_those_of_the_one_above,
-)
+from tests.mapfusion.align.test_clique import on_bits, random_graph
 from tests.mapfusion.align.test_correspondences import two_maps
-from tests.mapfusion.align.test_max_clique import on_bits, random_graph
-from tests.mapfusion.align.test_nearest_points import test_finds_what_looking_at_all_finds
-from tests.mapfusion.evidence.test_judge import (
-    test_a_picture_that_hangs_twice_leaves_two_places,
-    test_what_was_found_before_gives_the_same_verdict,
+from tests.mapfusion.align.test_nearest_neighbours import (
+    test_each_box_holds_its_points_and_halves_those_of_the_one_above,
+    test_finds_what_looking_at_all_finds,
 )
-from tests.mapfusion.fastslam.test_closing import (
+from tests.mapfusion.fastslam.test_filter_twin import test_equals_the_filter_that_copies
+from tests.mapfusion.fastslam.test_landmarks import test_each_track_s_end_widens_its_landmark_once
+from tests.mapfusion.fastslam.test_loop_closing import (
     test_evidence_is_the_slope_of_the_likelihood_at_the_pose_in_view,
     test_landmarks_of_all_particles_move_and_are_found_where_they_are_now,
 )
-from tests.mapfusion.fastslam.test_filter_twin import test_equals_the_filter_that_copies
 from tests.mapfusion.fastslam.test_particles import (
     test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot,
     test_without_landmarks_nothing_is_near,
 )
-from tests.mapfusion.fastslam.test_tracked import test_each_track_s_end_widens_its_landmark_once
-from tests.mapfusion.smoother.test_calibrate import test_the_posterior_equals_dense_algebra
+from tests.mapfusion.geometry.test_joint_covariance import (
+    test_all_directions_kept_are_the_dense_covariance,
+)
+from tests.mapfusion.smoother.test_odometry_calibration import (
+    test_the_posterior_equals_dense_algebra,
+)
 from tests.mapfusion.smoother.test_smooth import smoothed
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_tracks
-from tests.mapfusion.test_joint_covariance import (
-    test_all_directions_kept_are_the_dense_covariance,
+from tests.mapfusion.verification.test_verdict import (
+    test_a_picture_that_hangs_twice_leaves_two_places,
+    test_what_was_found_before_gives_the_same_verdict,
 )
 from tests.mapfusion.vision.rendered_scene import render, wall
 

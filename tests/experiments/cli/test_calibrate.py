@@ -14,7 +14,7 @@ from mapfusion.robot_log import (
     write_truth_poses,
 )
 from tests.helpers.tiny_scenario import assert_refused, command
-from tests.mapfusion.smoother.test_calibrate import planar_log
+from tests.mapfusion.smoother.test_odometry_calibration import planar_log
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from mapfusion.robot_log import read_log, write_log, write_truth_poses
 from mapfusion.tables import HEIGHT
 from tests.helpers.tiny_scenario import Reply, assert_refused, command
 from tests.mapfusion.contradicting_logs import JUMPS, MISTAKES, circling_log, true_poses
-from tests.mapfusion.recordings.written_layouts import (
+from tests.mapfusion.datasets.written_layouts import (
     CAMERA,
     POSES,
     START_NS,

@@ -1,23 +1,143 @@
+"""Tests of `mapfusion.align.mahalanobis_gate`."""
+
 import math
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import chi2, f, multivariate_normal
 
-from mapfusion.align.alignment import Pairs
+from mapfusion.align.alignment import Pairs, Status
+from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.mahalanobis_gate import (
+    PlanarPairs,
     Spread,
+    farthest_m,
+    is_unlike_the_others,
+    leaves_margin,
     log_likelihood,
     mark_supporters,
     mean_variances,
+    most_leverage,
+    rows_in_reach,
     settle,
     settle_at_best_scale,
     spread_area_m2,
+    those_of,
 )
-from mapfusion.align.rigid_motion import fit_weighted
+from mapfusion.align.refinement import Refinement
+from mapfusion.align.rigid_motion import (
+    fit_rigid,
+    fit_weighted,
+    motion_jacobian,
+    residual_covariances,
+)
+from mapfusion.geometry import se2
+from mapfusion.landmark_map import LandmarkMap
 from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.map_pairs import blurred, error, given_pairs, stretched
 from tests.mapfusion.align.slow_twins import slow_squares
+
+T_TRUE = np.array([1.0, -2.0, 0.7])
+SIGMA_M = 0.01
+
+
+def planar_map(p: np.ndarray, *, named: bool = False) -> LandmarkMap:
+    n = len(p)
+    return LandmarkMap(
+        np.column_stack([p, np.zeros(n)]),
+        np.tile(np.eye(3) * SIGMA_M**2, (n, 1, 1)),
+        np.full(n, 5, np.int32),
+        np.arange(n),
+        planar=True,
+        label=np.arange(n, dtype=np.int32) if named else None,
+    )
+
+
+def a_corner_and_one_far(
+    turned_rad: float, seed: int = 0, *, named: bool = False
+) -> tuple[LandmarkMap, LandmarkMap, Correspondences, np.ndarray]:
+    """25 true pairs within 0.3 m, and one 7 m away that is true for a map turned about them."""
+    rng = np.random.default_rng(seed)
+    p_b = np.vstack([rng.uniform(-0.15, 0.15, (25, 2)), [[7.0, 0.5]]])
+    p_a = se2.transform_points(T_TRUE, p_b) + rng.normal(0, SIGMA_M, p_b.shape)
+    T_turned = T_TRUE + np.array([0, 0, turned_rad])
+    p_a[-1] = se2.transform_points(T_turned, p_b[-1:])[0]
+    n = np.arange(26)
+    map_a, map_b = (planar_map(p, named=named) for p in (p_a, p_b))
+    return map_a, map_b, Correspondences(n, n, np.zeros(26)), T_turned
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_false_far_pair_turns_the_map_and_is_found_out(named: bool) -> None:
+    """A name that was misread is a false pair, too."""
+    map_a, map_b, pairs, T_turned = a_corner_and_one_far(0.7, named=named)
+    found = Refinement().refine(Pairs(map_a, map_b, pairs), T_turned)
+    assert np.hypot(*(found.T_a_b - T_turned)[:2]) < 0.1  # it did go there: residuals fit the gate
+    assert abs(found.T_a_b[2] - T_TRUE[2]) > 0.5
+    assert found.status is Status.REFUSED
+    assert "rests on one correspondence: without it landmarks move by 4" in found.reason
+
+
+@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.parametrize("seed", range(10))
+def test_a_true_far_pair_is_welcome(seed: int, named: bool) -> None:
+    map_a, map_b, pairs, start = a_corner_and_one_far(0.0, seed, named=named)
+    found = Refinement().refine(Pairs(map_a, map_b, pairs), start)
+    assert found.status is Status.ACCEPTED
+    assert abs(found.T_a_b[2] - T_TRUE[2]) < 0.01
+
+
+def test_leverage_is_the_hat_matrix_s_trace() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        n = 12
+        A = rng.normal(0, 0.1, (2, n, 2, 2))
+        S_a, S_b = A @ np.swapaxes(A, 2, 3)
+        pairs = PlanarPairs(rng.normal(0, 3, (n, 2)), rng.normal(0, 3, (n, 2)), S_a, S_b)
+        T, truth, variance = rng.normal(size=3), rng.uniform(0, 1, n), 0.01
+        C = residual_covariances(T, S_a, S_b) + variance * np.eye(2)
+        W, J = truth[:, None, None] * np.linalg.inv(C), motion_jacobian(T, pairs.p_b)
+        covariance = np.linalg.inv(np.einsum("nki,nkl,nlj->ij", J, W, J))
+        hat = np.einsum("nki,ij,nlj,nlk->n", J, covariance, J, W)
+        assert hat.sum() == pytest.approx(3)  # as many as parameters
+        assert most_leverage(T, pairs, variance, truth, covariance) == np.argmax(hat)
+
+
+@pytest.mark.parametrize("n", [4, 6, 12])
+def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
+    """Bent maps: all pairs are off alike, and the one of most leverage is as good as the others."""
+    rng, called, tried = np.random.default_rng(n), 0, 300
+    S = np.tile(np.eye(2) * 1e-6, (n, 1, 1))
+    for _ in range(tried):
+        p_b = rng.normal(0, 3, (n, 2))
+        p_a = se2.transform_points(T_TRUE, p_b) + rng.normal(0, 0.3, (n, 2))
+        pairs = PlanarPairs(p_a, p_b, S, S)
+        others = PlanarPairs(*(part[1:] for part in pairs))
+        T = np.array(fit_rigid(others.p_a, others.p_b, np.arange(n - 1)))
+        e = others.p_a - se2.transform_points(T, others.p_b)
+        variance = float(np.sum(e**2)) / (2 * (n - 1) - 3)
+        J = motion_jacobian(T, others.p_b)
+        covariance = np.linalg.inv(np.einsum("nki,nkj->ij", J, J)) * variance
+        called += is_unlike_the_others(T, covariance, variance, pairs, 0)
+    assert called <= 2  # 0.075 are expected at n = 4
+    far = p_a.copy()
+    far[0] += 300.0
+    assert is_unlike_the_others(T, covariance, variance, pairs._replace(p_a=far), 0)
+
+
+@pytest.mark.parametrize("n", [4, 6, 20])
+def test_the_limit_of_a_pair_is_that_of_the_f_distribution(n: int) -> None:
+    """The other n - 1 pairs leave m = 2 (n - 1) - 3 degrees of freedom, so D is 2 F(2, m)."""
+    rng, sigma_m, k = np.random.default_rng(n), 0.05, 2
+    p_b = rng.uniform(0, 9, (n, 2))
+    p_a, none, known = se2.transform_points(T_TRUE, p_b), np.zeros((n, 2, 2)), np.zeros((3, 3))
+    limit = 2 * f.isf(1e-3 / n, 2, 2 * (n - 1) - 3)
+    for share, unlike in ((0.999, False), (1.001, True)):
+        moved = p_a.copy()
+        moved[k] += sigma_m * np.sqrt(share * limit) * np.array([0.6, -0.8])
+        pairs = PlanarPairs(moved, p_b, none, none)
+        assert is_unlike_the_others(T_TRUE, known, sigma_m**2, pairs, k) == unlike
+
 
 BOUND = float(chi2.ppf(0.99, 2))
 
@@ -98,3 +218,27 @@ def test_no_support_at_any_scale():
     spread = Spread.of(planar)
     assert settle_at_best_scale(T, planar, spread, np.array([1e-4]), BOUND, inside)[1] == -1
     assert not inside.any()
+
+
+def test_whatever_comes_within_the_gate_before_the_margin_is_left_is_among_the_rows() -> None:
+    rng, gate_m, looked_at, left = np.random.default_rng(0), 0.5, 0, 0
+    for _ in range(200):
+        p_b = rng.uniform(-4, 4, (300, 2))
+        before = np.array([*rng.uniform(-5, 5, 2), rng.uniform(-3, 3)])
+        p_a = se2.transform_points(before, p_b) + rng.normal(0, 0.6, (300, 2))
+        S = rng.standard_normal((2, 300, 2, 2))
+        pairs, also = PlanarPairs(p_a, p_b, *S), rng.random(300) < 0.1
+        rows = rows_in_reach(before, pairs, gate_m, also)
+        assert np.isin(np.flatnonzero(also), rows).all()
+        assert len(rows) < 250
+        for part, some in zip(pairs, those_of(pairs, rows), strict=True):
+            np.testing.assert_array_equal(some, part[rows])
+        after = before + rng.normal(0, 1, 3) * [0.05, 0.05, 0.012]
+        if leaves_margin(after, before, gate_m, from_python(farthest_m)(p_b)):
+            left += 1
+            continue
+        inside = np.linalg.norm(p_a - se2.transform_points(after, p_b), axis=1) <= gate_m
+        looked_at += np.sum(inside)
+        assert np.isin(np.flatnonzero(inside), rows).all()
+    assert looked_at > 1000
+    assert left > 20

@@ -1,4 +1,4 @@
-"""The filter as a whole: against the filter that copies everything, and against closed forms."""
+"""Tests of `mapfusion.fastslam.filter`."""
 
 from dataclasses import replace
 
@@ -14,6 +14,7 @@ from tests.mapfusion.fastslam.landmark_worlds import (
     drive,
     nothing,
     parameters,
+    unit,
 )
 
 ONE_LANDMARK = Observations(
@@ -333,3 +334,28 @@ def test_a_landmark_looks_as_in_the_observation_it_came_from():
     )
     np.testing.assert_array_equal(found.descriptor, look[found.source_observation])
     assert found.count.min() >= 2
+
+
+# Quantiles by probability: 2 and 3 degrees of freedom.
+TABLE = {0.95: (5.991, 7.815), 0.99: (9.210, 11.345), 0.9999: (18.421, 21.108)}
+
+
+@pytest.mark.parametrize("probability", TABLE)
+@pytest.mark.parametrize("planar", [True, False, None])
+def test_gate_is_the_quantile_of_the_table(probability: float, planar: bool | None) -> None:
+    found = FastSlamParameters(gate_probability=probability, planar=planar).gate
+    assert found == pytest.approx(TABLE[probability][0 if planar else 1], abs=1e-3)
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_the_filter_keeps_to_it(planar: bool) -> None:
+    """A landmark and an observation of 0.1 m each differ by 0.14 m, times the bound's root."""
+    sigma_m, bound = 0.1, TABLE[0.99][0 if planar else 1]
+    settings = parameters(n_particles=2, motion=EXACT_MOTION, gate_probability=0.99, planar=planar)
+    descriptor = unit(np.ones((1, 64))).astype(np.float32)
+    for share, n_expected in ((0.999, 1), (1.001, 2)):
+        slam = FastSlam(settings, np.random.default_rng(0))
+        for apart_m in (0.0, share * np.sqrt(2 * bound) * sigma_m):
+            point = np.array([[5.0, 2.0 + apart_m, 0.0]])
+            slam.step(np.zeros(3), Observations(point, sigma_m**2 * np.eye(3)[None], descriptor))
+        assert len(slam.best_map(min_count=1)) == n_expected

@@ -1,0 +1,218 @@
+"""Tests of `experiments.evaluation.fused_map_errors`."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import chi2
+
+from experiments.evaluation import tables
+from experiments.evaluation.alignment_errors import EvaluatedRobot
+from experiments.evaluation.fused_map_errors import (
+    FILTERED,
+    FUSED,
+    NOMINAL,
+    SMOOTHED,
+    GivenMap,
+    JudgedFusion,
+    coverage_rows,
+)
+from experiments.evaluation.smoothed_robots import SmoothedRobot
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry import se2
+from mapfusion.landmark_map import LandmarkMap
+from tests.experiments.evaluation.judged_teams import (
+    BENT_M,
+    PARTS,
+    K,
+    evaluated_robots,
+    judged_team,
+)
+from tests.mapfusion.fusion.drawn_maps import DrawnTeam
+
+
+def coverage(fusions: Sequence[JudgedFusion]) -> pd.DataFrame:
+    return tables.framed("fuser_coverage", coverage_rows(fusions))
+
+
+def counted(landmarks: LandmarkMap, truth: np.ndarray, d: int = 3) -> np.ndarray:
+    """Probabilities (n,) of the smallest ellipses that hold the true points."""
+    off, S = (landmarks.position_m - truth)[:, :d], landmarks.covariance_m2[:, :d, :d]
+    squared = [e @ np.linalg.solve(own, e) for e, own in zip(off, S, strict=True)]
+    return chi2.cdf(squared, d)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_shares_are_those_of_landmarks_counted_one_by_one(planar: bool) -> None:
+    """Before fusing those of all robots together, not the mean of their shares."""
+    team = DrawnTeam(PARTS, 1, planar, BENT_M)
+    judged = judged_team(team)
+    rows, d = coverage([judged]), 2 if planar else 3
+    needed = np.concatenate([counted(own, team.truth(k), d) for k, own in enumerate(team.maps)])
+    before = rows[rows["map"] == FILTERED].set_index("nominal")
+    assert (before["n_landmarks"] == len(needed)).all()
+    assert before["frame_coverage"].to_dict() == {p: np.mean(needed <= p) for p in NOMINAL}
+    after, row = rows[rows["map"] == FUSED].set_index("nominal"), judged.row()
+    assert after.loc[0.95, "coverage"] == row["coverage_95"]
+    assert after.loc[0.95, "frame_coverage"] == row["frame_coverage_95"]
+    assert (after["fuser"] == "joint").all()
+    assert (before["fuser"] == "").all()
+
+
+def test_maps_that_are_as_sure_as_they_may_be_keep_to_the_diagonal() -> None:
+    fusions = [judged_team(DrawnTeam(PARTS, seed, bent_m=BENT_M)) for seed in range(30)]
+    rows = pd.concat([coverage([each]) for each in fusions])
+    for of, own in rows.groupby("map"):
+        mean = own.groupby("nominal")[["coverage", "frame_coverage"]].mean()
+        assert mean.sub(mean.index, axis=0).abs().to_numpy().max() < 0.05, of
+
+
+def test_gross_landmarks_are_left_out() -> None:
+    team = DrawnTeam(PARTS, 2, bent_m=BENT_M)
+    team.pairs = []
+    whole = coverage([judged_team(team)]).set_index(["map", "nominal"])
+    position = team.maps[0].position_m.copy()
+    position[:4] += 0.4
+    team.maps[0] = replace(team.maps[0], position_m=position)
+    rows = coverage([judged_team(team)]).set_index(["map", "nominal"])
+    lost = whole["n_landmarks"] - rows["n_landmarks"]
+    assert (lost == 4).all()
+    assert rows.loc[(FUSED, 0.99), "coverage"] > 0.9
+
+
+def test_smoothed_maps_stand_beside_the_filters_and_only_the_end_counts() -> None:
+    team = DrawnTeam(PARTS, 3, bent_m=BENT_M)
+    judged = judged_team(team)
+    rough = [replace(own, covariance_m2=own.covariance_m2 / 100, joint=None) for own in team.maps]
+    given = [
+        GivenMap(robot, own.landmarks, own.points_world_m, worse, own.of_filter_world_m)
+        for robot, own, worse in zip(evaluated_robots(team), judged.given, rough, strict=True)
+    ]
+    end = replace(judged, given=given)
+    rows = coverage([replace(judged, iteration=K - 1), end, replace(end, fuser="other")])
+    assert rows[["map", "fuser"]].drop_duplicates().to_numpy().tolist() == [
+        [FILTERED, ""],
+        [SMOOTHED, ""],
+        [FUSED, "joint"],
+        [FUSED, "other"],
+    ]
+    assert (rows["iteration"] == K).all()
+    at = rows[rows["nominal"] == 0.9].set_index("map")["coverage"]
+    assert at[SMOOTHED] > 0.8
+    assert at[FILTERED] < 0.3
+
+
+def test_where_nothing_was_fused_or_no_truth_is_known_there_are_no_rows() -> None:
+    team = DrawnTeam(PARTS, 4, bent_m=BENT_M)
+    team.world_m[:] = np.nan
+    assert coverage([judged_team(team)]).empty
+    assert coverage([]).empty
+
+
+def _fitted_errors(position: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Lengths after the rigid fit in the plane, by the singular values (Umeyama 1991)."""
+    p, q = position - position.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(q[:, :2].T @ p[:, :2])
+    R = (U @ np.diag([1, np.linalg.det(U @ Vt)]) @ Vt).T
+    plane = p[:, :2] - q[:, :2] @ R.T
+    return np.linalg.norm(np.column_stack([plane, position[:, 2] - truth[:, 2]]), axis=1)
+
+
+def test_figures_are_those_of_the_landmarks_one_by_one() -> None:
+    team = DrawnTeam(PARTS, 1, bent_m=BENT_M)
+    judged = judged_team(team)
+    row, fused = judged.row(), judged.fusion
+    truth = np.full((len(fused.landmarks), 3), np.nan)
+    for k, part in enumerate(team.parts):
+        has = fused.parents[:, k] != ABSENT
+        truth[has] = team.world_m[part][fused.parents[has, k]]
+    truth = se2.transform_points(se2.inverse(team.T_world_map[0]), truth)
+    off = np.linalg.norm(fused.landmarks.position_m - truth, axis=1)
+    errors = _fitted_errors(fused.landmarks.position_m, truth)
+    assert errors.max() < 0.15  # none is gross
+    assert row["landmark_rmse_m"] == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-9)
+    assert row["fitted_rmse_m"] == pytest.approx(np.sqrt(np.mean(errors**2)), rel=1e-6)
+    assert row["fitted_median_m"] == pytest.approx(np.median(errors), rel=1e-6)
+    assert (row["gross_share"], row["n_robots"], row["fuser"]) == (0.0, 3, "joint")
+    assert row["fallback"] == ""
+    ratios = []
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        both = np.all(fused.parents[:, [a, b]] != ABSENT, axis=1)
+        rms = [np.sqrt(np.mean(errors[both] ** 2))]
+        for k in (a, b):
+            own = _fitted_errors(team.maps[k].position_m, team.truth(k))
+            rms.append(np.sqrt(np.mean(own[fused.parents[both, k]] ** 2)))
+        ratios.append(rms[0] / min(rms[1:]))
+    assert row["over_better_parent"] == pytest.approx(np.median(ratios), rel=1e-6)
+    assert row["over_better_filter"] == row["over_better_parent"]  # it was given the filter's maps
+    nees = []
+    for k in (1, 2):
+        T = fused.T_first_map[k] - se2.between(team.T_world_map[0], team.T_world_map[k])
+        T[2] = se2.wrap(T[2])
+        nees.append(T @ np.linalg.solve(fused.motion_covariance[k], T) / 3)
+    assert row["alignment_nees_per_dof"] == pytest.approx(np.median(nees))
+    stated = [fused.motion_covariance[k] for k in (1, 2)]
+    sigma_m = np.median([np.sqrt(S[0, 0] + S[1, 1]) for S in stated])
+    assert row["alignment_sigma_m"] == pytest.approx(sigma_m)
+    assert row["alignment_sigma_rad"] == pytest.approx(np.median([S[2, 2] ** 0.5 for S in stated]))
+
+
+def test_over_the_filter_is_of_the_same_landmarks_in_the_filter_s_maps() -> None:
+    """Maps given are half as far off as the filter's, which lists its landmarks backwards."""
+    team = DrawnTeam(PARTS, 2, bent_m=BENT_M)
+    filters = evaluated_robots(team)
+    rough = []
+    for k, robot in enumerate(filters):
+        own, points = robot.at(K)
+        worse = team.truth(k) + 2 * (own.position_m - team.truth(k))
+        backwards = np.arange(len(own))[::-1]
+        rough_map = type(own)(
+            worse, own.covariance_m2, own.count, own.source_observation, own.descriptor
+        )[backwards]
+        rough.append(EvaluatedRobot(robot.name, {K: rough_map}, {K: points[backwards]}, robot.path))
+    fused = merge(team.maps, team.pairs).fused[0]
+    given = []
+    for robot, good in zip(rough, filters, strict=True):
+        smoothed = SmoothedRobot(
+            robot, np.zeros((1, 3)), good.maps, good.points_world_m, {}, {"not_smoothed": ""}
+        )
+        given.append(GivenMap.at(robot, smoothed, K))
+    row = JudgedFusion("joint", K, fused, given).row()
+    assert row["over_better_filter"] == pytest.approx(row["over_better_parent"] / 2, rel=0.1)
+
+
+def test_a_map_of_one_robot_has_no_parents_to_be_better_than() -> None:
+    team = DrawnTeam(PARTS, 3, bent_m=BENT_M)
+    team.pairs = []
+    row = judged_team(team).row()
+    assert np.isnan([row["over_better_parent"], row["alignment_nees_per_dof"]]).all()
+    assert row["n_robots"] == 1
+
+
+def test_motions_are_judged_by_the_median_robot_and_across_the_half_turn() -> None:
+    """Three maps are off by 0.1, 0.2 and 0.9 m, and by 0.01, 0.02 and 0.3 rad."""
+    team = DrawnTeam([slice(0, 20)] * 4, 5, bent_m=BENT_M)
+    team.T_world_map[:, 2] = [3.1, -3.1, 0.5, -0.4]
+    fused = judged_team(team).fusion
+    sigma = np.diag([0.1, 0.1, 0.01]) ** 2
+    T = np.array([se2.between(team.T_world_map[0], own) for own in team.T_world_map])
+    T[1:, 0] += [0.1, -0.2, 0.9]
+    T[1:, 2] += [0.01 + 2 * np.pi, -0.02, 0.3]
+    fused = replace(fused, T_first_map=T, motion_covariance=np.tile(sigma, (4, 1, 1)))
+    given = [GivenMap.at(robot, None, K) for robot in evaluated_robots(team)]
+    row = JudgedFusion("joint", K, fused, given).row()
+    assert row["alignment_error_m"] == pytest.approx(0.2)
+    assert row["alignment_error_rad"] == pytest.approx(0.02)
+    assert row["alignment_nees_per_dof"] == pytest.approx((4 + 4) / 3)  # 2, 8 and 981 over 3
+
+
+def test_a_fused_map_is_held_against_the_truth_in_its_own_frame() -> None:
+    """The first robot met nobody, so the map is in the frame of the second."""
+    team = DrawnTeam(PARTS, 6, bent_m=BENT_M)
+    team.pairs = [pair for pair in team.pairs if 0 not in (pair.a, pair.b)]
+    judged = judged_team(team)
+    assert judged.fusion.members.tolist() == [1, 2]
+    assert judged.row()["landmark_rmse_m"] < 0.1

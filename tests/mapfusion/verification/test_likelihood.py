@@ -1,0 +1,192 @@
+"""Tests of `mapfusion.verification.likelihood`."""
+
+import numpy as np
+import pytest
+from scipy.stats import beta, betabinom
+
+from mapfusion.verification import likelihood as model
+from mapfusion.verification.fitted_twins import WHOLE
+from mapfusion.verification.likelihood import (
+    CHANGED,
+    PART,
+    RIGHT,
+    WRONG,
+    BetaRate,
+    Signs,
+    TwinShares,
+    log10_against_chance,
+    log10_beside_one,
+    log10_ratio,
+    probability,
+)
+
+
+def must_own(k: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Regions (R, 2, 2) of nothing but landmarks that must be seen, where nothing is a copy."""
+    regions = np.zeros((2, len(k), 2, 2), np.int64)
+    regions[:, :, 0, 0] = k, n
+    return regions[0], regions[1]
+
+
+def pmf(k: np.ndarray, n: np.ndarray, rates) -> np.ndarray:
+    """(R, 2) of both parts, each a product over both classes."""
+    return np.prod([betabinom.pmf(k[..., c], n[..., c], *rates[c]) for c in (0, 1)], axis=0)
+
+
+@pytest.mark.parametrize("shares", [TwinShares(0.01, 0.4), TwinShares(0.3, 0.3)])
+def test_it_is_the_ratio_of_the_two_mixtures(shares: TwinShares) -> None:
+    rng = np.random.default_rng(0)
+    n = rng.integers(0, 12, (300, 2, 2))
+    k = rng.binomial(n, rng.random((300, 1, 1)))
+    right, part, chance = pmf(k, n, RIGHT), pmf(k, n, PART), pmf(k, n, WRONG)
+    twins = WHOLE * right[:, 1] + (1 - WHOLE) * part[:, 1]
+    copies = shares.copied * twins + (1 - shares.copied) * chance[:, 1]
+    throughout = WHOLE * right.prod(axis=1) + (1 - WHOLE) * part.prod(axis=1)
+    wrong = shares.own * throughout + (1 - shares.own) * chance[:, 0] * copies
+    expected = ((1 - CHANGED) * right[:, 0] * right[:, 1] + CHANGED * wrong) / wrong
+    np.testing.assert_allclose(log10_ratio(k, n, shares), np.log10(expected), rtol=1e-9)
+    against = np.log10(right / chance)
+    np.testing.assert_allclose(log10_against_chance(k, n), against, rtol=1e-9)
+
+
+def test_a_region_weighs_no_more_than_twins_and_changes_allow() -> None:
+    n = np.full(1001, 1000)
+    ratios = log10_ratio(*must_own(np.arange(1001), n), TwinShares(0.2, 0.5))
+    assert ratios[0] == pytest.approx(np.log10(CHANGED), abs=0.01)
+    assert ratios.max() < np.log10((1 - CHANGED) / (0.2 * WHOLE) + CHANGED)
+    assert ratios.max() > np.log10((1 - CHANGED) / 0.2 + CHANGED)
+
+
+@pytest.mark.parametrize("rate", RIGHT)
+def test_a_rate_in_part_has_the_mean_and_spread_of_a_rate_times_any_share(rate: BetaRate) -> None:
+    rng = np.random.default_rng(0)
+    drawn = rng.beta(*rate, 200_000) * rng.random(200_000)
+    seen, missed = rate.in_part()
+    assert seen / (seen + missed) == pytest.approx(drawn.mean(), rel=0.01)
+    assert beta.std(seen, missed) == pytest.approx(drawn.std(), rel=0.01)
+
+
+def test_half_of_a_region_speaks_for_a_twin_in_part() -> None:
+    """What is found throughout is likelier of a right motion; half of it of the edge of a twin."""
+    found = np.array([170, 100])
+    throughout, half = log10_ratio(*must_own(found, np.full(2, 200)), TwinShares(0.2, 0.2))
+    assert throughout > 0.7
+    assert half < 0
+
+
+def test_of_a_copy_that_is_found_less_is_learnt_than_of_what_surrounds_it() -> None:
+    """The same picture, its surroundings found, not looked for, and missing."""
+    found, expected = np.zeros((3, 2, 2), np.int64), np.zeros((3, 2, 2), np.int64)
+    found[:, 1, 0] = expected[:, 1, 0] = 20
+    found[0, 0, 0], expected[[0, 2], 0, 0] = 12, 12
+    around, alone, bare = log10_ratio(found, expected, TwinShares(0.02, 0.9))
+    assert around > 1.2
+    assert 0 < alone < np.log10(1 / WHOLE)
+    assert bare < -1
+
+
+def test_where_all_is_a_twin_only_that_it_is_one_throughout_speaks_for_a_motion() -> None:
+    k, n = np.arange(11), np.full(11, 10)
+    ratios = log10_ratio(*must_own(k, n), TwinShares(1 - 1e-12, 0.5))
+    of_right = betabinom.pmf(k, 10, *RIGHT[0])
+    expected = (1 - CHANGED) * of_right / of_twin(k, 10) + CHANGED
+    np.testing.assert_allclose(ratios, np.log10(expected), rtol=1e-6)
+    assert ratios.max() < np.log10(1 / WHOLE)
+
+
+def of_twin(k: np.ndarray, n: int) -> np.ndarray:
+    """The likelihood of k of n that must be seen where they are their like."""
+    return WHOLE * betabinom.pmf(k, n, *RIGHT[0]) + (1 - WHOLE) * betabinom.pmf(k, n, *PART[0])
+
+
+def test_the_ratio_s_mean_under_wrong_motions_is_one() -> None:
+    """E[right / wrong] over the wrong model is 1, whatever the numbers: a likelihood ratio."""
+    n, s = 12, 0.15
+    k = np.arange(n + 1)
+    wrong = s * of_twin(k, n) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
+    ratio = 10 ** log10_ratio(*must_own(k, np.full(n + 1, n)), TwinShares(s, 0.5))
+    assert wrong @ ratio == pytest.approx(1.0)
+
+
+def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
+    """The wrong model is enumerated: of two regions either, at even odds, is as if right."""
+    n, s = 7, 0.15
+    k = np.arange(n + 1)
+    wrong = s * of_twin(k, n) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
+    right = (1 - CHANGED) * betabinom.pmf(k, n, *RIGHT[0]) + CHANGED * wrong
+    found_by_one = (np.outer(right, wrong) + np.outer(wrong, right)) / 2
+    by_region = log10_ratio(*must_own(k, np.full(n + 1, n)), TwinShares(s, 0.5))
+    ratio = [
+        [10 ** log10_beside_one(np.array([first, second])) for second in by_region]
+        for first in by_region
+    ]
+    np.testing.assert_allclose(found_by_one * ratio, np.outer(right, right), rtol=1e-9)
+    assert np.sum(found_by_one * ratio) == pytest.approx(1.0)
+
+
+def test_one_region_alone_is_no_evidence_for_what_it_found() -> None:
+    assert log10_beside_one(np.array([1.3])) == pytest.approx(0.0)
+    assert log10_beside_one(np.zeros(0)) == 0.0
+    assert log10_beside_one(np.full(4, 0.8)) == pytest.approx(3 * 0.8)
+    assert log10_beside_one(np.array([1.3, -1.2])) == pytest.approx(-0.9, abs=0.01)
+
+
+FAIR = Signs(-20.0, 1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
+
+
+@pytest.mark.parametrize(
+    ("better", "worse"),
+    [
+        ({"log10_evidence": 2.5}, {"log10_evidence": -1.0}),
+        ({}, {"log10_false_alarms": -3.5}),
+        ({"n_confirmed": 9}, {"n_contradicted": 2}),
+        ({"extent_m": 11.0}, {"extent_m": 1.0}),
+        ({}, {"one_place": True}),
+        ({}, {"repeats": True}),
+    ],
+)
+def test_it_grows_with_what_speaks_for_it(better: dict, worse: dict) -> None:
+    high, low = (probability(FAIR._replace(**signs)) for signs in (better, worse))
+    assert 0 < low < high < 1
+
+
+def test_the_features_are_bounded_so_that_nothing_is_certain() -> None:
+    most = Signs(-1e9, 1e9, 10**6, 0, 10**6, 1e9, repeats=False, one_place=False)
+    assert probability(most) < 1
+    assert np.isfinite(most.features()).all()
+    np.testing.assert_allclose(most.features()[[0, 1, 4]], [10.0, 3.0, 12.0])
+
+
+@pytest.mark.parametrize(
+    ("n_confirmed", "n_contradicted", "net"),
+    [
+        (0, 0, 0.0),
+        (3, 1, 0.0),  # three regions that confirm make good for one that contradicts
+        (6, 2, 0.0),
+        (2, 0, 1 / 2),  # two regions more count as undecided
+        (8, 0, 4 / 5),
+        (0, 1, -3 / 5),
+        (9, 1, 3 / 7),
+    ],
+)
+def test_a_contradiction_weighs_as_much_as_three_confirmations(
+    n_confirmed: int, n_contradicted: int, net: float
+) -> None:
+    signs = FAIR._replace(n_confirmed=n_confirmed, n_contradicted=n_contradicted)
+    assert signs.features()[2] == pytest.approx(net, abs=1e-15)
+
+
+@pytest.mark.parametrize(("n_support", "decades"), [(0, 0.0), (9, 1.0), (99, 2.0)])
+def test_support_counts_by_its_decades(n_support: int, decades: float) -> None:
+    assert FAIR._replace(n_support=n_support).features()[3] == pytest.approx(decades)
+
+
+def test_coefficients_belong_to_their_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one coefficient set, the log odds are this coefficient times its feature."""
+    signs = FAIR._replace(log10_false_alarms=-4.0, extent_m=7.0, n_contradicted=1, repeats=True)
+    expected = [4.0, 1.0, 1 / 9, np.log10(51), 7.0, 1.0, 0.0]
+    monkeypatch.setattr(model, "INTERCEPT", -0.25)
+    for k, feature in enumerate(expected):
+        monkeypatch.setattr(model, "WEIGHTS", tuple(0.5 * (i == k) for i in range(7)))
+        p = probability(signs)
+        assert np.log(p / (1 - p)) == pytest.approx(0.5 * feature - 0.25)

@@ -1,0 +1,248 @@
+"""Tests of `mapfusion.verification.verdict`."""
+
+import itertools
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from mapfusion.align.alignment import Alignment, Pairs, Status
+from mapfusion.align.clique import Clique
+from mapfusion.align.correspondences import match
+from mapfusion.geometry import se2
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.registration import Registration
+from mapfusion.verification import verdict as verdict_module
+from mapfusion.verification.false_alarms import Acceptance, Verdict
+from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.regions import Witness
+from mapfusion.verification.rivals import BETWEEN, Copies, self_motions
+from mapfusion.verification.verdict import Judge, RivalMotion, laid_sigma_m
+from tests.mapfusion.verification.two_rooms import Wall, between, mapped
+
+JUDGE = Judge()
+
+
+def verdict(a: LandmarkMap, b: LandmarkMap, judge: Judge = JUDGE) -> tuple[Verdict, Alignment]:
+    registration = Registration(Clique(), judge=judge)
+    done = registration.register(a, b, match(a, b), np.random.default_rng(0))
+    return done.verdict, done.refined
+
+
+COMMON = Wall(20, seed=1)
+A, B = mapped(COMMON, 1, 11, seed=2, name="A"), mapped(COMMON, 4, 16, seed=3, name="B")
+
+
+def test_common_ground_is_accepted_with_evidence() -> None:
+    said, refined = verdict(A, B)
+    assert said.status is Status.ACCEPTED
+    assert said.reason == ""
+    np.testing.assert_allclose(refined.T_a_b, between(1, 4), atol=0.03)
+    assert said.n_confirmed >= 2
+    assert said.log10_evidence > 1.5
+
+
+def test_what_is_likelier_wrong_is_not_accepted_whatever_else_speaks_for_it() -> None:
+    said, _ = verdict(A, B)
+    bound = {"least_probability": min(1.0, said.probability + 1e-6)}
+    asked, _ = verdict(A, B, Judge(evidence=EvidenceParameters(**bound)))
+    assert asked.status is Status.AMBIGUOUS
+    assert f"probability {said.probability:.2g}" in asked.reason
+    assert asked.log10_evidence == said.log10_evidence
+
+
+@pytest.mark.parametrize(("log10_by_chance", "status"), [(4.0, "accepted"), (-0.5, "ambiguous")])
+def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
+    log10_by_chance: float, status: str
+) -> None:
+    """Another motion, as well seen again: what chance gives anyway is none."""
+    pairs = match(A, B)
+    sought = Registration(Clique()).on(A, B, pairs)
+    assert sought.judge is not None
+    evidence, (said, refined) = sought.judge.evidence, verdict(A, B)
+    assert evidence is not None
+    elsewhere = refined.T_a_b + np.array([0.0, 30.0, 0.0])
+    none = Copies.none(len(A), len(B))
+    told = log10_by_chance, 9, 2, 0, 2, said.log10_evidence
+    rival = RivalMotion(BETWEEN, elsewhere, *told, none)
+    assert said.log10_evidence > 2.5
+    known = replace(evidence, motions=(*evidence.motions, rival))
+    registration = Registration(Clique()).on(A, B, pairs, known)
+    answer = registration.register(np.random.default_rng(0)).verdict
+    assert str(answer.status) == status
+
+
+@pytest.mark.parametrize(("n_others", "status"), [(2, "accepted"), (4, "ambiguous")])
+def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str) -> None:
+    """Others that are more than chance by their pairs, and fit by no region."""
+    pairs, (said, refined) = match(A, B), verdict(A, B)
+    sought = Registration(Clique()).on(A, B, pairs)
+    assert sought.judge is not None
+    evidence = sought.judge.evidence
+    assert evidence is not None
+    none = Copies.none(len(A), len(B))
+    others = [
+        RivalMotion(
+            BETWEEN, refined.T_a_b + np.array([0.0, 30.0 * k, 0.0]), -5.0, 9, 0, 3, 3, -4.0, none
+        )
+        for k in range(1, n_others + 1)
+    ]
+    known = replace(evidence, motions=(*evidence.motions, *others))
+    enough = EvidenceParameters(least_ratio=10**said.log10_evidence / 4)
+    registration = Registration(Clique(), judge=Judge(evidence=enough)).on(A, B, pairs, known)
+    answer = registration.register(np.random.default_rng(0)).verdict
+    assert str(answer.status) == status
+    assert ("too few beside" in answer.reason) == (status == "ambiguous")
+
+
+def walls_with_one_picture(first_x: float, last_x: float) -> tuple[Wall, Wall]:
+    """Two walls that have nothing but a picture in common."""
+    first, second = Wall(16, seed=1), Wall(16, seed=8)
+    inside = (first.p[:, 0] >= first_x) & (first.p[:, 0] < last_x)
+    hidden = (second.p[:, 0] >= first_x) & (second.p[:, 0] < last_x)
+    second.p = np.concatenate([second.p[~hidden], first.p[inside]])
+    second.look = np.concatenate([second.look[~hidden], first.look[inside]])
+    return first, second
+
+
+def test_what_is_missing_makes_doubt_though_nothing_repeats() -> None:
+    """A picture larger than a region, one of which led to the motion; as much is missing."""
+    first, second = walls_with_one_picture(4, 8)
+    anyhow = Judge(evidence=EvidenceParameters(least_probability=0.0))
+    said, _ = verdict(mapped(first, 4, 12, seed=4), mapped(second, 4, 12, seed=5), anyhow)
+    assert said.status is Status.AMBIGUOUS
+    assert said.n_confirmed == said.n_contradicted == 2
+    assert "beside the one that led to it they speak against it" in said.reason
+
+
+def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
+    first, second = walls_with_one_picture(6, 8)
+    said, refined = verdict(mapped(first, 2, 12, seed=4), mapped(second, 2, 12, seed=5))
+    assert refined.ok
+    assert said.status is Status.REFUSED
+    assert said.log10_false_alarms < -3
+    assert "contradicted" in said.reason
+
+
+def test_a_picture_that_hangs_twice_leaves_two_places() -> None:
+    """Map a saw both copies and nothing else of b's ground; map b saw one."""
+    wall = Wall(30, seed=6, copies=[(4, 2.0, 12.0)])
+    other = Wall(30, seed=7)
+    picture = (wall.p[:, 0] >= 4) & (wall.p[:, 0] < 6)
+    other.p, other.look = wall.p[picture], wall.look[picture]  # on a wall that is bare
+    small = Judge(evidence=EvidenceParameters(place_m=1.0))  # b is one place
+    said, _ = verdict(mapped(wall, 1, 15, seed=8), mapped(other, 3, 7, seed=9), small)
+    assert said.status is Status.AMBIGUOUS
+    assert "T_a_b" in said.reason or "hold things twice" in said.reason
+
+
+def test_a_room_that_is_all_there_is_may_be_another_s_like() -> None:
+    """Both robots see 4 m of one wall and nothing else; with ground around it they are sure."""
+    room = Wall(4, seed=11)
+    said, refined = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13))
+    assert refined.ok
+    assert said.status is Status.AMBIGUOUS
+    assert "little else than this place" in said.reason
+    small = Judge(evidence=EvidenceParameters(place_m=1.0))
+    trusted, _ = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13), small)
+    assert trusted.status is Status.ACCEPTED
+
+
+def test_without_viewing_evidence_it_is_said_that_none_was_sought() -> None:
+    said, _ = verdict(replace(A, viewing=None), B)
+    assert said.status is Status.ACCEPTED
+    expected = "no evidence to the contrary could be sought: map A has no viewing evidence"
+    assert said.reason == expected
+    assert math.isnan(said.log10_evidence)
+
+
+def test_an_alignment_that_is_not_sure_enough_says_how_sure_it_is() -> None:
+    strict = Judge(evidence=EvidenceParameters(max_sigma_m=1e-3))
+    said, _ = verdict(A, B, strict)
+    assert said.status is Status.TOO_UNCERTAIN
+    assert "0.001 m, 0.05 rad are allowed" in said.reason
+    applied = said.applied_to(replace(verdict(A, B)[1]))
+    assert applied.status is Status.TOO_UNCERTAIN
+    assert not applied.ok
+
+
+def test_what_was_found_before_gives_the_same_verdict() -> None:
+    pairs = match(A, B)
+    registration = Registration(Clique())
+    sought = registration.on(A, B, pairs)
+    assert sought.judge is not None
+    known = registration.on(A, B, pairs, sought.judge.evidence)
+    both = [each.register(np.random.default_rng(0)).verdict for each in (sought, known)]
+    assert both[0] == both[1]
+
+
+def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> None:
+    """Each as `a` and as `b`: what it holds twice, and what of that must be seen, is its own."""
+    wall = Wall(20, seed=1, copies=[(2, 2, 12), (5, 1.5, 16)])
+    ends = (1, 11), (4, 16), (7, 19)
+    maps = [mapped(wall, *each, seed=k, name=f"R{k}") for k, each in enumerate(ends)]
+    ready, asked = [Witness(each) for each in maps], []
+
+    def counted(landmarks: LandmarkMap, *settings):
+        asked.append(landmarks.name)
+        return self_motions(landmarks, *settings)
+
+    monkeypatch.setattr(verdict_module, "self_motions", counted)
+    for _ in range(2):
+        for a, b in itertools.permutations(range(3), 2):
+            pairs = Pairs(maps[a], maps[b], match(maps[a], maps[b]))
+            found = JUDGE.on(pairs, witnesses=(ready[a], ready[b])).evidence
+            n, fresh = len(asked), JUDGE.on(pairs).evidence
+            assert len(asked) == n + 2
+            del asked[n:]
+            assert found is not None
+            assert fresh is not None
+            assert (found.shares, found.region_m) == (fresh.shares, fresh.region_m)
+            assert any(each.of != BETWEEN and each.n_regions for each in found.motions)
+            for own, other in zip(found.motions, fresh.motions, strict=True):
+                np.testing.assert_equal(asdict(own), asdict(other))
+    assert sorted(asked) == ["R0", "R1", "R2"]
+    other = replace(JUDGE, acceptance=Acceptance(patch_m=0.5))
+    changed = other.on(pairs, witnesses=(ready[a], ready[b])).evidence
+    assert changed is not None
+    assert len(asked) == 5
+
+
+def test_the_sigma_is_of_landmarks_wherever_the_origins_are() -> None:
+    """Moving both maps' origins far away changes an angle's lever, not the verdict."""
+    far = np.array([1000.0, -500.0, 0.0])
+    moved = [replace(m, position_m=m.position_m + far, viewing=None) for m in (A, B)]
+    near, _ = verdict(replace(A, viewing=None), replace(B, viewing=None))
+    assert verdict(moved[0], moved[1])[0].status == near.status == Status.ACCEPTED
+
+
+@pytest.mark.parametrize("field", ["gate_m", "region_m", "least_ratio", "max_sigma_m"])
+def test_settings_out_of_range_are_named(field: str) -> None:
+    with pytest.raises(ValueError, match=field):
+        EvidenceParameters(**{field: -1.0})
+
+
+COVARIANCE = np.array([[4.0, 1.0, -0.6], [1.0, 3.0, 0.5], [-0.6, 0.5, 0.4]]) * 1e-4
+P_B = np.random.default_rng(0).uniform([2, -9], [12, 3], (40, 2))
+
+
+@pytest.mark.parametrize("T_a_b", [[0.0, 0.0, 0.0], [5.0, -3.0, 2.1]])
+def test_it_is_the_rms_of_what_drawn_alignments_do(T_a_b: list[float]) -> None:
+    T = np.array(T_a_b)
+    drawn = np.random.default_rng(1).multivariate_normal(T, COVARIANCE, 4000)
+    laid = np.stack([se2.transform_points(each, P_B) for each in drawn])
+    off = laid - se2.transform_points(T, P_B)
+    expected = np.sqrt(np.mean(np.sum(off**2, axis=2)))
+    assert laid_sigma_m(T, COVARIANCE, P_B) == pytest.approx(expected, rel=0.03)
+
+
+def test_where_the_frames_have_their_origins_does_not_matter() -> None:
+    """The same two maps with b's origin elsewhere: T, its covariance and p_b change, not this."""
+    T, shift = np.array([1.0, 2.0, 0.7]), np.array([300.0, -80.0])
+    cos, sin = np.cos(T[2]), np.sin(T[2])
+    moved = se2.rotation(T[2]) @ shift
+    J = np.eye(3)
+    J[:2, 2] = sin * shift[0] + cos * shift[1], -cos * shift[0] + sin * shift[1]
+    there = laid_sigma_m(T - [*moved, 0.0], J @ COVARIANCE @ J.T, P_B + shift)
+    assert there == pytest.approx(laid_sigma_m(T, COVARIANCE, P_B), rel=1e-9)

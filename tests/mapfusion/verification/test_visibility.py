@@ -1,0 +1,138 @@
+"""What must have been seen, against a slow twin and a wall that is known."""
+
+import inspect
+import math
+
+import numpy as np
+import pytest
+
+from mapfusion.fastslam.mapping import run_log
+from mapfusion.verification.regions import Witness
+from mapfusion.verification.visibility import LEAST_FRAMES, MAY, MUST, UNSEEN, Seen, Watch, how_seen
+from mapfusion.viewing import BEARINGS, RANGES, FieldOfView, Viewing
+from mapfusion.vision.tracking import TrackParameters
+from tests.mapfusion.verification.two_rooms import Wall, between, mapped
+
+
+def slowly(seen: Seen, viewing: Viewing) -> list[int]:
+    """How each lay in view, pose by pose, from angles alone."""
+    how, field = [], viewing.field
+    for p, direction, before in zip(*seen, strict=True):
+        alike, frames = 0, 0
+        for t, (x, y, theta) in enumerate(viewing.pose):
+            sight = np.array([p[0] - x, p[1] - y])
+            range_m = float(np.linalg.norm(sight))
+            if not before / 2 <= range_m <= 2 * before or range_m == 0:
+                continue
+            slant = math.acos(np.clip(sight @ direction / range_m, -1, 1))
+            bearing = math.remainder(math.atan2(sight[1], sight[0]) - theta, 2 * math.pi)
+            low, high = field.bearing_rad
+            if slant > math.radians(45) or not low <= bearing <= high:
+                continue
+            if not field.range_m[0] <= range_m <= field.range_m[1]:
+                continue
+            lowest, highest = field.height_m[min(int(8 * range_m / field.range_m[1]), 7)]
+            part = min(int(16 * (bearing - low) / (high - low)), 15)
+            unhidden = range_m <= viewing.reach_m[t, part] + 0.3
+            if lowest <= p[2] <= highest and unhidden:
+                near = before / 1.4 <= range_m <= 1.4 * before
+                alike, frames = alike + (near and slant <= math.radians(30)), frames + 1
+        seen_so = MAY if frames >= LEAST_FRAMES else UNSEEN
+        how.append(MUST if alike >= LEAST_FRAMES else seen_so)
+    return how
+
+
+def test_equals_the_slow_twin_on_any_places() -> None:
+    rng = np.random.default_rng(0)
+    landmarks = mapped(Wall(8, seed=1), 1, 6, seed=2)
+    assert landmarks.viewing is not None
+    n, angle = 8000, rng.uniform(-0.8, 0.8, 8000)
+    places = np.stack([rng.uniform(1, 4, n), rng.uniform(-6, 2, n), rng.uniform(0, 1.3, n)], axis=1)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    seen = Seen(places, direction, rng.uniform(1.5, 7, n))
+    how = how_seen(seen, Watch.of(landmarks.viewing))
+    assert how.tolist() == slowly(seen, landmarks.viewing)
+    assert np.bincount(how, minlength=3).min() > 50
+
+
+@pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
+def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None:
+    """Stretches of frames in which the robot turns, and a last one that is shorter."""
+    rng = np.random.default_rng(1)
+    n_frames, n = 100 * LEAST_FRAMES + 3, 3000
+    theta = np.cumsum(rng.normal(0, 0.2, n_frames))
+    steps = 0.1 * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    path = np.column_stack([np.cumsum(steps, axis=0), theta])
+    heights = np.tile([0.1, 1.2], (RANGES, 1))
+    field = FieldOfView(np.array([-1.0, 0.9]) * half_view_rad, np.array([0.5, 6.0]), heights)
+    reach = rng.uniform(0, 6, (n_frames, BEARINGS)).astype(np.float32)
+    nothing = np.zeros(0)
+    viewing = Viewing(nothing, nothing, nothing.astype(np.int32), path, reach, field)
+    angle, at = rng.uniform(-np.pi, np.pi, n), path[rng.integers(0, n_frames, n), :2]
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    distance = rng.uniform(0.5, 6, n)
+    places = np.column_stack([at + distance[:, None] * direction, rng.uniform(0, 1.4, n)])
+    seen = Seen(places, direction, distance)
+    how = how_seen(seen, Watch.of(viewing))
+    assert how.tolist() == slowly(seen, viewing)
+    assert np.bincount(how, minlength=3).min() > 50
+
+
+@pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
+def test_what_is_straight_behind_is_not_in_view(half_view_rad: float) -> None:
+    """Of a robot that turns once, so that its frames are not told all at once to look elsewhere."""
+    n_frames, one = LEAST_FRAMES + 1, np.ones(1)
+    path = np.zeros((n_frames, 3))
+    path[0, 2] = 3.1
+    field = FieldOfView(
+        np.array([-1.0, 0.9]) * half_view_rad,
+        np.array([0.5, 6.0]),
+        np.tile([0.0, 1.0], (RANGES, 1)),
+    )
+    reach = np.full((n_frames, BEARINGS), 5.0, np.float32)
+    ways = one, one, np.ones(1, np.int32), path, reach, field
+    for x, how in ((2.0, MUST), (-2.0, UNSEEN)):
+        seen = Seen(np.array([[x, 0.0, 0.5]]), np.array([[np.sign(x), 0.0]]), 2 * one)
+        assert how_seen(seen, Watch.of(Viewing(*ways))).tolist() == [how]
+
+
+def test_where_nothing_was_seen_nothing_is_in_view() -> None:
+    nowhere = FieldOfView(np.zeros(2), np.zeros(2), np.tile([1.0, 0.0], (RANGES, 1)))
+    one, path = np.ones(1), np.zeros((9, 3))
+    reach = np.zeros((9, BEARINGS), np.float32)
+    viewing = Viewing(one, one, np.ones(1, np.int32), path, reach, nowhere)
+    seen = Seen(np.array([[0.2, 0.0, 0.5]]), np.array([[1.0, 0.0]]), 0.2 * one)
+    assert how_seen(seen, Watch.of(viewing)).tolist() == [UNSEEN]
+
+
+def test_what_must_be_seen_was_in_view_for_as_long_as_a_landmark_takes() -> None:
+    first_observation = TrackParameters().min_length
+    min_count = inspect.signature(run_log).parameters["min_count"].default
+    assert first_observation + min_count - 1 == LEAST_FRAMES
+
+
+def test_of_the_same_wall_what_lies_before_both_robots_must_be_seen() -> None:
+    wall = Wall(12, seed=5)
+    a, b = (Witness(mapped(wall, *ends, seed=6)) for ends in ((1, 6), (4, 10)))
+    own = b.seen_from(between(1, 4))
+    rows = np.flatnonzero(how_seen(own, a.watch) == MUST)
+    along_wall_m = 1 - own.p[:, 1]  # frame a looks at the wall: its y is the world's -x
+    inside = (along_wall_m > 4.5) & (along_wall_m < 5.5)
+    assert np.isin(np.flatnonzero(inside), rows).mean() > 0.95
+    assert not np.isin(np.flatnonzero(along_wall_m > 8), rows).any()
+
+
+def test_behind_a_wall_nothing_must_be_seen() -> None:
+    a = Witness(mapped(Wall(8, seed=7), 1, 6, seed=8))
+    here = a.seen_from(np.zeros(3))
+    behind = here._replace(p=here.p + np.array([1.5, 0.0, 0.0]))
+    along_wall_m = 1 - here.p[:, 1]
+    passed = (along_wall_m > 1) & (along_wall_m < 6)  # what lies at the ends was in view for less
+    assert np.mean(how_seen(here, a.watch)[passed] == MUST) > 0.95
+    assert not how_seen(behind, a.watch).any()
+
+
+def test_from_the_other_side_nothing_must_be_seen() -> None:
+    a = Witness(mapped(Wall(8, seed=7), 1, 6, seed=8))
+    here = a.seen_from(np.zeros(3))
+    assert not how_seen(here._replace(direction=-here.direction), a.watch).any()
