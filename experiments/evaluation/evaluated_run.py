@@ -20,7 +20,6 @@ from experiments.pipeline.head_start import with_head_start
 from experiments.pipeline.kept_logs import kept_log
 from experiments.pipeline.memory import require_memory
 from experiments.pipeline.pipeline import PairStages, Pipeline, RobotStages, lay_out
-from experiments.pipeline.rehearsal import rehearsals
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.fuse import read_fusions
 from experiments.pipeline.stages.match import known_at
@@ -190,7 +189,6 @@ class JudgedRun:
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
         if jobs > 1:
             left = with_head_start(self.pipeline, self.store, left)
-            left = [*rehearsals(self.scenario, left), *left]
         try:
             with workers(jobs) as pool:
                 run_tasks(left, pool, on_progress, None if only else self._load_task())

@@ -125,17 +125,6 @@ class Sightings:
         """What kernels take: by landmark its first row and its first track, by track its rows."""
         return self.starts, self.first_track, self.track_starts
 
-    @property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float]:
-        """What kernels take: by track its rows and landmark, by row what was observed."""
-        return (
-            self.track_starts,
-            self.landmark_of_track,
-            self.frame,
-            self.position_m,
-            self.information,
-        )
-
     def on_level(self, level: float) -> "Sightings":
         """With stated covariances of observations on tracks that stray multiplied by `level`."""
         if level == 1:
