@@ -104,32 +104,19 @@ def depth_at(depth_m: np.ndarray, uv_px: Float) -> Float:
     Between pixels of one surface the inverse depth is interpolated (it is linear in the image for a
     plane); at the edge of a surface the nearest pixel's depth counts.
     """
-    uv = np.ascontiguousarray(uv_px, dtype=np.float64)
-    found = np.empty(len(uv))
-    _read(depth_m, uv, found)
-    return found
-
-
-@kernel(error_model="numpy")  # one over a depth of zero is infinite
-def _read(depth_m: np.ndarray, uv: Float, found: Float) -> None:
     height, width = depth_m.shape
-    for n in range(len(uv)):
-        u = min(max(uv[n, 0], 0.0), width - 1.0)
-        v = min(max(uv[n, 1], 0.0), height - 1.0)
-        i, j = min(int(v), height - 2), min(int(u), width - 2)
-        a, b = u - j, v - i
-        p, q = float(depth_m[i, j]), float(depth_m[i, j + 1])
-        r, s = float(depth_m[i + 1, j]), float(depth_m[i + 1, j + 1])
-        at_p, at_q, at_r, at_s = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-        nearest, most = p, at_p
-        for depth, weight in ((q, at_q), (r, at_r), (s, at_s)):
-            if weight > most:
-                nearest, most = depth, weight
-        found[n] = nearest
+    u, v = np.clip(np.asarray(uv_px, dtype=np.float64), 0, [width - 1.0, height - 1.0]).T
+    i, j = np.minimum(v.astype(np.int64), height - 2), np.minimum(u.astype(np.int64), width - 2)
+    a, b = u - j, v - i
+    depth = np.stack([depth_m[i + r, j + q] for r in (0, 1) for q in (0, 1)]).astype(np.float64)
+    weight = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    nearest = np.take_along_axis(depth, np.argmax(weight, axis=0)[None], axis=0)[0]
+    with np.errstate(divide="ignore", invalid="ignore"):  # one over a depth of zero is infinite
         # comparisons with NaN are false, so a pixel of the background makes an edge too
-        apart = max(p, q, r, s) - min(p, q, r, s)
-        if p + q + r + s > 0 and apart <= SAME_SURFACE * nearest:
-            found[n] = 1 / (at_p / p + at_q / q + at_r / r + at_s / s)
+        apart = depth.max(axis=0) - depth.min(axis=0)
+        is_inside = (depth.sum(axis=0) > 0) & (apart <= SAME_SURFACE * nearest)
+        p, q, r, s = weight / depth
+        return np.where(is_inside, 1 / (p + q + r + s), nearest)
 
 
 NEAR_M = 0.1  # nearer than any wall can come to the lens

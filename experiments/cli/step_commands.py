@@ -96,12 +96,16 @@ def align(
     from experiments.cli.options import DOCUMENT, require_file
     from experiments.evaluation import single_steps as single
     from experiments.reports import json_document
-    from experiments.reports.terminal.run_screen import print_estimates
+    from experiments.reports.terminal.run_screen import print_estimates, print_verdict
     from experiments.scenario.suite import settings_of
 
     require_file("--output", output, DOCUMENT, [map_a, map_b, scenario])
     settings = settings_of(scenario, overrides, seed)
-    rows = single.align(map_a, map_b, settings)
+    rows = []
+    for row in single.align(map_a, map_b, settings):
+        rows.append(row)
+        if not as_json:
+            print_verdict(row)
     found = json_document.of_alignment((map_a, map_b), settings.seed, rows)
     json_document.publish("align", found, as_json, output)
     if not as_json:

@@ -21,7 +21,6 @@ from experiments.evaluation.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.evaluation.truth import why_no_truth
 from experiments.pipeline.memory import require_memory
 from experiments.pipeline.pipeline import PairStages, Pipeline, RobotStages, lay_out
-from experiments.pipeline.rehearsal import rehearsals
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.fuse import read_fusions
 from experiments.pipeline.stages.match import known_at
@@ -214,7 +213,7 @@ class JudgedRun:
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
         if jobs > 1:
-            left = [*rehearsals(self.scenario, left), *left]
+            left = with_head_start(self.pipeline, self.store, left)
         try:
             with workers(jobs) as pool:
                 run_tasks(left, pool, on_progress, None if only else self._load_task())

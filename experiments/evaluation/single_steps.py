@@ -1,7 +1,7 @@
 """Single steps on a user's files: slam, align, merge."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -173,8 +173,8 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     return Registration(aligner, settings.refinement, settings.judge)
 
 
-def align(path_a: Path, path_b: Path, settings: Scenario) -> list[dict[str, Any]]:
-    """Every aligner's estimate, its refinement and the verdict on it, as rows.
+def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, Any]]:
+    """Yield every aligner's estimate, its refinement and the verdict on it, a row at a time.
 
     Each is called twice, with the same random numbers, and the second call is timed: the first
     compiles kernels and starts processes. Nothing of the first is kept for the second.
@@ -182,7 +182,6 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> list[dict[str, Any]
     map_a, map_b = read_map(path_a), read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
     evidence = settings.align.judge.on(Pairs(map_a, map_b, pairs)).evidence
-    rows = []
     for entry in settings.align.aligners:
         registration = _registration(entry, settings.align)
         given = map_a, map_b, pairs, evidence
@@ -191,8 +190,7 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> list[dict[str, Any]
             done = registration.on(*given).register(generator(settings.seed, "align", entry.name))
         row = {"aligner": entry.name, "elapsed_s": done.estimated.elapsed_s}
         row |= {"n_inliers": int(done.refined.inlier.sum())} | estimate_row(len(pairs), *done)
-        rows.append(row)
-    return rows
+        yield row
 
 
 def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:

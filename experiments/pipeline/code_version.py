@@ -2,9 +2,10 @@
 
 Read from the import statements, without importing anything. A process reads each file once.
 
-Numba by itself notices a change in a kernel's own file, not in a kernel that it calls from another
-file. A folder named after the source of both cannot hand out an outdated kernel, and a change to
-one module leaves alone what is compiled of those that do not import it.
+Numba recompiles a kernel when its own file changes, but not when a kernel or a constant of another
+file changes. The folder is named by a hash of all sources, so it never holds an outdated kernel.
+All processes share it. Numba writes whole files, so processes need no lock: at worst two of them
+compile the same kernel at the same time.
 """
 
 import functools
@@ -13,8 +14,6 @@ import importlib.metadata
 import os
 import re
 import shutil
-from collections import Counter
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 SOURCE_ROOT = Path(__file__).resolve().parents[2]
@@ -25,17 +24,9 @@ _FINDS_BY_NAME = frozenset({"mapfusion/align/aligners.py"})
 _DATA = ".urdf"  # files that a module reads from its own folder
 _KEPT = (".py", _DATA)
 _NUMERICAL_LIBRARIES = ("numba", "numpy", "opencv-python-headless", "pyarrow", "pybullet", "scipy")
-# Parsing all files would take each process that is started tenths of a second, so a statement is
-# told by its looks. A line of a text may have them, too: at worst that adds a file.
-_STATEMENT = re.compile(
-    r"""
-    [\r\n;:][ \t\f]*  # what may stand before a statement
-    (?:from\b(?P<package>(?:[\w. \t\f]|\\\r?\n)+?))?
-    \bimport\b(?P<names>\s*\((?:[^()#]|\#.*)*\)|(?:[\w.,* \t\f]|\\\r?\n)+)
-    """,
-    re.VERBOSE,
-)
-_NO_NAME = re.compile(r"#.*|[()\\]")
+# An import statement as our formatter writes it; Python's parser would take ten times as long.
+_IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) )?import (\([^)]*\)|.+)$", re.MULTILINE)
+_NO_NAME = re.compile(r"#.*|[()]")
 
 
 @functools.cache
@@ -99,24 +90,15 @@ def imports_of(root: Path, path: str) -> tuple[str, ...]:
     """
     if path in _FINDS_BY_NAME:
         return ()
-    text = "\n" + _content(root, path).decode(errors="replace")
     found: list[str | None] = []
-    for package, names in _imported_names(text):
-        if package is None:
-            found += [_file_of(root, name) for name in names]
-        else:  # what is imported from a package may be a module in it
+    for package, listed in _IMPORT.findall(_content(root, path).decode()):
+        names = [name.split()[0] for name in _NO_NAME.sub(" ", listed).split(",") if name.strip()]
+        if package:  # what is imported from a package may be a module in it
             whole = _file_of(root, package)
             found += [_file_of(root, f"{package}.{name}") or whole for name in names]
+        else:
+            found += [_file_of(root, name) for name in names]
     return tuple(filter(None, found))
-
-
-def _imported_names(text: str) -> Iterator[tuple[str | None, list[str]]]:
-    """Of each import statement: what it imports from, if it says so, and the names it imports."""
-    for statement in _STATEMENT.finditer(text):
-        package = statement["package"]
-        listed = (name.split() for name in _NO_NAME.sub(" ", statement["names"]).split(","))
-        names = [name for name, *_ in filter(None, listed)]  # without `as` and what follows
-        yield (package and "".join(package.replace("\\", " ").split())), names
 
 
 @functools.cache
@@ -151,98 +133,35 @@ def _content(root: Path, path: str) -> bytes:
     return (root / path).read_bytes()
 
 
-_VERSIONS_KEPT = 4  # of a module; going back and forth between branches stays fast
+# Kernels of `experiments` use kernels of these alone, and Numba notices changes of their own files.
+_SOURCES = ("mapfusion", "sim")
+_VERSIONS_KEPT = 8  # so that a change between branches need not compile everything again
 _HASH_DIGITS = 16
-# What is not ours, a plug-in's kernels, goes where Numba would put it.
-_LOCATORS = ("UserProvidedCacheLocator", "InTreeCacheLocator", "UserWideCacheLocator")
 
 
 def use_kernel_cache() -> None:
-    """Tell Numba where to keep compiled kernels; to be called before it is first imported.
+    """Tell Numba where to keep compiled kernels; call this before Numba is imported.
 
-    A `NUMBA_CACHE_DIR` set by the user is left alone. Worker processes inherit the setting.
+    Worker processes inherit the setting. A `NUMBA_CACHE_DIR` set by the user is left alone.
     """
-    # Numba tries one way of compiling a call after the other and discards the errors of those that
-    # fail. To colour them, where colorama is installed, is a thirtieth of all compilation.
-    os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
     if "NUMBA_CACHE_DIR" in os.environ:
         return
     cache_home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     root = cache_home / "mapfusion" / "kernels"
+    folder = root / source_hash(_SOURCES)[:_HASH_DIGITS]
     try:
-        root.mkdir(parents=True, exist_ok=True)
-        _remove_outdated(root)
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        outdated = sorted(root.iterdir(), key=_last_used, reverse=True)[_VERSIONS_KEPT:]
     except OSError:  # a home that cannot be written to: Numba finds a place of its own
         return
-    os.environ["NUMBA_CACHE_DIR"] = str(root)
-    ours = f"{__name__}.{KernelLocator.__name__}"
-    os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", ",".join((ours, *_LOCATORS)))
-
-
-def _remove_outdated(root: Path) -> None:
-    seen = Counter[str]()
-    for folder in sorted(root.iterdir(), key=_last_used, reverse=True):
-        module, _, _ = folder.name.rpartition("-")
-        seen[module] += 1
-        if seen[module] > _VERSIONS_KEPT:
-            shutil.rmtree(folder, ignore_errors=True)
+    for each in outdated:
+        shutil.rmtree(each, ignore_errors=True)
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
 
 
 def _last_used(folder: Path) -> float:
     try:
         return folder.stat().st_mtime
-    except OSError:  # another command has just removed it
+    except OSError:  # another process has just removed it
         return 0.0
-
-
-class KernelLocator:
-    """Tells Numba where the kernels of one of our modules are kept (its cache locators' protocol).
-
-    Numba makes one for each kernel, by the name in `NUMBA_CACHE_LOCATOR_CLASSES`.
-    """
-
-    def __init__(self, folder: Path, path: str, line: int) -> None:
-        self._folder, self._line = folder, line
-        self._py_file = path  # where Numba's warning points to, of a kernel that cannot be kept
-
-    @classmethod
-    def from_function(cls, py_func: Callable[..., object], py_file: str) -> "KernelLocator | None":
-        """That of a kernel in a file; none where it is not ours or cannot be kept."""
-        root, path = os.environ.get("NUMBA_CACHE_DIR"), Path(py_file)
-        if not root or not any(path.is_relative_to(SOURCE_ROOT / package) for package in PACKAGES):
-            return None
-        try:
-            folder = _used(kernel_folder(Path(root), path))
-        except OSError:
-            return None
-        return cls(folder, py_file, py_func.__code__.co_firstlineno)
-
-    def get_cache_path(self) -> str:
-        """The folder."""
-        return str(self._folder)
-
-    def ensure_cache_path(self) -> None:
-        """Make the folder where it was removed since."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-
-    def get_source_stamp(self) -> str:
-        """What is in it is of one version of the source, which its name tells."""
-        return self._folder.name
-
-    def get_disambiguator(self) -> str:
-        """Tells kernels of one name in one file apart."""
-        return str(self._line)
-
-
-@functools.cache
-def kernel_folder(root: Path, path: Path) -> Path:
-    """Where below `root` the kernels of a file of ours are kept, as the source stands."""
-    module = ".".join(path.relative_to(SOURCE_ROOT).with_suffix("").parts)
-    return root / f"{module}-{source_hash(imported_sources(module))[:_HASH_DIGITS]}"
-
-
-@functools.cache
-def _used(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    os.utime(folder)
-    return folder

@@ -15,19 +15,11 @@ from mapfusion.align.consensus import Consensus, consistency, in_rows
 from mapfusion.align.mahalanobis_gate import PlanarPairs, Spread, settle, settle_at_best_scale
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.rigid_motion import fit_rigid
-from mapfusion.geometry.numerics import (
-    WORD,
-    chi_square_bound,
-    count_common,
-    inner_kernel,
-    kernel,
-    kernel_part,
-    trailing_zeros,
-)
+from mapfusion.geometry.numerics import WORD, chi_square_bound, count_common, kernel, trailing_zeros
 from mapfusion.parameters import Probability, Range
 
 
-@kernel_part
+@kernel
 def degrees(graph: np.ndarray) -> np.ndarray:
     """Number of neighbours (N,) of each vertex of a graph (N, W)."""
     degree = np.empty(len(graph), np.int64)
@@ -36,13 +28,13 @@ def degrees(graph: np.ndarray) -> np.ndarray:
     return degree
 
 
-@inner_kernel
+@kernel
 def has(bits: np.ndarray, v: int) -> bool:
     """Whether v is in a set (W,)."""
     return (bits[v // WORD] >> np.uint64(v % WORD)) & np.uint64(1) != 0
 
 
-@inner_kernel
+@kernel
 def members(bits: np.ndarray, into: np.ndarray) -> int:
     """Write the numbers of a set (W,) into `into`, ascending; returns how many there are."""
     count = 0
@@ -147,7 +139,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     return best[:size_of_best].copy()
 
 
-@inner_kernel
+@kernel
 def colour(
     graph: np.ndarray,
     candidates: np.ndarray,
@@ -188,7 +180,7 @@ def colour(
                     count += 1
 
 
-@kernel_part
+@kernel
 def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np.ndarray, int]:
     """Maximum clique (K,) of a small graph (n, W) if larger than `at_least`, else empty.
 
@@ -235,7 +227,7 @@ def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np
     return best, budget
 
 
-@kernel_part
+@kernel
 def _subgraph(graph: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """The graph (n, ceil(n / 64)) of some vertices (n,), numbered 0 to n - 1."""
     n = len(rows)

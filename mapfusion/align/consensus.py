@@ -24,9 +24,7 @@ from mapfusion.geometry.numerics import (
     WORD,
     Float,
     chi_square_bound,
-    inner_kernel,
     kernel,
-    kernel_part,
     mirror,
     packed,
     trailing_zeros,
@@ -57,13 +55,13 @@ class _Coarse(NamedTuple):
     most: np.ndarray
 
 
-@kernel_part
+@kernel
 def _worst(xx: float, xy: float, yy: float) -> float:
     """Larger eigenvalue of a covariance: the variance in the worst direction."""
     return (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
 
 
-@kernel_part
+@kernel
 def _coarse(rows: Float, variance_m2: float, bound: float) -> _Coarse:
     """The pairs under their landmarks' worst variances, so that rounding loses none."""
     n, extent = len(rows), _LEAST_EXTENT_M
@@ -89,7 +87,7 @@ def _coarse(rows: Float, variance_m2: float, bound: float) -> _Coarse:
     return coarse
 
 
-@kernel_part
+@kernel
 def _mark_near(
     ax: np.ndarray,
     ay: np.ndarray,
@@ -113,14 +111,14 @@ def _mark_near(
         near[j] = (p - q) * (p - q) <= m * (p + q + (p + q) - m)
 
 
-@inner_kernel(error_model="numpy")
+@kernel(error_model="numpy")
 def _variance_along(dx: float, dy: float, square: float, xx: float, xy: float, yy: float) -> float:
     """Variance along the line (dx, dy) of this squared length; 0 where there is no line."""
     along = dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy
     return along / square if square > 0 else 0.0
 
 
-@inner_kernel(error_model="numpy")
+@kernel(error_model="numpy")
 def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> float:
     """`drift_needed` of two correspondences, each a row of `in_rows`."""
     ax, ay, bx, by = other[0] - one[0], other[1] - one[1], other[2] - one[2], other[3] - one[3]
@@ -140,13 +138,13 @@ def in_rows(pairs: PlanarPairs) -> Float:
     return rows
 
 
-@inner_kernel
+@kernel
 def _numbers(rows: Float, i: int) -> tuple[float, ...]:
     r = rows[i]
     return r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9]
 
 
-@kernel_part
+@kernel
 def drift_needed(rows: Float, i: int, j: int, bound: float) -> float:
     """s_drift^2 from which on correspondences i and j of `in_rows` agree; negative: even without.
 
@@ -156,7 +154,7 @@ def drift_needed(rows: Float, i: int, j: int, bound: float) -> float:
     return _needed(_numbers(rows, i), _numbers(rows, j), bound)
 
 
-@kernel_part
+@kernel
 def _agreeing(
     near: np.uint64,
     first: int,

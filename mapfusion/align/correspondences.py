@@ -14,9 +14,7 @@ from mapfusion.geometry.numerics import (
     WORD,
     Float,
     chi_square_bound,
-    inner_kernel,
     kernel,
-    kernel_part,
     packed,
     trailing_zeros,
 )
@@ -135,7 +133,7 @@ def _coarse(side: _Side, rows: np.ndarray, height_bound: float) -> _Coarse:
     return _Coarse(square, best, z, most)
 
 
-@kernel_part
+@kernel
 def _mark_nearer(
     product: np.ndarray,
     square: np.ndarray,
@@ -207,14 +205,14 @@ def _take_nearer(
             first, end = end, 2 * end
 
 
-@kernel_part
+@kernel
 def _apart_by_less(p: Float, i: int, q: Float, j: int, distance_m: float) -> bool:
     """Whether point i of (N, 2) and point j of others are less than a distance apart."""
     dx, dy = p[i, 0] - q[j, 0], p[i, 1] - q[j, 1]
     return dx * dx + dy * dy < distance_m * distance_m
 
 
-@inner_kernel
+@kernel
 def _take(side: _Side, i: int, j: int, distance2: float) -> None:
     """Take j for the nearest of i if it is; of equally near ones the first."""
     known = side.distance2[i]

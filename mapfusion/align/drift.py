@@ -10,7 +10,7 @@ import numpy as np
 
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances
-from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import rotation
 
 # Below this nothing is measured: it only keeps the weights of noise-free data finite.
@@ -22,7 +22,7 @@ _BEYOND = 41.0
 _MOTION_PARAMETERS = 3
 
 
-@inner_kernel
+@kernel
 def _scoring(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:
@@ -32,7 +32,8 @@ def _scoring(
     radius g, is -log|C|/2 - e' C^-1 e/2 - log(1 - exp(-g^2 / 2v)) with v = tr C / 2. The last term
     is exact for isotropic C and small otherwise, since a gate is wide. The three parameters that
     the fitted motion took from the 2N numbers are made good by their share.
-    S = S_a + R S_b R^T is (N, 2, 2), `weight` (N,) 0 to 1 how surely each pair is true.
+    S = S_a + R S_b R^T is (N, 2, 2), `weight` (N,) 0 to 1 how surely each pair is true; what has
+    no weight is not read.
     """
     numbers = 0.0
     for i in range(len(weight)):
@@ -40,6 +41,8 @@ def _scoring(
     share = numbers / max(numbers - _MOTION_PARAMETERS, 1.0)
     score = information = 0.0
     for i in range(len(residual_m)):
+        if weight[i] == 0:
+            continue
         xx = covariance_m2[i, 0, 0] + variance_m2
         xy = covariance_m2[i, 0, 1]
         yy = covariance_m2[i, 1, 1] + variance_m2
@@ -57,7 +60,7 @@ def _scoring(
     return score / information
 
 
-@kernel_part
+@kernel
 def drift_step(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import moved_point
 
 # At most. To ask a box costs as much as to pass over some ten points of a leaf.
@@ -153,7 +153,7 @@ def room_for_groups() -> Room:
     return Room(x, y, z, nearest, np.empty(GROUP), node, away, near, far)
 
 
-@inner_kernel
+@kernel
 def look_up_group(
     T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: Room
 ) -> None:
@@ -186,7 +186,7 @@ def look_up_group(
     _descend(tree, room)
 
 
-@kernel_part
+@kernel
 def _largest(values: Float) -> float:
     largest = values[0]
     for q in range(1, GROUP):
@@ -194,13 +194,13 @@ def _largest(values: Float) -> float:
     return largest
 
 
-@kernel_part
+@kernel
 def _between(low: float, high: float, box_low: float, box_high: float) -> float:
     """How far two intervals are apart."""
     return max(box_low - high, low - box_high, 0.0)
 
 
-@kernel_part
+@kernel
 def _descend(tree: BoxTree, room: Room) -> None:
     """Go down the tree with a group, to the nearest boxes first."""
     _, px, py, pz, _, box, starts, ends = tree
@@ -242,8 +242,15 @@ def _descend(tree: BoxTree, room: Room) -> None:
                 near[n_near] = c
                 n_near += far[c] < most
             for c in range(n_near):
+                # let each of the group take point k for its nearest if it is
                 k = starts[node] + near[c]
-                _compare(k, px[k], py[k], pz[k], x, y, z, found, square)
+                at_x, at_y, at_z = px[k], py[k], pz[k]
+                for q in range(GROUP):
+                    dx, dy, dz = at_x - x[q], at_y - y[q], at_z - z[q]
+                    away = dx * dx + dy * dy + dz * dz
+                    nearer = away < square[q]
+                    square[q] = away if nearer else square[q]
+                    found[q] = k if nearer else found[q]
             most = _largest(square)
         while n_todo > 0 and aways[n_todo - 1] >= most:
             n_todo -= 1
@@ -251,27 +258,6 @@ def _descend(tree: BoxTree, room: Room) -> None:
             return
         n_todo -= 1
         node = nodes[n_todo]
-
-
-@kernel_part
-def _compare(
-    k: int,
-    px: float,
-    py: float,
-    pz: float,
-    x: Float,
-    y: Float,
-    z: Float,
-    found: Float,
-    square: Float,
-) -> None:
-    """Let each of a group take point k for its nearest if it is."""
-    for q in range(GROUP):
-        dx, dy, dz = px - x[q], py - y[q], pz - z[q]
-        away = dx * dx + dy * dy + dz * dz
-        nearer = away < square[q]
-        square[q] = away if nearer else square[q]
-        found[q] = k if nearer else found[q]
 
 
 _WIDER = 1 + 1e-6  # than the radius asked for, so that rounding leaves out no point on its edge
@@ -319,7 +305,7 @@ class Grid(NamedTuple):
         return cls(p[row], row, start, corner_m, cell_m, shape)
 
 
-@inner_kernel
+@kernel
 def _cells(middle: float, radius: float, corner: float, cell: float, cells: int) -> tuple[int, int]:
     """First cell that an interval meets along one axis, and one behind the last."""
     wider = radius * _WIDER
@@ -328,7 +314,7 @@ def _cells(middle: float, radius: float, corner: float, cell: float, cells: int)
     return (int(first), int(last) + 1) if first <= last else (0, 0)
 
 
-@inner_kernel
+@kernel
 def runs_about(x: float, y: float, radius_m: float, grid: Grid, runs: np.ndarray) -> int:
     """Ranges of grid.p with all points within a radius of (x, y), and others.
 

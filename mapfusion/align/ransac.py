@@ -10,7 +10,7 @@ from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.rigid_motion import fit_rigid, fit_two
-from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import residual
 from mapfusion.parameters import Probability, Range, require_in_range
 
@@ -61,7 +61,7 @@ class Ransac:
         return Fit(T_a_b, inlier, gate_m=self.gate_m)
 
 
-@inner_kernel
+@kernel
 def next_random(state: np.uint64) -> np.uint64:
     """Next state of a xorshift generator with 64 bits (Marsaglia 2003); state must not be 0."""
     state ^= state << np.uint64(13)
@@ -70,7 +70,7 @@ def next_random(state: np.uint64) -> np.uint64:
     return state
 
 
-@inner_kernel
+@kernel
 def draw_pair(state: np.uint64, n: int) -> tuple[np.uint64, int, int]:
     """The state after drawing two different numbers below n, and the numbers."""
     # the upper 32 bits, scaled, are uneven by n / 2^32 at most
@@ -81,7 +81,7 @@ def draw_pair(state: np.uint64, n: int) -> tuple[np.uint64, int, int]:
     return state, i, j + 1 if j >= i else j
 
 
-@kernel_part
+@kernel
 def _two_point_motion(
     p_a: Float, p_b: Float, i: int, j: int, gate_m: float, min_baseline_m: float, T_a_b: Float
 ) -> bool:
@@ -95,7 +95,7 @@ def _two_point_motion(
     return fit_two(p_a, p_b, i, j, T_a_b) >= min_baseline_m
 
 
-@inner_kernel
+@kernel
 def list_supporters(
     T_a_b: Float, p_a: Float, p_b: Float, gate_m: float, to_beat: int, rows: np.ndarray
 ) -> tuple[int, float]:
@@ -122,7 +122,7 @@ def list_supporters(
     return count, cost
 
 
-@kernel_part
+@kernel
 def refit(
     p_a: Float, p_b: Float, gate_m: float, T_a_b: Float, rows: np.ndarray, count: int
 ) -> tuple[int, float]:

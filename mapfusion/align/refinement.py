@@ -12,17 +12,12 @@ from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.drift import calibration_part, drift_step
 from mapfusion.align.mahalanobis_gate import (
     PlanarPairs,
-    at_rows,
-    farthest_m,
     is_unlike_the_others,
-    leaves_margin,
-    mark_inside,
     most_leverage,
-    near_pairs,
     why_one_pair,
 )
 from mapfusion.align.method import why_one_place
-from mapfusion.geometry.numerics import Float, invert, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, invert, kernel
 from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points, wrap
 from mapfusion.parameters import Range, require_in_range, require_shape
 
@@ -135,138 +130,6 @@ class Refinement:
         return max(self.gate_m, _GATE_SIGMAS**2 * math.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
-@kernel_part
-def residuals_under(T_a_b: Float, pairs: PlanarPairs, e: Float, S: Float) -> None:
-    """Fill e = p_a - T p_b (N, 2) and S = S_a + R S_b R^T (N, 2, 2)."""
-    p_a, p_b, S_a, S_b = pairs
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    for i in range(len(p_a)):
-        e[i, 0], e[i, 1] = residual(T_a_b, cos, sin, p_a, p_b, i)
-        S[i, 0, 0], turned_xy, S[i, 1, 1] = add_turned(
-            S_a[i, 0, 0], 0.0, S_a[i, 1, 1], cos, sin, S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
-        )
-        S[i, 0, 1] = S[i, 1, 0] = S_a[i, 0, 1] + turned_xy
-
-
-@kernel_part
-def truth_probabilities(
-    e: Float,
-    S: Float,
-    variance_m2: float,
-    share: float,
-    gate_m: float,
-    inside: np.ndarray,
-    truth: Float,
-) -> tuple[float, int]:
-    """Fill the probability (N,) of being true of each pair inside the gate, 0 of the others.
-
-    Returns their sum, and how many are inside.
-    """
-    false_density = (1 - share) / (math.pi * gate_m * gate_m)
-    total, count = 0.0, 0
-    for i in range(len(e)):
-        truth[i] = 0.0
-        if not inside[i]:
-            continue
-        xx, xy, yy = S[i, 0, 0] + variance_m2, S[i, 0, 1], S[i, 1, 1] + variance_m2
-        det = xx * yy - xy * xy
-        square = (yy * e[i, 0] ** 2 - 2 * xy * e[i, 0] * e[i, 1] + xx * e[i, 1] ** 2) / det
-        true_density = share * math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
-        if true_density > 0:
-            truth[i] = true_density / (true_density + false_density)
-        total += truth[i]
-        count += 1
-    return total, count
-
-
-@kernel_part
-def put_normal_equations(
-    T_a_b: Float,
-    p_b: Float,
-    e: Float,
-    S: Float,
-    variance_m2: float,
-    truth: Float,
-    normal: Float,
-    right: Float,
-) -> None:
-    """J' W J (3, 3) and J' W e (3,) with W = truth (S + s_drift^2 I)^-1 and J = d(T p_b)/dT."""
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    nxx = nxy = nyy = nxt = nyt = ntt = rx = ry = rt = 0.0
-    for i in range(len(e)):
-        if truth[i] == 0:
-            continue
-        ex, ey = e[i, 0], e[i, 1]
-        xx, xy, yy = S[i, 0, 0] + variance_m2, S[i, 0, 1], S[i, 1, 1] + variance_m2
-        scale = truth[i] / (xx * yy - xy * xy)
-        wxx, wxy, wyy = scale * yy, -scale * xy, scale * xx
-        jx, jy = lever(cos, sin, p_b, i)
-        wx, wy = wxx * ex + wxy * ey, wxy * ex + wyy * ey
-        nxx, nxy, nyy = nxx + wxx, nxy + wxy, nyy + wyy
-        nxt += wxx * jx + wxy * jy
-        nyt += wxy * jx + wyy * jy
-        ntt += wxx * jx * jx + 2 * wxy * jx * jy + wyy * jy * jy
-        rx, ry, rt = rx + wx, ry + wy, rt + (jx * wx + jy * wy)
-    right[0], right[1], right[2] = rx, ry, rt
-    normal[0, 0], normal[1, 1], normal[2, 2] = nxx, nyy, ntt
-    normal[0, 1] = normal[1, 0] = nxy
-    normal[0, 2] = normal[2, 0] = nxt
-    normal[1, 2] = normal[2, 1] = nyt
-
-
-@kernel_part
-def take_missing_information(
-    T_a_b: Float,
-    p_b: Float,
-    e: Float,
-    S: Float,
-    weighed_m2: float,
-    judged_m2: float,
-    truth: Float,
-    information: Float,
-) -> None:
-    """Take from the information (3, 3) what not knowing which pairs are true takes (Louis 1982).
-
-    When the motion moves, so do the probabilities: d truth / de = -truth (1 - truth) C^-1 e, and a
-    normal matrix with certain weights would promise too much. `weighed_m2` is s_drift^2 in the
-    weights, `judged_m2` in the probabilities; e and S are those of `residuals_under`.
-    """
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    missing, pull, turn = np.zeros((3, 3)), np.empty(3), np.empty(3)
-    for i in range(len(e)):
-        share = truth[i] * (1 - truth[i])
-        if share == 0:
-            continue
-        jx, jy = lever(cos, sin, p_b, i)
-        for k in range(2):
-            variance, force = (judged_m2, turn) if k else (weighed_m2, pull)
-            xx, xy, yy = S[i, 0, 0] + variance, S[i, 0, 1], S[i, 1, 1] + variance
-            det = xx * yy - xy * xy
-            force[0] = (yy * e[i, 0] - xy * e[i, 1]) / det
-            force[1] = (xx * e[i, 1] - xy * e[i, 0]) / det
-            force[2] = jx * force[0] + jy * force[1]
-        for row in range(3):
-            for column in range(3):
-                product = pull[row] * turn[column] + turn[row] * pull[column]
-                missing[row, column] += share * product / 2
-    for row in range(3):
-        for column in range(3):
-            information[row, column] -= missing[row, column]
-
-
-@kernel_part
-def _farthest_moved(T_a_b: Float, step: Float, p_b: Float, truth: Float) -> float:
-    """How far a step (3,) moves the landmark that it moves farthest, in m."""
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    square = 0.0
-    for i in range(len(truth)):
-        if truth[i] > 0:
-            jx, jy = lever(cos, sin, p_b, i)
-            dx, dy = step[0] + jx * step[2], step[1] + jy * step[2]
-            square = max(square, dx * dx + dy * dy)
-    return math.sqrt(square)
-
-
 @kernel
 def maximise_likelihood(
     pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
@@ -278,29 +141,66 @@ def maximise_likelihood(
         landmark (m), T_a_b (3,), its covariance (3, 3), s_drift^2, each pair's probability of being
         true (N,), and which one has most leverage.
     """
-    n, farthest = len(pairs.p_a), farthest_m(pairs.p_b)
-    T_a_b, T_near = T_start.copy(), T_start.copy()
-    inside_of_all, truth_of_all = np.zeros(n, np.bool_), np.zeros(n)
-    near = near_pairs(T_a_b, pairs, gate_m, inside_of_all)
+    p_a, p_b, S_a, S_b = pairs
+    n = len(p_a)
+    T_a_b, cos, sin = T_start.copy(), 1.0, 0.0
+    # residuals p_a - T p_b and their covariances S_a + R S_b R^T, of the pairs inside the gate
+    e, S = np.empty((n, 2)), np.empty((n, 2, 2))
+    inside, truth = np.zeros(n, np.bool_), np.zeros(n)
     widest = (gate_m / _GATE_SIGMAS) ** 2
     variance, share = widest, 0.5
     step_share, last_change = 1.0, 0.0
-    covariance, step, right = np.empty((3, 3)), np.empty(3), np.empty(3)
+    normal, covariance, step = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for k in range(9):
         covariance[k // 3, k % 3] = math.nan
     moved, determined = math.inf, True
-    judged, weighed, normal, at = variance, variance, np.empty((3, 3)), np.empty(3)
+    judged, weighed = variance, variance
     for rounds in range(max_rounds):
-        if leaves_margin(T_a_b, T_near, gate_m, farthest):
-            at_rows(near.inside, near.rows, inside_of_all)
-            near, T_near = near_pairs(T_a_b, pairs, gate_m, inside_of_all), T_a_b.copy()
-        _, some, e, S, inside, truth = near
-        residuals_under(T_a_b, some, e, S)
-        if rounds < _SETTLING_ROUNDS:
-            mark_inside(e, gate_m, inside)
+        cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
         weighed, judged = variance, max(variance, least_drift_m * least_drift_m)
-        total, count = truth_probabilities(e, S, judged, share, gate_m, inside, truth)
-        put_normal_equations(T_a_b, some.p_b, e, S, variance, truth, normal, right)
+        false_density = (1 - share) / (math.pi * gate_m * gate_m)
+        total, count = 0.0, 0
+        # J' W J and J' W e with W = truth (S + s_drift^2 I)^-1 and J = d(T p_b)/dT
+        nxx = nxy = nyy = nxt = nyt = ntt = rx = ry = rt = 0.0
+        for i in range(n):
+            ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
+            if rounds < _SETTLING_ROUNDS:
+                inside[i] = ex * ex + ey * ey <= gate_m * gate_m
+            truth[i] = 0.0
+            if not inside[i]:
+                continue
+            own_xx, turned_xy, own_yy = add_turned(
+                S_a[i, 0, 0], 0.0, S_a[i, 1, 1], cos, sin, S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
+            )
+            xy = S_a[i, 0, 1] + turned_xy
+            e[i, 0], e[i, 1] = ex, ey
+            S[i, 0, 0], S[i, 0, 1], S[i, 1, 0], S[i, 1, 1] = own_xx, xy, xy, own_yy
+            # the probability of being true
+            xx, yy = own_xx + judged, own_yy + judged
+            det = xx * yy - xy * xy
+            square = (yy * ex**2 - 2 * xy * ex * ey + xx * ey**2) / det
+            true_density = share * math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
+            if true_density > 0:
+                truth[i] = true_density / (true_density + false_density)
+            total += truth[i]
+            count += 1
+            if truth[i] == 0:
+                continue
+            # the normal equations
+            xx, yy = own_xx + weighed, own_yy + weighed
+            scale = truth[i] / (xx * yy - xy * xy)
+            wxx, wxy, wyy = scale * yy, -scale * xy, scale * xx
+            jx, jy = lever(cos, sin, p_b, i)
+            wx, wy = wxx * ex + wxy * ey, wxy * ex + wyy * ey
+            nxx, nxy, nyy = nxx + wxx, nxy + wxy, nyy + wyy
+            nxt += wxx * jx + wxy * jy
+            nyt += wxy * jx + wyy * jy
+            ntt += wxx * jx * jx + 2 * wxy * jx * jy + wyy * jy * jy
+            rx, ry, rt = rx + wx, ry + wy, rt + (jx * wx + jy * wy)
+        normal[0, 0], normal[1, 1], normal[2, 2] = nxx, nyy, ntt
+        normal[0, 1] = normal[1, 0] = nxy
+        normal[0, 2] = normal[2, 0] = nxt
+        normal[1, 2] = normal[2, 1] = nyt
         determined = not total < 1.0 and invert(normal, covariance)
         if not determined:
             break
@@ -312,24 +212,44 @@ def maximise_likelihood(
             step_share /= 2
         variance += step_share * change
         last_change = change
-        _times(covariance, right, step)
-        moved = _farthest_moved(T_a_b, step, some.p_b, truth)
         for k in range(3):
-            at[k] = T_a_b[k]
+            step[k] = covariance[k, 0] * rx + covariance[k, 1] * ry + covariance[k, 2] * rt
+        # how far the step moves the landmark that it moves farthest
+        farthest2 = 0.0
+        for i in range(n):
+            if truth[i] > 0:
+                jx, jy = lever(cos, sin, p_b, i)
+                dx, dy = step[0] + jx * step[2], step[1] + jy * step[2]
+                farthest2 = max(farthest2, dx * dx + dy * dy)
+        moved = math.sqrt(farthest2)
+        for k in range(3):
             T_a_b[k] += step[k]
         if moved <= _TOLERANCE_M:
             break
     if determined:
-        _, some, e, S, _, truth = near
-        take_missing_information(at, some.p_b, e, S, weighed, judged, truth, normal)
+        # Take from the information what not knowing which pairs are true takes (Louis 1982). When
+        # the motion moves, so do the probabilities: d truth / de = -truth (1 - truth) C^-1 e, and a
+        # normal matrix with certain weights would promise too much.
+        missing, pull, turn = np.zeros((3, 3)), np.empty(3), np.empty(3)
+        for i in range(n):
+            unsure = truth[i] * (1 - truth[i])
+            if unsure == 0:
+                continue
+            jx, jy = lever(cos, sin, p_b, i)
+            for k in range(2):
+                drift_m2, force = (judged, turn) if k else (weighed, pull)
+                xx, xy, yy = S[i, 0, 0] + drift_m2, S[i, 0, 1], S[i, 1, 1] + drift_m2
+                det = xx * yy - xy * xy
+                force[0] = (yy * e[i, 0] - xy * e[i, 1]) / det
+                force[1] = (xx * e[i, 1] - xy * e[i, 0]) / det
+                force[2] = jx * force[0] + jy * force[1]
+            for row in range(3):
+                for column in range(3):
+                    product = pull[row] * turn[column] + turn[row] * pull[column]
+                    missing[row, column] += unsure * product / 2
+        for row in range(3):
+            for column in range(3):
+                normal[row, column] -= missing[row, column]
         determined = invert(normal, covariance)
-    at_rows(near.truth, near.rows, truth_of_all)
-    most = most_leverage(T_a_b, pairs, variance, truth_of_all, covariance)
-    return determined, moved, T_a_b, covariance, variance, truth_of_all, most
-
-
-@kernel_part
-def _times(matrix: Float, vector: Float, product: Float) -> None:
-    """Fill the product (3,) of a matrix (3, 3) and a vector (3,)."""
-    for k in range(3):
-        product[k] = matrix[k, 0] * vector[0] + matrix[k, 1] * vector[1] + matrix[k, 2] * vector[2]
+    most = most_leverage(T_a_b, pairs, variance, truth, covariance)
+    return determined, moved, T_a_b, covariance, variance, truth, most

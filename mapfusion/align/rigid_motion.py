@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, inner_kernel, kernel, source_of
+from mapfusion.geometry.numerics import Float, kernel, source_of
 from mapfusion.geometry.se2 import add_turned, lever, residual, rotation
 
 _ALL = slice(None)  # as the number of a pair: of all of them at once, in NumPy
 
 
-@inner_kernel
+@kernel
 def _fit_rows(
     p_a: Float, p_b: Float, rows: np.ndarray, weight: Float
 ) -> tuple[float, float, float]:
@@ -54,7 +54,7 @@ def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
     T_a_b[0], T_a_b[1], T_a_b[2] = _fit_rows(p_a, p_b, np.arange(len(weight)), weight)
 
 
-@inner_kernel
+@kernel
 def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
     """Fill T_a_b (3,) with the motion of pairs i and j; returns the shorter of their distances."""
     ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
@@ -92,56 +92,35 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     p_b are (N, 2 or more), not all in one place; weights (N,) are all equal by default.
     """
     given = np.ones(len(p_b)) if weight is None else weight
-    inverse: Float = np.linalg.inv(_normal_matrix(T_a_b, p_b, given)).astype(np.float64, copy=False)
-    return _gain(T_a_b, p_b, given, inverse)
-
-
-@kernel
-def _normal_matrix(T_a_b: Float, p_b: Float, weight: Float) -> Float:
-    """Sum of weight J'J (3, 3), J the `motion_jacobian` of a point."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    total = x = y = square = 0.0
-    for i in range(len(p_b)):
-        jx, jy = lever(cos, sin, p_b, i)
-        total += weight[i]
-        x += weight[i] * jx
-        y += weight[i] * jy
-        square += weight[i] * (jx * jx + jy * jy)
+    of_turn = np.stack(source_of(lever)(cos, sin, p_b, _ALL), axis=1)
+    inverse = np.linalg.inv(_normal_matrix(of_turn, given))
+    gain = inverse[:, :2] + inverse[:, 2, None] * of_turn[:, None]
+    return given[:, None, None] * gain
+
+
+def _normal_matrix(lever: Float, weight: Float) -> Float:
+    """Sum of weight J'J (3, 3), J the `motion_jacobian` of points with levers (N, 2)."""
+    x, y = lever.T
+    terms = np.stack([weight, weight * x, weight * y, weight * (x * x + y * y)])
+    total, x, y, square = np.cumsum(terms, axis=1)[:, -1]  # in their order, as kernels add
     return np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]])
 
 
-@kernel
-def _gain(T_a_b: Float, p_b: Float, weight: Float, inverse: Float) -> Float:
-    """Weight times the normal matrix' inverse (3, 3) times J' (N, 3, 2)."""
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    gain = np.empty((len(p_b), 3, 2))
-    for i in range(len(p_b)):
-        jx, jy = lever(cos, sin, p_b, i)
-        for k in range(3):
-            gain[i, k, 0] = weight[i] * (inverse[k, 0] + inverse[k, 2] * jx)
-            gain[i, k, 1] = weight[i] * (inverse[k, 1] + inverse[k, 2] * jy)
-    return gain
-
-
-@kernel
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     """Covariance (3, 3) of a motion from its gains (N, 3, 2) and independent residuals' (N, 2, 2).
 
     Weights that are not the inverse covariances make it larger than the inverse of the normal
     matrix: this is the sandwich of the two.
     """
-    total = np.zeros((3, 3))
-    for i in range(len(gain)):
-        xx, xy, yy = covariance_m2[i, 0, 0], covariance_m2[i, 0, 1], covariance_m2[i, 1, 1]
-        for k in range(3):
-            x, y = gain[i, k, 0], gain[i, k, 1]
-            along_x, along_y = x * xx + y * xy, x * xy + y * yy
-            for j in range(k + 1):
-                total[k, j] += along_x * gain[i, j, 0] + along_y * gain[i, j, 1]
-    for k in range(3):
-        for j in range(k):
-            total[j, k] = total[k, j]
-    return total
+    if not len(gain):
+        return np.zeros((3, 3))
+    x, y = gain[:, :, 0], gain[:, :, 1]
+    xx, xy, yy = (covariance_m2[:, r, q, None] for r, q in ((0, 0), (0, 1), (1, 1)))
+    along_x, along_y = x * xx + y * xy, x * xy + y * yy
+    terms = along_x[:, :, None] * x[:, None, :] + along_y[:, :, None] * y[:, None, :]
+    total = np.cumsum(terms, axis=0)[-1]
+    return np.tril(total) + np.tril(total, -1).T
 
 
 def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:

@@ -3,7 +3,6 @@
 An observation takes at most one landmark in a frame, and a landmark at most one observation.
 """
 
-import math
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
@@ -13,7 +12,7 @@ import numpy as np
 from mapfusion.fastslam.landmarks import Estimates, Slots, touches
 from mapfusion.fastslam.measurement import DROPPED, NEW, Sightings, innovation, quadratic_form
 from mapfusion.fastslam.particles import ParticleMaps
-from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 
 _PART = 16  # entries of a descriptor that are compared at a time
 
@@ -33,24 +32,14 @@ class Pairs(NamedTuple):
     slot: np.ndarray  # (P,)
 
 
-@kernel(error_model="numpy")
 def boxes_of(seen: Sightings, gate: float) -> Float:
     """Boxes (K, 4) of observations and their gates over all particles."""
-    point, noise = seen
-    boxes = np.empty((len(point), 4))
-    for k in range(len(boxes)):
-        low_x = low_y = math.inf
-        high_x = high_y = -math.inf
-        spread_x = spread_y = 0.0
-        for m in range(point.shape[1]):
-            x, y = point[k, m, 0], point[k, m, 1]
-            low_x, low_y = min(low_x, x), min(low_y, y)
-            high_x, high_y = max(high_x, x), max(high_y, y)
-            spread_x, spread_y = max(spread_x, noise[k, m, 0]), max(spread_y, noise[k, m, 3])
-        margin_x, margin_y = math.sqrt(gate * spread_x), math.sqrt(gate * spread_y)
-        boxes[k, 0], boxes[k, 1] = low_x - margin_x, low_y - margin_y
-        boxes[k, 2], boxes[k, 3] = high_x + margin_x, high_y + margin_y
-    return boxes
+    # by coordinate (2, K, M), since NumPy is slow along an axis before a short one
+    point = np.ascontiguousarray(seen.point_m[:, :, :2].transpose(2, 0, 1))
+    spread = np.stack([seen.covariance_m2[:, :, 0], seen.covariance_m2[:, :, 3]])  # xx and yy
+    margin = np.sqrt(gate * spread.max(axis=2, initial=0.0))
+    boxes = np.concatenate([point.min(axis=2) - margin, point.max(axis=2) + margin])
+    return np.ascontiguousarray(boxes.T)
 
 
 def pairs_nearby(
@@ -70,7 +59,8 @@ def pairs_nearby(
     boxes = boxes_of(seen, gate)
     around = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
     observation, slot, distance = _touching(
-        maps.slots,
+        maps.slots.box_m,
+        maps.slots.descriptor,
         maps.near(around),
         boxes,
         np.ascontiguousarray(descriptor, dtype=np.float32),
@@ -97,7 +87,12 @@ def pairs_of_labels(
 
 @kernel(error_model="numpy")
 def _touching(
-    slots: Slots, names: np.ndarray, boxes: Float, descriptor: np.ndarray, threshold: np.float32
+    box_of: Float,
+    descriptor_of: np.ndarray,
+    names: np.ndarray,
+    boxes: Float,
+    descriptor: np.ndarray,
+    threshold: np.float32,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     observation = np.empty(len(boxes) * len(names), np.int64)
     slot = np.empty(len(observation), np.int64)
@@ -105,16 +100,16 @@ def _touching(
     n = 0
     for k in range(len(boxes)):
         for s in names:
-            if not touches(slots.box_m, s, boxes[k]):
+            if not touches(box_of, s, boxes[k]):
                 continue
-            apart = _unlikeness(descriptor, k, slots.descriptor, s, threshold)
+            apart = _unlikeness(descriptor, k, descriptor_of, s, threshold)
             if apart < threshold:
                 observation[n], slot[n], distance[n] = k, s, apart
                 n += 1
     return observation[:n], slot[:n], distance[:n]
 
 
-@kernel_part(error_model="numpy")
+@kernel(error_model="numpy")
 def _unlikeness(
     descriptor: np.ndarray, k: int, known: np.ndarray, s: int, threshold: np.float32
 ) -> np.float32:
@@ -163,7 +158,7 @@ def choose(
     chosen[:] = np.where(may_create, NEW, DROPPED)[:, None]
     taken = np.zeros((len(used), seen.point_m.shape[1]), dtype=bool)
     take = _take_nearest if nearest else _take_in_order
-    take(maps.slots, pairs, place, taken, seen, gate, planar, chosen)
+    take(maps.slots.own, maps.slots.row, pairs, place, taken, seen, gate, planar, chosen)
     return chosen, used[taken.any(axis=1)]
 
 
@@ -178,7 +173,7 @@ def _distinct(slot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ordered[first], place
 
 
-@inner_kernel(error_model="numpy")
+@kernel(error_model="numpy")
 def _distance(seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool) -> float:
     difference, inverse, _ = innovation(seen, k, own, r, m, planar)
     return quadratic_form(difference, inverse)
@@ -186,7 +181,8 @@ def _distance(seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: b
 
 @kernel(error_model="numpy")
 def _take_in_order(
-    slots: Slots,
+    own: Estimates,
+    row_of: np.ndarray,
     pairs: Pairs,
     place: np.ndarray,
     taken: np.ndarray,
@@ -197,16 +193,16 @@ def _take_in_order(
 ) -> None:
     for i in range(len(place)):
         k, s, j = pairs.observation[i], pairs.slot[i], place[i]
-        r = int(slots.row[s])
+        r = int(row_of[s])
         for m in range(chosen.shape[1]):
-            if chosen[k, m] >= 0 or taken[j, m] or slots.own.count[r, m] == 0:
+            if chosen[k, m] >= 0 or taken[j, m] or own.count[r, m] == 0:
                 continue
-            if _distance(seen, k, slots.own, r, m, planar) <= gate:
+            if _distance(seen, k, own, r, m, planar) <= gate:
                 chosen[k, m] = s
                 taken[j, m] = True
 
 
-@kernel_part(error_model="numpy")
+@kernel(error_model="numpy")
 def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
     """Write the pairs inside the gate into `order`, nearest first, the first on a tie; how many.
 
@@ -226,7 +222,8 @@ def _sort_inside(distance: Float, gate: float, order: np.ndarray) -> int:
 
 @kernel(error_model="numpy")
 def _take_nearest(
-    slots: Slots,
+    own: Estimates,
+    row_of: np.ndarray,
     pairs: Pairs,
     place: np.ndarray,
     taken: np.ndarray,
@@ -238,10 +235,10 @@ def _take_nearest(
     n_particles = chosen.shape[1]
     distance = np.full((n_particles, len(place)), np.inf)
     for i in range(len(place)):
-        k, r = pairs.observation[i], int(slots.row[pairs.slot[i]])
+        k, r = pairs.observation[i], int(row_of[pairs.slot[i]])
         for m in range(n_particles):
-            if slots.own.count[r, m] > 0:
-                distance[m, i] = _distance(seen, k, slots.own, r, m, planar)
+            if own.count[r, m] > 0:
+                distance[m, i] = _distance(seen, k, own, r, m, planar)
     nearest_first = np.empty(len(place), np.int64)
     for m in range(n_particles):
         for i in nearest_first[: _sort_inside(distance[m], gate, nearest_first)]:
@@ -251,19 +248,11 @@ def _take_nearest(
                 taken[j, m] = True
 
 
-@kernel
 def sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
     """(K, M) int32 source of the landmark that each observation went into, -1 if it was dropped.
 
     `first_source` is the running number of the first observation.
     """
-    source = np.empty(chosen.shape, dtype=np.int32)
-    for k in range(chosen.shape[0]):
-        last, its = DROPPED, -1  # most particles choose as the one before
-        for m in range(chosen.shape[1]):
-            s = chosen[k, m]
-            if s != last:
-                last = s
-                its = -1 if s == DROPPED else first_source + k if s == NEW else slots.source[s]
-            source[k, m] = its
-    return source
+    own = first_source + np.arange(len(chosen))[:, None]
+    source = np.where(chosen == NEW, own, slots.source[chosen])
+    return np.where(chosen == DROPPED, -1, source).astype(np.int32)

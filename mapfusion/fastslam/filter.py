@@ -186,7 +186,8 @@ class FastSlam:
         self._poses, log_ratio = self._propose(odometry, sigma, observations, noise)
         seen = sightings(self._poses, observations.position_m, noise, planar)
         chosen, changed = self._associate(seen, observations)
-        log_likelihood = update_landmarks(self._maps.slots, chosen, seen, log_new, planar)
+        slots = self._maps.slots
+        log_likelihood = update_landmarks(slots.own, slots.row, chosen, seen, log_new, planar)
         self._maps.moved(changed)
         created = self._start_landmarks(chosen, seen, observations)
         self._maps.slots.last_frame[np.concatenate([changed, created[:, 1]])] = self._bends.frame
@@ -281,8 +282,10 @@ class FastSlam:
         if settings.close_loops and self._close_loops(chosen, seen, predicted, odometry, sigma):
             predicted = compose(self._poses, odometry)
             seen = sightings(predicted, observations.position_m, noise, self._planar)
+        slots = self._maps.slots
         eta, log_ratio = informed_disturbance(
-            self._maps.slots,
+            slots.own,
+            slots.row,
             chosen,
             seen,
             predicted,

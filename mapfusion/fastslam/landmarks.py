@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.tables import DESCRIPTOR_LENGTH, NO_LABEL
 
 FREE = -1  # the generation of a slot in no use, and the slot of a row in no use
@@ -90,104 +90,74 @@ def _estimates(n: int, m: int) -> Estimates:
     return Estimates(np.empty((n, m, 3)), np.empty((n, m, 6)), np.empty((n, m), dtype=np.int32))
 
 
-@kernel
-def copy_estimate(old: Estimates, n: int, m: int, new: Estimates, i: int, j: int) -> None:
-    """Write what particle m has of landmark n to another place."""
-    new.count[i, j] = old.count[n, m]
-    for k in range(3):
-        new.mean_m[i, j, k] = old.mean_m[n, m, k]
-    for k in range(6):
-        new.covariance_m2[i, j, k] = old.covariance_m2[n, m, k]
-
-
 def _doubled(capacity: int, needed: int) -> int:
     while capacity < needed:
         capacity *= 2
     return capacity
 
 
-@kernel
+_ALONG_PLANE = (0, 3)  # xx and yy among a covariance's upper entries
+
+
 def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
-    """Write the boxes of slots that are up to date, and of their blocks."""
-    for s in which:
-        box, spread_x, spread_y = slots.box_m[s], 0.0, 0.0
-        if slots.generation[s] == COMMON:
-            box[0] = box[2] = slots.common.mean_m[s, 0, 0]
-            box[1] = box[3] = slots.common.mean_m[s, 0, 1]
-            spread_x = slots.common.covariance_m2[s, 0, 0]
-            spread_y = slots.common.covariance_m2[s, 0, 3]
-        else:
-            box[:2], box[2:] = np.inf, -np.inf
-            r = slots.row[s]
-            for m in range(slots.own.count.shape[1]):
-                if slots.own.count[r, m] == 0:
-                    continue
-                x, y = slots.own.mean_m[r, m, 0], slots.own.mean_m[r, m, 1]
-                box[0], box[1] = min(box[0], x), min(box[1], y)
-                box[2], box[3] = max(box[2], x), max(box[3], y)
-                spread_x = max(spread_x, slots.own.covariance_m2[r, m, 0])
-                spread_y = max(spread_y, slots.own.covariance_m2[r, m, 3])
-        # Inside the gate |dx| <= sqrt(gate (Sigma_xx + R_xx)), at most the sum of both roots: one
-        # is the landmark's margin, the other the observation's.
-        margin_x, margin_y = np.sqrt(gate * spread_x), np.sqrt(gate * spread_y)
-        box[0], box[1] = box[0] - margin_x, box[1] - margin_y
-        box[2], box[3] = box[2] + margin_x, box[3] + margin_y
-    last = -1
-    for s in which:
-        if s // BLOCK != last:
-            last = s // BLOCK
-            bound_block(slots, last)
+    """Write the boxes of slots (n,) that are up to date, and of their blocks."""
+    is_common = slots.generation[which] == COMMON
+    common, rowed = which[is_common], which[~is_common]
+    low, high, spread = (np.empty((2, len(which))) for _ in range(3))  # along x and y
+    own, rows = slots.own, slots.row[rowed]
+    has = own.count[rows] > 0
+    for axis, variance in enumerate(_ALONG_PLANE):
+        low[axis, is_common] = high[axis, is_common] = slots.common.mean_m[common, 0, axis]
+        spread[axis, is_common] = slots.common.covariance_m2[common, 0, variance]
+        mean, of_mean = own.mean_m[rows, :, axis], own.covariance_m2[rows, :, variance]
+        low[axis, ~is_common] = np.where(has, mean, np.inf).min(axis=1)
+        high[axis, ~is_common] = np.where(has, mean, -np.inf).max(axis=1)
+        spread[axis, ~is_common] = np.where(has, of_mean, 0.0).max(axis=1)
+    # Inside the gate |dx| <= sqrt(gate (Sigma_xx + R_xx)), at most the sum of both roots: one is
+    # the landmark's margin, the other the observation's.
+    margin = np.sqrt(gate * spread)
+    slots.box_m[which, :2], slots.box_m[which, 2:] = (low - margin).T, (high + margin).T
+    bound_blocks(slots, np.unique(which // BLOCK))
 
 
-@kernel_part
-def bend_box(slots: Slots, s: int, motion: Float) -> None:
-    """Put a box around what is in it after a motion (3,) of the plane."""
-    box = slots.box_m[s]
-    cos, sin = np.cos(motion[2]), np.sin(motion[2])
-    x, y = 0.5 * (box[0] + box[2]), 0.5 * (box[1] + box[3])
-    half_x, half_y = 0.5 * (box[2] - box[0]), 0.5 * (box[3] - box[1])
-    wide_x = abs(cos) * half_x + abs(sin) * half_y
-    wide_y = abs(sin) * half_x + abs(cos) * half_y
-    x, y = cos * x - sin * y + motion[0], sin * x + cos * y + motion[1]
-    box[0], box[1], box[2], box[3] = x - wide_x, y - wide_y, x + wide_x, y + wide_y
+def bend_boxes(slots: Slots, which: np.ndarray, turn: Float, shift: Float) -> None:
+    """Put boxes of slots (n,) around what is in them after motions of the plane.
+
+    A motion turns by the cosines and sines `turn` (n, 2) and then shifts by `shift` (n, 2).
+    """
+    cos, sin = turn.T
+    low, high = slots.box_m[which, :2], slots.box_m[which, 2:]
+    (x, y), (half_x, half_y) = (0.5 * (low + high)).T, (0.5 * (high - low)).T
+    wide = np.stack([abs(cos) * half_x + abs(sin) * half_y, abs(sin) * half_x + abs(cos) * half_y])
+    middle = np.stack([cos * x - sin * y + shift[:, 0], sin * x + cos * y + shift[:, 1]])
+    slots.box_m[which] = np.concatenate([middle - wide, middle + wide]).T
+
+
+def bound_blocks(slots: Slots, blocks: np.ndarray) -> None:
+    """Write the boxes of blocks (n,) around those of their slots."""
+    boxes = slots.box_m.reshape(-1, BLOCK, 4)[blocks]
+    for side, outermost in enumerate((np.min, np.min, np.max, np.max)):
+        slots.block_box_m[blocks, side] = outermost(boxes[:, :, side], axis=1)
 
 
 @kernel
-def bound_block(slots: Slots, block: int) -> None:
-    """Write the box of a block around those of its slots."""
-    around = slots.block_box_m[block]
-    around[:2], around[2:] = np.inf, -np.inf
-    for s in range(block * BLOCK, (block + 1) * BLOCK):
-        around[0] = min(around[0], slots.box_m[s, 0])
-        around[1] = min(around[1], slots.box_m[s, 1])
-        around[2] = max(around[2], slots.box_m[s, 2])
-        around[3] = max(around[3], slots.box_m[s, 3])
-
-
-@inner_kernel
 def touches(boxes: Float, i: int, box: Float) -> bool:
-    """Whether row i of boxes (N, 4) and a box (4,) have a point in common."""
+    """Return True if row i of boxes (N, 4) and a box (4,) have a point in common."""
     x = (boxes[i, 0] <= box[2]) & (boxes[i, 2] >= box[0])
     y = (boxes[i, 1] <= box[3]) & (boxes[i, 3] >= box[1])
     return x & y
 
 
-@kernel
 def near(slots: Slots, box: Float) -> np.ndarray:
     """Slots, ascending, whose boxes touch a box (4,)."""
-    blocks = np.empty(len(slots.block_box_m), np.int64)
-    n_blocks = n = 0
-    for block in range(len(blocks)):
-        if touches(slots.block_box_m, block, box):
-            blocks[n_blocks] = block
-            n_blocks += 1
-    found = np.empty(n_blocks * BLOCK, np.int64)
-    for block in blocks[:n_blocks]:
-        for s in range(block * BLOCK, (block + 1) * BLOCK):
-            if touches(slots.box_m, s, box):
-                found[n] = s
-                n += 1
-    return found[:n]
+    blocks = _touching(slots.block_box_m, box)
+    of_blocks = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+    return of_blocks[_touching(slots.box_m[of_blocks], box)]
+
+
+def _touching(boxes: Float, box: Float) -> np.ndarray:
+    """Rows of the boxes (N, 4) that have a point in common with a box (4,)."""
+    return np.flatnonzero(np.all((boxes[:, :2] <= box[2:]) & (boxes[:, 2:] >= box[:2]), axis=1))
 
 
 class Tracked:
@@ -228,21 +198,10 @@ class Tracked:
         self._source = slots.source[self._slot]
 
 
-@kernel
 def _distinct(chosen: np.ndarray) -> np.ndarray:
-    """Rows and slots (n, 2) of `chosen` (K, M), each once: most particles choose the same slot."""
-    pairs = np.empty((chosen.size, 2), dtype=np.int64)
-    n = 0
-    for k in range(chosen.shape[0]):
-        first = n
-        for m in range(chosen.shape[1]):
-            s = chosen[k, m]
-            if s < 0:
-                continue
-            known = False
-            for i in range(first, n):
-                known = known or pairs[i, 1] == s
-            if not known:
-                pairs[n, 0], pairs[n, 1] = k, s
-                n += 1
-    return pairs[:n].copy()
+    """Rows and slots (n, 2) of `chosen` (K, M), each once and in the order of first appearance."""
+    row, particle = np.nonzero(chosen >= 0)
+    slot = chosen[row, particle].astype(np.int64)
+    _, first = np.unique(row * (slot.max(initial=0) + 1) + slot, return_index=True)
+    first.sort()
+    return np.stack([row[first], slot[first]], axis=1)

@@ -16,15 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.landmarks import Slots
-from mapfusion.fastslam.measurement import NEW, Sightings, innovation, quadratic_form
+from mapfusion.fastslam.measurement import NEW, Sightings, quadratic_form
 from mapfusion.geometry.numerics import (
     Float,
     chi_square_bound,
     cholesky,
-    kernel,
-    kernel_part,
+    cofactors,
     solve_lower,
     solve_upper,
+    source_of,
 )
 
 # Frames between two knots at first. A landmark that has been out of view for less has lost its
@@ -205,7 +205,6 @@ def close_loops(
     return drift
 
 
-@kernel(error_model="numpy")
 def _steps(
     slots: Slots, frame: Seen, rows: np.ndarray, by_odometry: Float, motion: Float, rounds: int
 ) -> tuple[Float, Float, Float]:
@@ -224,70 +223,56 @@ def _steps(
         (3, 3) the motion's covariance; and of where the last step began what the observations say
         about a further motion: (3, 3) information, and (3,) gradient of the log likelihood.
     """
-    information, pull, covariance = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    eta, right, root, half = np.zeros(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    A, eta = by_odometry, np.zeros(3)
+    root, information, pull = np.eye(3), np.empty((3, 3)), np.empty(3)
     for _ in range(rounds):
-        _put_evidence(slots, frame, rows, motion, information, pull)
-        for i in range(3):
-            right[i] = -eta[i]
-            for j in range(3):
-                root[i, j] = 1.0 if i == j else 0.0
-                for a in range(3):
-                    for b in range(3):
-                        root[i, j] += by_odometry[a, i] * information[a, b] * by_odometry[b, j]
-            for a in range(3):
-                right[i] += by_odometry[a, i] * pull[a]
+        information, pull = _evidence(slots, frame, rows, motion)
+        terms = A[:, None, :, None] * information[:, :, None, None] * A[None, :, None, :]
+        root = _sum_in_order(np.eye(3), terms.reshape(9, 3, 3))
+        step = _sum_in_order(-eta, A * pull[:, None])
         cholesky(root, 0.0)
-        solve_lower(root, right)
-        solve_upper(root, right)
-        for a in range(3):
-            eta[a] += right[a]
-        for a in range(3):
-            motion[a] = _dot(by_odometry, a, eta[0], eta[1], eta[2])
+        solve_lower(root, step)
+        solve_upper(root, step)
+        eta += step
+        motion[:] = A[:, 0] * eta[0] + A[:, 1] * eta[1] + A[:, 2] * eta[2]
     # the precision of eta is root root^T, so the motion's covariance is the square of this
-    for a in range(3):
-        for i in range(3):
-            right[i] = by_odometry[a, i]
-        solve_lower(root, right)
-        for i in range(3):
-            half[a, i] = right[i]
-    for a in range(3):
-        for b in range(3):
-            covariance[a, b] = _dot(half, a, half[b, 0], half[b, 1], half[b, 2])
-    return covariance, information, pull
+    half = A.copy()
+    for row in half:
+        solve_lower(root, row)
+    x, y, z = half.T
+    return x[:, None] * x + y[:, None] * y + z[:, None] * z, information, pull
 
 
-@kernel_part(error_model="numpy")
-def _dot(A: Float, row: int, x: float, y: float, z: float) -> float:
-    return A[row, 0] * x + A[row, 1] * y + A[row, 2] * z
+def _sum_in_order(first: Float, others: Float) -> Float:
+    """Return the sum of an array (...) and others (n, ...), added one after the other."""
+    return np.cumsum(np.concatenate([first[None], others]), axis=0)[-1]
 
 
-@kernel_part(error_model="numpy")
-def _put_evidence(
-    slots: Slots, frame: Seen, rows: np.ndarray, motion: Float, information: Float, pull: Float
-) -> None:
-    """What observations say about a further motion after `motion`, weighed as in the proposal."""
-    seen, m, own = frame.sightings, frame.particle, slots.own
+def _evidence(slots: Slots, frame: Seen, rows: np.ndarray, motion: Float) -> tuple[Float, Float]:
+    """What observations say about a further motion after `motion`, weighed as in the proposal.
+
+    Returns:
+        (3, 3) information, and (3,) gradient of the log likelihood.
+    """
+    seen, m, own, r = frame.sightings, frame.particle, slots.own, slots.row[frame.chosen[rows]]
+    point, off = seen.point_m[rows, m], seen.point_m[rows, m] - own.mean_m[r, m]
+    Z = own.covariance_m2[r, m] + seen.covariance_m2[rows, m]
+    if frame.planar:  # see `innovation`
+        off[:, 2] = Z[:, 2] = Z[:, 4] = 0.0
+        Z[:, 5] = 1.0
+    *adjugate, determinant = source_of(cofactors)(*Z.T)
+    inverse = 1.0 / determinant * np.array(adjugate)
+    ixx, ixy, ixz, iyy, iyz, _ = inverse
     cos, sin = math.cos(motion[2]), math.sin(motion[2])
-    px = py = pt = xx = xy = yy = xt = yt = tt = 0.0
-    for k in rows:
-        r = int(slots.row[frame.chosen[k]])
-        difference, inverse, _ = innovation(seen, k, own, r, m, frame.planar)
-        ixx, ixy, ixz, iyy, iyz, _ = inverse
-        at_x, at_y = seen.point_m[k, m, 0], seen.point_m[k, m, 1]
-        x, y = cos * at_x - sin * at_y + motion[0], sin * at_x + cos * at_y + motion[1]
-        dx, dy, dz = difference[0] + x - at_x, difference[1] + y - at_y, difference[2]
-        weight = 1.0 / (1.0 + quadratic_form((dx, dy, dz), inverse) / frame.gate)
-        fx = -weight * (ixx * dx + ixy * dy + ixz * dz)
-        fy = -weight * (ixy * dx + iyy * dy + iyz * dz)
-        ixx, ixy, iyy = weight * ixx, weight * ixy, weight * iyy
-        # a turn moves the point by (-y, x)
-        ax, ay = ixy * x - ixx * y, iyy * x - ixy * y
-        px, py, pt = px + fx, py + fy, pt + (x * fy - y * fx)
-        xx, xy, yy = xx + ixx, xy + ixy, yy + iyy
-        xt, yt, tt = xt + ax, yt + ay, tt + (x * ay - y * ax)
-    pull[0], pull[1], pull[2] = px, py, pt
-    information[0, 0], information[1, 1], information[2, 2] = xx, yy, tt
-    information[0, 1] = information[1, 0] = xy
-    information[0, 2] = information[2, 0] = xt
-    information[1, 2] = information[2, 1] = yt
+    at_x, at_y, _ = point.T
+    x, y = cos * at_x - sin * at_y + motion[0], sin * at_x + cos * at_y + motion[1]
+    dx, dy, dz = off[:, 0] + x - at_x, off[:, 1] + y - at_y, off[:, 2]
+    weight = 1.0 / (1.0 + source_of(quadratic_form)((dx, dy, dz), inverse) / frame.gate)
+    fx = -weight * (ixx * dx + ixy * dy + ixz * dz)
+    fy = -weight * (ixy * dx + iyy * dy + iyz * dz)
+    ixx, ixy, iyy = weight * ixx, weight * ixy, weight * iyy
+    # a turn moves the point by (-y, x)
+    ax, ay = ixy * x - ixx * y, iyy * x - ixy * y
+    terms = np.stack([fx, fy, x * fy - y * fx, ixx, ixy, iyy, ax, ay, x * ay - y * ax], axis=1)
+    *pull, xx, xy, yy, xt, yt, tt = _sum_in_order(np.zeros(9), terms)
+    return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]]), np.array(pull)

@@ -6,6 +6,8 @@ slot that all particles have from one ancestor. So a map out of view takes one e
 once the particles' lines have met, and a step costs what is in view.
 """
 
+import math
+
 import numpy as np
 
 from mapfusion.fastslam.landmarks import (
@@ -16,16 +18,15 @@ from mapfusion.fastslam.landmarks import (
     Estimates,
     Slots,
     allocate,
-    bend_box,
+    bend_boxes,
     bound,
-    bound_block,
-    copy_estimate,
+    bound_blocks,
     near,
     with_room,
 )
 from mapfusion.fastslam.measurement import NEW, Sightings
 from mapfusion.fastslam.resampling import MEMORY, Genealogy
-from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import compose
 from mapfusion.robot_log import Observations
 
@@ -72,7 +73,16 @@ class ParticleMaps:
         """
         genealogy = self._genealogy
         self._give_rows(which[self.slots.generation[which] == COMMON])
-        alive = _inherit(self.slots, which, genealogy.ancestors, genealogy.generation)
+        slots = self.slots
+        alive = _inherit(
+            slots.own,
+            slots.common,
+            slots.row,
+            slots.generation,
+            which,
+            genealogy.ancestors,
+            genealogy.generation,
+        )
         if not alive.all():
             dead = which[~alive]
             self._free_rows(dead, FREE)
@@ -97,7 +107,20 @@ class ParticleMaps:
 
         The motions are small: covariances keep their directions.
         """
-        _bend(self.slots, np.flatnonzero(self.slots.generation != FREE), T_map_bent)
+        slots = self.slots
+        which = np.flatnonzero(slots.generation != FREE)
+        x, y, angle = T_map_bent[which].T
+        turn = np.array([[math.cos(each), math.sin(each)] for each in angle]).reshape(-1, 2)
+        is_common = slots.generation[which] == COMMON
+        for means, rows, moved in (
+            (slots.common.mean_m, which[is_common], is_common),
+            (slots.own.mean_m, slots.row[which[~is_common]], ~is_common),
+        ):
+            (cos, sin), at = turn[moved].T[:, :, None], means[rows]
+            means[rows, :, 0] = cos * at[:, :, 0] - sin * at[:, :, 1] + x[moved, None]
+            means[rows, :, 1] = sin * at[:, :, 0] + cos * at[:, :, 1] + y[moved, None]
+        bend_boxes(slots, which, turn, np.stack([x, y], axis=1))
+        bound_blocks(slots, np.arange(len(slots.block_box_m)))
 
     def create(
         self, chosen: np.ndarray, seen: Sightings, observations: Observations, first_source: int
@@ -120,7 +143,10 @@ class ParticleMaps:
             slots.descriptor[created] = observations.descriptor[rows]
         if observations.label is not None:
             slots.label[created] = observations.label[rows]
-        _initialise(slots, created, rows, chosen, seen, self.n_landmarks)
+        new, own_rows = chosen[rows] == NEW, slots.row[created]
+        slots.own.count[own_rows], slots.own.mean_m[own_rows] = new, seen.point_m[rows]
+        slots.own.covariance_m2[own_rows] = seen.covariance_m2[rows]
+        self.n_landmarks += np.count_nonzero(new, axis=0)
         self.moved(created)
         return created, rows
 
@@ -195,106 +221,65 @@ class _Pool:
 
 
 @kernel
-def _bend(slots: Slots, which: np.ndarray, T_map_bent: Float) -> None:
-    for s in which:
-        motion = T_map_bent[s]
-        cos, sin = np.cos(motion[2]), np.sin(motion[2])
-        if slots.generation[s] == COMMON:
-            means = slots.common.mean_m[s]
-        else:
-            means = slots.own.mean_m[slots.row[s]]
-        for m in range(len(means)):
-            x, y = means[m, 0], means[m, 1]
-            means[m, 0] = cos * x - sin * y + motion[0]
-            means[m, 1] = sin * x + cos * y + motion[1]
-        bend_box(slots, s, motion)
-    for block in range(len(slots.block_box_m)):
-        bound_block(slots, block)
+def _inherit(
+    own: Estimates,
+    common: Estimates,
+    row_of: np.ndarray,
+    generation_of: np.ndarray,
+    which: np.ndarray,
+    ancestors: np.ndarray,
+    generation: int,
+) -> np.ndarray:
+    """Write the rows of slots `which` (n,) for a generation; for each whether any particle has it.
 
-
-@kernel
-def _inherit(slots: Slots, which: np.ndarray, ancestors: np.ndarray, generation: int) -> np.ndarray:
-    own, common = slots.own, slots.common
+    The first four are of slots: all of them would take long to compile.
+    """
     n_particles = own.count.shape[1]
     alive = np.zeros(len(which), np.bool_)
-    old = Estimates(
-        np.empty((1, n_particles, 3)),
-        np.empty((1, n_particles, 6)),
-        np.empty((1, n_particles), np.int32),
-    )
+    old_mean, old_covariance = np.empty((n_particles, 3)), np.empty((n_particles, 6))
+    old_count = np.empty(n_particles, np.int32)
     for i in range(len(which)):
         s = int(which[i])
-        r = int(slots.row[s])
-        written = slots.generation[s]
-        slots.generation[s] = generation
+        r = int(row_of[s])
+        written = generation_of[s]
+        generation_of[s] = generation
+        mean, covariance, count = own.mean_m[r], own.covariance_m2[r], own.count[r]
         if written == generation:
             alive[i] = True
         elif written == COMMON:
             alive[i] = True
             for m in range(n_particles):
-                copy_estimate(common, s, 0, own, r, m)
+                count[m] = common.count[s, 0]
+                for k in range(3):
+                    mean[m, k] = common.mean_m[s, 0, k]
+                for k in range(6):
+                    covariance[m, k] = common.covariance_m2[s, 0, k]
         else:
-            _copy_row(own, r, old)
+            for m in range(n_particles):
+                old_count[m] = count[m]
+                for k in range(3):
+                    old_mean[m, k] = mean[m, k]
+                for k in range(6):
+                    old_covariance[m, k] = covariance[m, k]
             for m in range(n_particles):
                 parent = ancestors[written % len(ancestors), m]
-                copy_estimate(old, 0, parent, own, r, m)
-                alive[i] |= own.count[r, m] > 0
+                count[m] = old_count[parent]
+                for k in range(3):
+                    mean[m, k] = old_mean[parent, k]
+                for k in range(6):
+                    covariance[m, k] = old_covariance[parent, k]
+                alive[i] |= count[m] > 0
     return alive
 
 
-@kernel_part
-def _copy_row(own: Estimates, r: int, old: Estimates) -> None:
-    """All particles' estimates, number by number: a processor takes several at a time."""
-    n_particles = own.count.shape[1]
-    means, covariances = own.mean_m[r].reshape(-1), own.covariance_m2[r].reshape(-1)
-    old_means, old_covariances = old.mean_m.reshape(-1), old.covariance_m2.reshape(-1)
-    for k in range(3 * n_particles):
-        old_means[k] = means[k]
-    for k in range(6 * n_particles):
-        old_covariances[k] = covariances[k]
-    for m in range(n_particles):
-        old.count[0, m] = own.count[r, m]
-
-
-@kernel
 def _settle(slots: Slots, which: np.ndarray) -> np.ndarray:
     """Note what is common to all particles; for each slot whether all is."""
-    own = slots.own
     same = np.ones(len(which), dtype=np.bool_)
-    for i in range(len(which)):
-        s = int(which[i])
-        r = int(slots.row[s])
-        copy_estimate(own, r, 0, slots.common, s, 0)
-        for m in range(1, own.count.shape[1]):
-            same[i] &= own.count[r, m] == own.count[r, 0]
-            for k in range(3):
-                same[i] &= own.mean_m[r, m, k] == own.mean_m[r, 0, k]
-            for k in range(6):
-                same[i] &= own.covariance_m2[r, m, k] == own.covariance_m2[r, 0, k]
-            if not same[i]:
-                break
+    for common, own in zip(slots.common, slots.own, strict=True):
+        rows = own[slots.row[which]]
+        common[which, 0] = rows[:, 0]
+        same &= np.all(rows == rows[:, :1], axis=tuple(range(1, rows.ndim)))
     return same
-
-
-@kernel
-def _initialise(
-    slots: Slots,
-    created: np.ndarray,
-    rows: np.ndarray,
-    chosen: np.ndarray,
-    seen: Sightings,
-    n_landmarks: np.ndarray,
-) -> None:
-    own = slots.own
-    for i in range(len(created)):
-        r, k = slots.row[created[i]], rows[i]
-        for m in range(len(n_landmarks)):
-            own.count[r, m] = int(chosen[k, m] == NEW)
-            n_landmarks[m] += own.count[r, m]
-            for j in range(3):
-                own.mean_m[r, m, j] = seen.point_m[k, m, j]
-            for j in range(6):
-                own.covariance_m2[r, m, j] = seen.covariance_m2[k, m, j]
 
 
 # Steps between two prunings, at least; as many as half of what the last one looked through, so that

@@ -15,16 +15,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import LANES, Slots
+from mapfusion.fastslam.landmarks import LANES, Estimates
 from mapfusion.fastslam.measurement import Sightings, innovation, quadratic_form
-from mapfusion.geometry.numerics import (
-    Float,
-    cholesky,
-    kernel,
-    kernel_part,
-    solve_lower,
-    solve_upper,
-)
+from mapfusion.geometry.numerics import Float, cholesky, kernel, solve_lower, solve_upper
 
 # Gauss-Newton steps; the turn of a frame is off by 0.1 rad at most, which the second step makes
 # 0.005 and the third nothing.
@@ -71,7 +64,8 @@ def _widen(point: Float, covariance: Float, pose: Float, turn: float, sigma: Flo
 
 @kernel(error_model="numpy")
 def informed_disturbance(
-    slots: Slots,
+    own: Estimates,
+    row_of: np.ndarray,
     chosen: np.ndarray,
     predicted: Sightings,
     T_map_predicted: Float,
@@ -85,8 +79,9 @@ def informed_disturbance(
 
     The observations' part is a Gaussian at the most probable eta, found by Gauss-Newton steps from
     zero. Pairs weigh 1 / (1 + d^2 / gate) (Cauchy), since a wide gate lets false ones in.
-    `chosen` (K, M) is negative for none, `turn` the heading part of the odometry, `sigma` (3,) its
-    standard deviations, `standard_normal` (M, 3) independent draws. Returns (M, 3) eta, and (M,)
+    `own` and `row_of` are the `own` and `row` of slots, `chosen` (K, M) slots or negative, `turn`
+    the heading part of the odometry, `sigma` (3,) its standard deviations, `standard_normal` (M, 3)
+    independent draws. Returns (M, 3) eta, and (M,)
     log of its prior density over the density it was drawn from.
     """
     eta = np.zeros(T_map_predicted.shape)
@@ -96,16 +91,80 @@ def informed_disturbance(
     root, right = np.empty((3, 3)), np.empty(3)
     for first in range(0, len(eta), LANES):
         end = min(first + LANES, len(eta))
-        n_pairs = _gather_pairs(
-            slots, chosen, predicted, T_map_predicted, planar, first, end, pairs
-        )
+        # Fill rows of innovation (3), inverse of Z (6) and arm from robot to point (2); their
+        # number.
+        # What does not change from step to step; Z with the noise turned by the predicted
+        # heading. Of a row each number is there for the particles from `first` to `end`, zero for
+        # those without a pair, to which it adds nothing.
+        n, point = 0, predicted.point_m
+        for k in range(len(chosen)):
+            row, is_any = pairs[n], False
+            for m in range(first, end):
+                s, lane = chosen[k, m], m - first
+                if s < 0:
+                    for i in range(_PAIR):
+                        row[i * LANES + lane] = 0.0
+                    continue
+                is_any, r = True, int(row_of[s])
+                difference, inverse, _ = innovation(predicted, k, own, r, m, planar)
+                row[lane], row[LANES + lane], row[2 * LANES + lane] = difference
+                row[3 * LANES + lane], row[4 * LANES + lane] = inverse[0], inverse[1]
+                row[5 * LANES + lane], row[6 * LANES + lane] = inverse[2], inverse[3]
+                row[7 * LANES + lane], row[8 * LANES + lane] = inverse[4], inverse[5]
+                row[9 * LANES + lane] = point[k, m, 0] - T_map_predicted[m, 0]
+                row[10 * LANES + lane] = point[k, m, 1] - T_map_predicted[m, 1]
+            n += is_any
+        n_pairs = n
         for step in range(_ROUNDS):
             for m in range(first, end):
                 before = T_map_predicted[m, 2] - turn
                 _put_linearised(before, sigma, eta[m], m - first, at, system)
-            _add_pairs(pairs[:n_pairs], sigma[2], gate, at, system)
+            # Add what pairs say to the gradients of the log density at eta, and to the
+            # precisions.
+            filled = pairs[:n_pairs]
+            sigma_turn = sigma[2]
+            for n in range(len(filled)):
+                pair = filled[n]
+                for m in range(LANES):
+                    ax, ay, bx, by = at[m], at[LANES + m], at[2 * LANES + m], at[3 * LANES + m]
+                    cos, sin = at[4 * LANES + m], at[5 * LANES + m]
+                    dz, ixx, ixy = pair[2 * LANES + m], pair[3 * LANES + m], pair[4 * LANES + m]
+                    ixz, iyy = pair[5 * LANES + m], pair[6 * LANES + m]
+                    iyz, izz = pair[7 * LANES + m], pair[8 * LANES + m]
+                    rx, ry = pair[9 * LANES + m], pair[10 * LANES + m]
+                    # eta moves the point from where it was predicted
+                    tx, ty = cos * rx - sin * ry, sin * rx + cos * ry
+                    dx = pair[m] + (at[6 * LANES + m] + tx - rx)
+                    dy = pair[LANES + m] + (at[7 * LANES + m] + ty - ry)
+                    distance = quadratic_form((dx, dy, dz), (ixx, ixy, ixz, iyy, iyz, izz))
+                    weight = 1.0 / (1.0 + distance / gate)
+                    cx, cy = -sigma_turn * ty, sigma_turn * tx  # d(point) / d eta_2
+                    wx = weight * (ixx * dx + ixy * dy + ixz * dz)
+                    wy = weight * (ixy * dx + iyy * dy + iyz * dz)
+                    system[m] -= ax * wx + ay * wy
+                    system[LANES + m] -= bx * wx + by * wy
+                    system[2 * LANES + m] -= cx * wx + cy * wy
+                    axx, axy, ayy = weight * ixx, weight * ixy, weight * iyy
+                    system[3 * LANES + m] += ax * ax * axx + 2 * ax * ay * axy + ay * ay * ayy
+                    system[4 * LANES + m] += bx * bx * axx + 2 * bx * by * axy + by * by * ayy
+                    system[5 * LANES + m] += cx * cx * axx + 2 * cx * cy * axy + cy * cy * ayy
+                    system[6 * LANES + m] += (
+                        ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
+                    )
+                    system[7 * LANES + m] += (
+                        ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
+                    )
+                    system[8 * LANES + m] += (
+                        bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy
+                    )
             for m in range(first, end):
-                _take_system(system, m - first, root, right)
+                # A particle's precision (3, 3) of eta, its lower half, and the gradient (3,).
+                lane = m - first
+                for i in range(3):
+                    right[i] = system[i * LANES + lane]
+                    root[i, i] = system[(3 + i) * LANES + lane]
+                root[1, 0], root[2, 0] = system[6 * LANES + lane], system[7 * LANES + lane]
+                root[2, 1] = system[8 * LANES + lane]
                 cholesky(root, 0.0)
                 solve_lower(root, right)
                 solve_upper(root, right)
@@ -116,7 +175,7 @@ def informed_disturbance(
     return eta, log_ratio
 
 
-@kernel_part(error_model="numpy")
+@kernel(error_model="numpy")
 def _draw(root: Float, standard_normal: Float, pull: Float, eta: Float) -> float:
     """Draw about eta (3,), in place; the log of the density before over that of the draw."""
     # the precision is root root^T, so root^-T times a standard normal has its inverse
@@ -130,45 +189,7 @@ def _draw(root: Float, standard_normal: Float, pull: Float, eta: Float) -> float
     return 0.5 * (drawn - prior) - np.log(root[0, 0] * root[1, 1] * root[2, 2])
 
 
-@kernel_part(error_model="numpy")
-def _gather_pairs(
-    slots: Slots,
-    chosen: np.ndarray,
-    predicted: Sightings,
-    pose: Float,
-    planar: bool,
-    first: int,
-    end: int,
-    pairs: Float,
-) -> int:
-    """Fill rows of innovation (3), inverse of Z (6) and arm from robot to point (2); their number.
-
-    What does not change from step to step; Z with the noise turned by the predicted heading. Of a
-    row each number is there for the particles from `first` to `end`, zero for those without a pair,
-    to which it adds nothing.
-    """
-    n, point = 0, predicted.point_m
-    for k in range(len(chosen)):
-        row, is_any = pairs[n], False
-        for m in range(first, end):
-            s, lane = chosen[k, m], m - first
-            if s < 0:
-                for i in range(_PAIR):
-                    row[i * LANES + lane] = 0.0
-                continue
-            is_any, r = True, int(slots.row[s])
-            difference, inverse, _ = innovation(predicted, k, slots.own, r, m, planar)
-            row[lane], row[LANES + lane], row[2 * LANES + lane] = difference
-            row[3 * LANES + lane], row[4 * LANES + lane] = inverse[0], inverse[1]
-            row[5 * LANES + lane], row[6 * LANES + lane] = inverse[2], inverse[3]
-            row[7 * LANES + lane], row[8 * LANES + lane] = inverse[4], inverse[5]
-            row[9 * LANES + lane] = point[k, m, 0] - pose[m, 0]
-            row[10 * LANES + lane] = point[k, m, 1] - pose[m, 1]
-        n += is_any
-    return n
-
-
-@kernel_part(error_model="numpy")
+@kernel(error_model="numpy")
 def _put_linearised(
     before: float, sigma: Float, eta: Float, lane: int, at: Float, system: Float
 ) -> None:
@@ -185,48 +206,3 @@ def _put_linearised(
         system[i * LANES + lane] = -eta[i]
         system[(3 + i) * LANES + lane] = 1.0
         system[(6 + i) * LANES + lane] = 0.0
-
-
-@kernel_part(error_model="numpy")
-def _take_system(system: Float, lane: int, normal: Float, right: Float) -> None:
-    """A particle's precision (3, 3) of eta, its lower half, and the gradient (3,)."""
-    for i in range(3):
-        right[i] = system[i * LANES + lane]
-        normal[i, i] = system[(3 + i) * LANES + lane]
-    normal[1, 0], normal[2, 0] = system[6 * LANES + lane], system[7 * LANES + lane]
-    normal[2, 1] = system[8 * LANES + lane]
-
-
-# One loop over all lanes, which a processor takes several at a time, without a call, a branch, or
-# an array of two dimensions in it: with these each is taken alone.
-@kernel_part(error_model="numpy")
-def _add_pairs(pairs: Float, sigma_turn: float, gate: float, at: Float, system: Float) -> None:
-    """Add what pairs say to the gradients of the log density at eta, and to the precisions."""
-    for n in range(len(pairs)):
-        pair = pairs[n]
-        for m in range(LANES):
-            ax, ay, bx, by = at[m], at[LANES + m], at[2 * LANES + m], at[3 * LANES + m]
-            cos, sin = at[4 * LANES + m], at[5 * LANES + m]
-            dz, ixx, ixy = pair[2 * LANES + m], pair[3 * LANES + m], pair[4 * LANES + m]
-            ixz, iyy = pair[5 * LANES + m], pair[6 * LANES + m]
-            iyz, izz = pair[7 * LANES + m], pair[8 * LANES + m]
-            rx, ry = pair[9 * LANES + m], pair[10 * LANES + m]
-            # eta moves the point from where it was predicted
-            tx, ty = cos * rx - sin * ry, sin * rx + cos * ry
-            dx = pair[m] + (at[6 * LANES + m] + tx - rx)
-            dy = pair[LANES + m] + (at[7 * LANES + m] + ty - ry)
-            distance = quadratic_form((dx, dy, dz), (ixx, ixy, ixz, iyy, iyz, izz))
-            weight = 1.0 / (1.0 + distance / gate)
-            cx, cy = -sigma_turn * ty, sigma_turn * tx  # d(point) / d eta_2
-            wx = weight * (ixx * dx + ixy * dy + ixz * dz)
-            wy = weight * (ixy * dx + iyy * dy + iyz * dz)
-            system[m] -= ax * wx + ay * wy
-            system[LANES + m] -= bx * wx + by * wy
-            system[2 * LANES + m] -= cx * wx + cy * wy
-            axx, axy, ayy = weight * ixx, weight * ixy, weight * iyy
-            system[3 * LANES + m] += ax * ax * axx + 2 * ax * ay * axy + ay * ay * ayy
-            system[4 * LANES + m] += bx * bx * axx + 2 * bx * by * axy + by * by * ayy
-            system[5 * LANES + m] += cx * cx * axx + 2 * cx * cy * axy + cy * cy * ayy
-            system[6 * LANES + m] += ax * bx * axx + (ax * by + ay * bx) * axy + ay * by * ayy
-            system[7 * LANES + m] += ax * cx * axx + (ax * cy + ay * cx) * axy + ay * cy * ayy
-            system[8 * LANES + m] += bx * cx * axx + (bx * cy + by * cx) * axy + by * cy * ayy

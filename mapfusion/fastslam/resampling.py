@@ -6,7 +6,7 @@ they were written, and are read through the ancestors since.
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.geometry.numerics import Float
 
 
 def normalised(log_weights: Float) -> tuple[Float, float]:
@@ -62,20 +62,11 @@ class Genealogy:
     # `ancestors[g % MEMORY, m]` is the ancestor in generation g of the present particle m.
 
 
-@kernel
 def _compose(table: np.ndarray, ancestors: np.ndarray, newest: int, shared: int) -> int:
     """Follow a resampling, in the generations where it makes a difference; the new `shared`."""
-    n_particles = table.shape[1]
-    old = np.empty(n_particles, np.int32)
-    for generation in range(max(shared + 1, newest - len(table) + 1), newest):
-        g, is_shared = generation % len(table), True
-        for m in range(n_particles):
-            old[m] = table[g, m]
-        for m in range(n_particles):
-            table[g, m] = old[ancestors[m]]
-            is_shared &= table[g, m] == table[g, 0]
-        if is_shared:
-            shared = generation
-    for m in range(n_particles):
-        table[newest % len(table), m] = m
-    return shared
+    generations = np.arange(max(shared + 1, newest - len(table) + 1), newest)
+    rows = generations % len(table)
+    table[rows] = table[rows[:, None], ancestors]
+    is_shared = np.all(table[rows] == table[rows, :1], axis=1)
+    table[newest % len(table)] = np.arange(table.shape[1])
+    return int(generations[is_shared].max(initial=shared))

@@ -3,6 +3,9 @@
 NumPy and SciPy bring a BLAS each, with threads of its own, and those of the one wait in a loop
 while the other computes. Where blocks of some ten rows go to both in turn, as in a factorisation by
 envelope, that takes several times as long as one thread does.
+
+Products are written out by entries: BLAS would take longer to call than to compute so small a
+product, and may round differently on another processor.
 """
 
 import math
@@ -12,51 +15,21 @@ from typing import Any, cast
 
 import numpy as np
 from numba import njit, types
-from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 Float = NDArray[np.float64]
 
-# Compiled once for each version of its source and kept on disk. A wrapper for callers in C would
-# be compiled with it; nobody here is one.
+# Kernels are compiled once for each version of their source and kept on disk. Nothing calls them
+# from C, so they need no wrapper for that.
 _OPTIONS: dict[str, Any] = {"cache": True, "no_cfunc_wrapper": True}
 kernel: Callable[..., Any] = partial(njit, **_OPTIONS)
 
 
-class _Inner(CPUDispatcher):
-    """Has no wrapper for callers in Python, without which a call ends the process."""
-
-    def __call__(self, *arguments: object) -> Any:
-        raise TypeError(f"{self.py_func.__name__}: only kernels can call it")
-
-
-def inner_kernel(function: Any = None, **options: Any) -> Any:
-    """For what is called by kernels alone, at several places.
-
-    The wrapper for callers in Python, which is up to half of what is compiled for a short one, is
-    left out; tests take what `tests.helpers.inner_kernels` makes of it. Such a kernel makes no
-    arrays: what Numba compiles for that, it would compile once more for these.
-    """
-    if function is None:
-        return partial(inner_kernel, **options)
-    made = kernel(function, no_cpython_wrapper=True, **options)
-    if isinstance(made, CPUDispatcher):  # not so with NUMBA_DISABLE_JIT
-        made.__class__ = _Inner
-    return made
-
-
 def source_of(compiled: Callable[..., Any]) -> Callable[..., Any]:
-    """The function that a kernel was made of, which NumPy's arrays may be given to as well."""
+    """Return the Python function that a kernel was made of, for whole NumPy arrays."""
     return getattr(compiled, "py_func", compiled)
-
-
-# For what is called by kernels alone and at one place, or is short: its lines are put into its
-# caller before that is compiled, which is less to compile than both apart. Both have the same
-# `error_model`: once inside, a part divides by zero as its caller does. Called from Python, as
-# tests do, it is compiled by itself.
-kernel_part: Callable[..., Any] = partial(kernel, inline="always")
 
 
 one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
@@ -79,7 +52,7 @@ def chi_square_bound(probability: float, degrees_of_freedom: float) -> float:
 _SINGULAR = 1e-12  # determinant of a matrix scaled to a unit diagonal that is rounding error
 
 
-@inner_kernel
+@kernel
 def cofactors(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -89,7 +62,7 @@ def cofactors(
     return axx, axy, axz, ayy, ayz, azz, xx * axx + xy * axy + xz * axz
 
 
-@inner_kernel
+@kernel
 def invert(matrix: Float, inverse: Float) -> bool:
     """Fill the inverse (3, 3) of a symmetric matrix; False unless positive definite."""
     a, d, f = matrix[0, 0], matrix[1, 1], matrix[2, 2]
@@ -104,7 +77,7 @@ def invert(matrix: Float, inverse: Float) -> bool:
     return True
 
 
-@inner_kernel
+@kernel
 def copy_lower(matrix: Float, copy: Float) -> None:
     """Put the lower half of a matrix into another, which Numba's `copy[:] = matrix` would, too.
 
@@ -115,7 +88,7 @@ def copy_lower(matrix: Float, copy: Float) -> None:
             copy[i, j] = matrix[i, j]
 
 
-@inner_kernel
+@kernel
 def cholesky(matrix: Float, singular: float) -> bool:
     """Lower factor of a symmetric matrix in place, of which the lower half is read.
 
@@ -136,7 +109,7 @@ def cholesky(matrix: Float, singular: float) -> bool:
     return True
 
 
-@inner_kernel
+@kernel
 def solve_lower(factor: Float, x: Float) -> None:
     """Solve factor y = x in place."""
     for i in range(len(x)):
@@ -145,7 +118,7 @@ def solve_lower(factor: Float, x: Float) -> None:
         x[i] /= factor[i, i]
 
 
-@inner_kernel
+@kernel
 def solve_upper(factor: Float, x: Float) -> None:
     """Solve factor^T y = x in place."""
     for i in range(len(x) - 1, -1, -1):
@@ -154,61 +127,33 @@ def solve_upper(factor: Float, x: Float) -> None:
         x[i] /= factor[i, i]
 
 
-# Kernels take an array of blocks and a row: a view of a row costs more than the sums.
-@inner_kernel
-def put_along(A: Float, row: int, x: Float, product: Float) -> None:
-    """Write A[row] x to `product`."""
-    for r in range(3):
-        product[r] = A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
+def times_vectors(A: Float, x: Float) -> Float:
+    """Return the products (N, 3) of blocks (N, 3, 3) and vectors (N, 3)."""
+    return A[:, :, 0] * x[:, None, 0] + A[:, :, 1] * x[:, None, 1] + A[:, :, 2] * x[:, None, 2]
 
 
-@inner_kernel
-def add_along(A: Float, row: int, x: Float, total: Float) -> None:
-    """Add A[row] x to `total`."""
-    for r in range(3):
-        total[r] += A[row, r, 0] * x[0] + A[row, r, 1] * x[1] + A[row, r, 2] * x[2]
+def times_blocks(A: Float, B: Float) -> Float:
+    """Return the products (N, 3, 3) of blocks (N, 3, 3)."""
+    made = A[:, :, 0, None] * B[:, 0, None] + A[:, :, 1, None] * B[:, 1, None]
+    made += A[:, :, 2, None] * B[:, 2, None]
+    return made
 
 
-@inner_kernel
-def put_inverse(A: Float, inverse: Float) -> bool:
-    """Write the inverse of a symmetric positive definite A = L D L'; read only its lower half.
+def sums_by(group: np.ndarray, values: Float, n: int) -> Float:
+    """Return the sums (n, ...) of values (N, ...) of each group 0, 1, ..., n - 1, in their order.
 
-    Returns:
-        False if A is not positive definite.
+    `group` (N,) is that of each value.
     """
-    positive, entries = _inverse_entries(A[0, 0], A[1, 0], A[1, 1], A[2, 0], A[2, 1], A[2, 2])
-    inverse[0, 0], inverse[1, 1], inverse[2, 2] = entries[0], entries[2], entries[5]
-    inverse[0, 1] = inverse[1, 0] = entries[1]
-    inverse[0, 2] = inverse[2, 0] = entries[3]
-    inverse[1, 2] = inverse[2, 1] = entries[4]
-    return positive
-
-
-@inner_kernel(error_model="numpy")
-def _inverse_entries(a00: Any, a10: Any, a11: Any, a20: Any, a21: Any, a22: Any) -> Any:
-    """Return if A = L D L' is positive definite, and the lower half of its inverse row by row.
-
-    In NumPy the entries may be arrays of many matrices.
-    """
-    l10, l20 = a10 / a00, a20 / a00
-    d1 = a11 - l10 * a10
-    rest = a21 - l20 * a10
-    l21 = rest / d1
-    d2 = a22 - l20 * a20 - l21 * rest
-    m20 = l10 * l21 - l20  # of L^-1, whose other entries are -l10 and -l21
-    entries = (
-        1 / a00 + l10 * l10 / d1 + m20 * m20 / d2,
-        -l10 / d1 - m20 * l21 / d2,
-        1 / d1 + l21 * l21 / d2,
-        m20 / d2,
-        -l21 / d2,
-        1 / d2,
-    )
-    return (a00 > 0) & (d1 > 0) & (d2 > 0), entries
+    total = np.empty((n, *values.shape[1:]))
+    for column in np.ndindex(*values.shape[1:]):
+        total[:, *column] = np.bincount(group, values[:, *column], n)
+    return total
 
 
 def inverses(blocks: Float) -> Float:
-    """Invert symmetric positive definite blocks (N, D, D), where D is two or three.
+    """Return the inverses (N, D, D) of symmetric blocks (N, D, D) = L D L', D two or three.
+
+    The lower half of each block is read.
 
     Raises:
         LinAlgError: a block is not positive definite.
@@ -220,8 +165,23 @@ def inverses(blocks: Float) -> Float:
     for k, (r, q) in enumerate(pairs):
         if r < dimensions:
             entries[k] = blocks[:, r, q]
+    a00, a10, a11, a20, a21, a22 = entries
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        positive, inverse = source_of(_inverse_entries)(*entries)
+        l10, l20 = a10 / a00, a20 / a00
+        d1 = a11 - l10 * a10
+        rest = a21 - l20 * a10
+        l21 = rest / d1
+        d2 = a22 - l20 * a20 - l21 * rest
+        m20 = l10 * l21 - l20  # of L^-1, whose other entries are -l10 and -l21
+        inverse = (
+            1 / a00 + l10 * l10 / d1 + m20 * m20 / d2,
+            -l10 / d1 - m20 * l21 / d2,
+            1 / d1 + l21 * l21 / d2,
+            m20 / d2,
+            -l21 / d2,
+            1 / d2,
+        )
+        positive = (a00 > 0) & (d1 > 0) & (d2 > 0)
     if not positive.all():
         raise np.linalg.LinAlgError("a block is not positive definite")
     found = np.empty(blocks.shape)
@@ -264,7 +224,7 @@ trailing_zeros = cast(Callable[[Any], int], _trailing_zeros)
 ones = cast(Callable[[Any], int], _ones)
 
 
-@inner_kernel
+@kernel
 def count_common(first: np.ndarray, second: np.ndarray) -> int:
     """Size of the intersection of two sets (W,) uint64."""
     count = 0
@@ -273,7 +233,7 @@ def count_common(first: np.ndarray, second: np.ndarray) -> int:
     return count
 
 
-@inner_kernel
+@kernel
 def packed(eights: np.ndarray, w: int) -> np.uint64:
     """Word w of a set whose members are bytes of 1, the others 0; `eights` are eight bytes each."""
     word = np.uint64(0)
@@ -282,7 +242,7 @@ def packed(eights: np.ndarray, w: int) -> np.uint64:
     return word
 
 
-@kernel_part
+@kernel
 def transpose(square: np.ndarray) -> None:
     """Exchange rows and columns of 64 words: halves of halves change places (Warren 2012, 7-3)."""
     size, low = WORD // 2, np.uint64(0xFFFFFFFF)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mapfusion.geometry.numerics import Float, inner_kernel
+from mapfusion.geometry.numerics import Float, kernel
 
 IDENTITY: Float = np.zeros(3)
 IDENTITY.setflags(write=False)
@@ -93,13 +93,13 @@ def motion_sigma(covariance: Float) -> tuple[Float, Float]:
     return np.sqrt(m2), np.sqrt(covariance[..., 2, 2])
 
 
-@inner_kernel
+@kernel
 def moved_point(T_a_b: Float, cos: float, sin: float, x: float, y: float) -> tuple[float, float]:
     """T p of the point (x, y); cos and sin are theta's."""
     return T_a_b[0] + cos * x - sin * y, T_a_b[1] + sin * x + cos * y
 
 
-@inner_kernel
+@kernel
 def residual(
     T_a_b: Float, cos: float, sin: float, p_a: Float, p_b: Float, i: int
 ) -> tuple[float, float]:
@@ -109,13 +109,13 @@ def residual(
     return ex, ey
 
 
-@inner_kernel
+@kernel
 def lever(cos: float, sin: float, p_b: Float, i: int) -> tuple[float, float]:
     """d(T p_b) / d theta of point i of (N, 2 or more)."""
     return -sin * p_b[i, 0] - cos * p_b[i, 1], cos * p_b[i, 0] - sin * p_b[i, 1]
 
 
-@inner_kernel
+@kernel
 def add_turned(
     xx: float, xy: float, yy: float, cos: float, sin: float, bxx: float, bxy: float, byy: float
 ) -> tuple[float, float, float]:

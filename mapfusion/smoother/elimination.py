@@ -18,7 +18,7 @@ import scipy.linalg
 from scipy.sparse import csr_array
 
 from mapfusion.geometry.joint_covariance import RANK, KnownErrors, SharedErrors
-from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.smoother.cholesky import Envelope, Factor, factor_in_envelope
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
 from mapfusion.smoother.problem import Sightings
@@ -194,7 +194,30 @@ def _add_squares(
             for k in range(starts[j], i + 1):
                 if place[k] >= 0:
                     share = 0.5 if k == i else 1.0
-                    _add_part(Z, offset, 3 * place[i], 3 * place[k], share, moved, k, of_pose)
+                    # Add a share of the poses' covariance times what moves observation k's
+                    # landmark.
+                    row = 3 * place[i]
+                    column = 3 * place[k]
+                    above = row < column  # its mirror image is stored
+                    down, across = (column, row) if above else (row, column)
+                    at0, at1, at2 = (
+                        offset[down] + across,
+                        offset[down + 1] + across,
+                        offset[down + 2] + across,
+                    )
+                    for q in range(3):
+                        x, y, z = (
+                            share * moved[k, 0, q],
+                            share * moved[k, 1, q],
+                            share * moved[k, 2, q],
+                        )
+                        if above:
+                            for r in range(3):
+                                of_pose[r, q] += Z[at0 + r] * x + Z[at1 + r] * y + Z[at2 + r] * z
+                        else:
+                            of_pose[0, q] += Z[at0] * x + Z[at0 + 1] * y + Z[at0 + 2] * z
+                            of_pose[1, q] += Z[at1] * x + Z[at1 + 1] * y + Z[at1 + 2] * z
+                            of_pose[2, q] += Z[at2] * x + Z[at2 + 1] * y + Z[at2 + 2] * z
             for r in range(3):
                 for q in range(3):
                     total[j, r, q] += (
@@ -202,32 +225,6 @@ def _add_squares(
                         + moved[i, 1, r] * of_pose[1, q]
                         + moved[i, 2, r] * of_pose[2, q]
                     )
-
-
-@kernel_part
-def _add_part(
-    Z: Float,
-    offset: np.ndarray,
-    row: int,
-    column: int,
-    share: float,
-    moved: Float,
-    k: int,
-    total: Float,
-) -> None:
-    """Add a share of the poses' covariance times what moves observation k's landmark."""
-    above = row < column  # its mirror image is stored
-    down, across = (column, row) if above else (row, column)
-    at0, at1, at2 = offset[down] + across, offset[down + 1] + across, offset[down + 2] + across
-    for q in range(3):
-        x, y, z = share * moved[k, 0, q], share * moved[k, 1, q], share * moved[k, 2, q]
-        if above:
-            for r in range(3):
-                total[r, q] += Z[at0 + r] * x + Z[at1 + r] * y + Z[at2 + r] * z
-        else:
-            total[0, q] += Z[at0] * x + Z[at0 + 1] * y + Z[at0 + 2] * z
-            total[1, q] += Z[at1] * x + Z[at1 + 1] * y + Z[at1 + 2] * z
-            total[2, q] += Z[at2] * x + Z[at2 + 1] * y + Z[at2 + 2] * z
 
 
 _GB = 1e9

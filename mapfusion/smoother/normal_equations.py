@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.geometry.numerics import Float, inner_kernel, kernel
+from mapfusion.geometry.numerics import Float, sums_by, times_vectors
 from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.smoother.problem import Sightings
 
@@ -171,8 +171,18 @@ def normal_equations(
         np.empty((len(seen), 3, 3)),
         _no_observations(at, weights, stray_information, shares),
     )
-    factors = weights.observation, shares.observation
-    _add_observations(seen.arrays, at, turns(at.path), *factors, made)
+    share, frame = shares.observation, seen.frame
+    W, e, point = _in_map_frame(seen, at, weights.observation)
+    _put_points(seen, W, e, share, made.points)
+    # the lever: of de/dx the last column
+    a, b = point[:, 1] - at.path[frame, 1], at.path[frame, 0] - point[:, 0]
+    coupling = made.coupling
+    coupling[:, :2] = -share * W[:, :2]
+    coupling[:, 2] = share * (a[:, None] * W[:, 0] + b[:, None] * W[:, 1])
+    made.pose_gradient[:] = sums_by(frame, times_vectors(coupling, e) / share, n_poses)
+    made.pose_block[:, :, :2] = -sums_by(frame, coupling[:, :, :2], n_poses)
+    turned = coupling[:, :, 0] * a[:, None] + coupling[:, :, 1] * b[:, None]
+    made.pose_block[:, :, 2] = sums_by(frame, turned, n_poses)
     _add_odometry(at.path, odometry, information, made)
     return made
 
@@ -182,7 +192,8 @@ def point_equations(
 ) -> PointEquations:
     """Return the equations of the points for a fixed path; arguments as in `normal_equations`."""
     made = _no_observations(at, weights, stray_information, WHOLE)
-    _add_to_points(seen.arrays, at, turns(at.path), weights.observation, made)
+    W, e, _ = _in_map_frame(seen, at, weights.observation)
+    _put_points(seen, W, e, 1.0, made)
     return made
 
 
@@ -205,90 +216,36 @@ def _add_odometry(path: Float, odometry: Float, information: Float, made: Normal
     made.link[:] = (np.swapaxes(after, 1, 2) * information[:, None, :]) @ before
 
 
-@kernel
-def _add_observations(
-    seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
-    at: Estimate,
-    turn: Float,
-    weight: Float,
-    share: float,
-    made: NormalEquations,
-) -> None:
-    starts, owner, frame, position, information = seen
-    path, W, e = at.path, np.empty((3, 3)), np.empty(3)
-    coupling, pose_block, pose_gradient = made.coupling, made.pose_block, made.pose_gradient
-    for t in range(len(starts) - 1):
-        x = at.point_m[owner[t], 0] + at.offset_m[t, 0]
-        y = at.point_m[owner[t], 1] + at.offset_m[t, 1]
-        z = at.point_m[owner[t], 2] + at.offset_m[t, 2]
-        for i in range(starts[t], starts[t + 1]):
-            k = frame[i]
-            a, b = y - path[k, 1], path[k, 0] - x  # the lever: of de/dx the last column
-            _put_in_map_frame(turn[k], information[i], weight[i], W)
-            _put_residual(path[k], x, y, z, turn[k], position[i], e)
-            _add_to_track(W, e, share, made.points, t)
-            for q in range(3):
-                coupling[i, 0, q] = -share * W[0, q]
-                coupling[i, 1, q] = -share * W[1, q]
-                coupling[i, 2, q] = share * (a * W[0, q] + b * W[1, q])
-            for r in range(3):
-                to_x, to_y, to_z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
-                pose_gradient[k, r] += (to_x * e[0] + to_y * e[1] + to_z * e[2]) / share
-                pose_block[k, r, 0] -= to_x
-                pose_block[k, r, 1] -= to_y
-                pose_block[k, r, 2] += to_x * a + to_y * b
+def _in_map_frame(seen: Sightings, at: Estimate, weight: Float) -> tuple[Float, Float, Float]:
+    """Return what the N observations say in the map frame.
+
+    Returns:
+        Their weighted information R W R' (N, 3, 3), their residuals (N, 3), and the points (N, 3)
+        that they are of.
+    """
+    point = (at.point_m[seen.landmark_of_track] + at.offset_m)[seen.track]
+    pose, z, (c, s) = at.path[seen.frame], seen.position_m, turns(at.path)[seen.frame].T
+    e = np.empty(point.shape)
+    e[:, 0] = point[:, 0] - pose[:, 0] - (c * z[:, 0] - s * z[:, 1])
+    e[:, 1] = point[:, 1] - pose[:, 1] - (s * z[:, 0] + c * z[:, 1])
+    e[:, 2] = point[:, 2] - z[:, 2]
+    own, W = seen.information, np.empty(seen.information.shape)
+    along, across, mixed = own[:, 0, 0], own[:, 1, 1], own[:, 0, 1]
+    W[:, 0, 0] = weight * (c * c * along - 2 * c * s * mixed + s * s * across)
+    W[:, 1, 1] = weight * (s * s * along + 2 * c * s * mixed + c * c * across)
+    W[:, 0, 1] = weight * (c * s * (along - across) + (c * c - s * s) * mixed)
+    W[:, 0, 2] = weight * (c * own[:, 0, 2] - s * own[:, 1, 2])
+    W[:, 1, 2] = weight * (s * own[:, 0, 2] + c * own[:, 1, 2])
+    W[:, 2, 2] = weight * own[:, 2, 2]
+    W[:, 1, 0], W[:, 2, 0], W[:, 2, 1] = W[:, 0, 1], W[:, 0, 2], W[:, 1, 2]
+    return W, e, point
 
 
-@kernel
-def _add_to_points(
-    seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
-    at: Estimate,
-    turn: Float,
-    weight: Float,
-    made: PointEquations,
-) -> None:
-    starts, owner, frame, position, information = seen
-    W, e = np.empty((3, 3)), np.empty(3)
-    for t in range(len(starts) - 1):
-        x = at.point_m[owner[t], 0] + at.offset_m[t, 0]
-        y = at.point_m[owner[t], 1] + at.offset_m[t, 1]
-        z = at.point_m[owner[t], 2] + at.offset_m[t, 2]
-        for i in range(starts[t], starts[t + 1]):
-            k = frame[i]
-            _put_in_map_frame(turn[k], information[i], weight[i], W)
-            _put_residual(at.path[k], x, y, z, turn[k], position[i], e)
-            _add_to_track(W, e, 1.0, made, t)
-
-
-@inner_kernel
-def _add_to_track(W: Float, e: Float, share: float, made: PointEquations, t: int) -> None:
-    for r in range(3):
-        made.track_gradient[t, r] += W[r, 0] * e[0] + W[r, 1] * e[1] + W[r, 2] * e[2]
-        for q in range(3):
-            made.track_block[t, r, q] += share * W[r, q]
-
-
-@inner_kernel
-def _put_in_map_frame(turn: Float, information: Float, weight: float, W: Float) -> None:
-    """Write the information of an observation in the map frame: weight R information R'."""
-    c, s = turn[0], turn[1]
-    along, across, mixed = information[0, 0], information[1, 1], information[0, 1]
-    W[0, 0] = weight * (c * c * along - 2 * c * s * mixed + s * s * across)
-    W[1, 1] = weight * (s * s * along + 2 * c * s * mixed + c * c * across)
-    W[0, 1] = W[1, 0] = weight * (c * s * (along - across) + (c * c - s * s) * mixed)
-    W[0, 2] = W[2, 0] = weight * (c * information[0, 2] - s * information[1, 2])
-    W[1, 2] = W[2, 1] = weight * (s * information[0, 2] + c * information[1, 2])
-    W[2, 2] = weight * information[2, 2]
-
-
-@inner_kernel
-def _put_residual(
-    pose: Float, x: float, y: float, z: float, turn: Float, seen_at: Float, e: Float
-) -> None:
-    """Write the residual of an observation of (x, y, z) in the map frame."""
-    e[0] = x - pose[0] - (turn[0] * seen_at[0] - turn[1] * seen_at[1])
-    e[1] = y - pose[1] - (turn[1] * seen_at[0] + turn[0] * seen_at[1])
-    e[2] = z - seen_at[2]
+def _put_points(seen: Sightings, W: Float, e: Float, share: float, made: PointEquations) -> None:
+    """Put the sums of W, of which a share counts, and of W e of each track."""
+    n = len(seen.strays)
+    made.track_gradient[:] = sums_by(seen.track, times_vectors(W, e), n)
+    made.track_block[:] = sums_by(seen.track, share * W, n)
 
 
 def first_points(seen: Sightings, path: Float) -> Float:
@@ -300,79 +257,48 @@ def first_points(seen: Sightings, path: Float) -> Float:
 
 
 def squared_distances(seen: Sightings, at: Estimate) -> Float:
-    """Return the squared Mahalanobis distances of the residuals, shape (N,)."""
-    squares = np.empty(len(seen))
-    _put_squares(seen.arrays, at, turns(at.path), squares)
-    return squares
+    """(N,) squared Mahalanobis distances of the observations from where they should be.
+
+    In the robot's frame, where the information is: r' W r with r = R'(l + b - p) - z.
+    """
+    point = (at.point_m[seen.landmark_of_track] + at.offset_m)[seen.track]
+    pose, W, (c, s) = at.path[seen.frame], seen.information, turns(at.path)[seen.frame].T
+    along, across = point[:, 0] - pose[:, 0], point[:, 1] - pose[:, 1]
+    r0 = c * along + s * across - seen.position_m[:, 0]
+    r1 = c * across - s * along - seen.position_m[:, 1]
+    r2 = point[:, 2] - seen.position_m[:, 2]
+    return (
+        r0 * (W[:, 0, 0] * r0 + 2 * W[:, 0, 1] * r1)
+        + r1 * (W[:, 1, 1] * r1 + 2 * W[:, 1, 2] * r2)
+        + r2 * (W[:, 2, 2] * r2 + 2 * W[:, 0, 2] * r0)
+    )
 
 
 def squares_of_points(seen: Sightings, path: Float, covariance_m2: Float) -> Float:
-    """Return how much larger the expected squares about the true points are, shape (N,).
+    """(N,) what squared distances are expected to be more by: the trace of W R' C R.
 
-    Squares about points that were fitted to the same observations are smaller.
+    About the tracks' true points, that is; those about points that were fitted to the same
+    observations are smaller.
 
     Args:
         seen: the observations.
-        path: poses, shape (T, 3).
-        covariance_m2: covariances of the tracks' points, shape (B, 3, 3).
+        path: (T, 3).
+        covariance_m2: (B, 3, 3) C of the tracks' points.
     """
-    squares = np.empty(len(seen))
-    _put_traces(seen.arrays, turns(path), covariance_m2, squares)
-    return squares
-
-
-@kernel
-def _put_squares(
-    seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
-    at: Estimate,
-    turn: Float,
-    squares: Float,
-) -> None:
-    """Write r' W r with r = R'(l + b - p) - z in the robot frame."""
-    starts, owner, frame, position, W = seen
-    for t in range(len(starts) - 1):
-        j = owner[t]
-        x = at.point_m[j, 0] + at.offset_m[t, 0]
-        y = at.point_m[j, 1] + at.offset_m[t, 1]
-        z = at.point_m[j, 2] + at.offset_m[t, 2]
-        for i in range(starts[t], starts[t + 1]):
-            k = frame[i]
-            c, s, along, across = turn[k, 0], turn[k, 1], x - at.path[k, 0], y - at.path[k, 1]
-            r0 = c * along + s * across - position[i, 0]
-            r1 = c * across - s * along - position[i, 1]
-            r2 = z - position[i, 2]
-            squares[i] = (
-                r0 * (W[i, 0, 0] * r0 + 2 * W[i, 0, 1] * r1)
-                + r1 * (W[i, 1, 1] * r1 + 2 * W[i, 1, 2] * r2)
-                + r2 * (W[i, 2, 2] * r2 + 2 * W[i, 0, 2] * r0)
-            )
-
-
-@kernel
-def _put_traces(
-    seen: tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float],
-    turn: Float,
-    covariance_m2: Float,
-    squares: Float,
-) -> None:
-    """Write the trace of W R' C R."""
-    starts, _, frame, _, W = seen
-    for t in range(len(starts) - 1):
-        xx, xy, xz = covariance_m2[t, 0, 0], covariance_m2[t, 0, 1], covariance_m2[t, 0, 2]
-        yy, yz, zz = covariance_m2[t, 1, 1], covariance_m2[t, 1, 2], covariance_m2[t, 2, 2]
-        for i in range(starts[t], starts[t + 1]):
-            c, s = turn[frame[i], 0], turn[frame[i], 1]
-            along = c * c * xx + 2 * c * s * xy + s * s * yy
-            across = s * s * xx - 2 * c * s * xy + c * c * yy
-            mixed = c * s * (yy - xx) + (c * c - s * s) * xy
-            squares[i] = (
-                W[i, 0, 0] * along
-                + W[i, 1, 1] * across
-                + W[i, 2, 2] * zz
-                + 2 * W[i, 0, 1] * mixed
-                + 2 * W[i, 0, 2] * (c * xz + s * yz)
-                + 2 * W[i, 1, 2] * (c * yz - s * xz)
-            )
+    C, W, (c, s) = covariance_m2[seen.track], seen.information, turns(path)[seen.frame].T
+    xx, xy, xz = C[:, 0, 0], C[:, 0, 1], C[:, 0, 2]
+    yy, yz, zz = C[:, 1, 1], C[:, 1, 2], C[:, 2, 2]
+    along = c * c * xx + 2 * c * s * xy + s * s * yy
+    across = s * s * xx - 2 * c * s * xy + c * c * yy
+    mixed = c * s * (yy - xx) + (c * c - s * s) * xy
+    return (
+        W[:, 0, 0] * along
+        + W[:, 1, 1] * across
+        + W[:, 2, 2] * zz
+        + 2 * W[:, 0, 1] * mixed
+        + 2 * W[:, 0, 2] * (c * xz + s * yz)
+        + 2 * W[:, 1, 2] * (c * yz - s * xz)
+    )
 
 
 def offset_squares(seen: Sightings, at: Estimate, stray_information: float) -> Float:

@@ -126,17 +126,6 @@ class Sightings:
         """Arrays for kernels: first row and track of each landmark, first row of each track."""
         return self.starts, self.first_track, self.track_starts
 
-    @property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Float, Float]:
-        """Arrays for kernels: rows and landmark of each track, frame and data of each row."""
-        return (
-            self.track_starts,
-            self.landmark_of_track,
-            self.frame,
-            self.position_m,
-            self.information,
-        )
-
     def on_level(self, level: float) -> "Sightings":
         """Multiply the stated covariances of observations on tracks with offsets by `level`."""
         if level == 1:

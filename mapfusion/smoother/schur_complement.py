@@ -23,12 +23,11 @@ import numpy as np
 
 from mapfusion.geometry.numerics import (
     Float,
-    add_along,
-    inner_kernel,
+    inverses,
     kernel,
-    kernel_part,
-    put_along,
-    put_inverse,
+    sums_by,
+    times_blocks,
+    times_vectors,
 )
 from mapfusion.smoother.normal_equations import NormalEquations, PointEquations
 from mapfusion.smoother.problem import Sightings
@@ -59,74 +58,17 @@ def without_offsets(seen: Sightings, equations: PointEquations) -> Reduced:
     Raises:
         LinAlgError: the information of a point is singular.
     """
-    n_tracks, n_landmarks = len(seen.strays), seen.n_landmarks
-    left = Reduced(
-        np.zeros((n_tracks, 3, 3)),
-        equations.track_gradient + equations.offset_gradient,
-        np.zeros((n_tracks, 3, 3)),
-        np.zeros((n_landmarks, 3)),
-        np.empty((n_landmarks, 3, 3)),
-    )
-    planar = seen.n_dimensions == 2
-    if not _reduce(seen.by_landmark, seen.strays, planar, equations, left):
-        raise np.linalg.LinAlgError("the information of a point is singular")
-    return left
-
-
-@kernel
-def _reduce(
-    rows: tuple[np.ndarray, np.ndarray, np.ndarray],
-    strays: np.ndarray,
-    planar: bool,
-    equations: PointEquations,
-    left: Reduced,
-) -> bool:
-    """Write the reduced equations; return False if a block is singular."""
-    _, first_track, _ = rows
-    block, known, inverse = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    S, P, G, K = equations.track_block, equations.offset_information, left.own_m2, left.kept
-    for j in range(len(first_track) - 1):
-        for r in range(3):
-            for q in range(3):
-                block[r, q] = 0.0
-        for t in range(first_track[j], first_track[j + 1]):
-            if strays[t]:
-                for r in range(3):
-                    for q in range(3):
-                        known[r, q] = S[t, r, q]
-                    known[r, r] += P[t]
-                if not put_inverse(known, inverse):
-                    return False
-                for r in range(3):
-                    for q in range(3):
-                        G[t, r, q], K[t, r, q] = inverse[r, q], P[t] * inverse[r, q]
-            else:
-                for r in range(3):
-                    K[t, r, r] = 1.0
-            _add_track(equations, left, j, t, block)
-        if planar:
-            block[2, 2] = 1.0
-        if not put_inverse(block, inverse):
-            return False
-        for r in range(3):
-            for q in range(3):
-                left.landmark_m2[j, r, q] = inverse[r, q]
-    return True
-
-
-@kernel_part
-def _add_track(equations: PointEquations, left: Reduced, j: int, t: int, block: Float) -> None:
-    """Add the reduced equations of a track to its landmark's block and gradient."""
-    S, gradient, G, K = equations.track_block, equations.track_gradient, left.own_m2, left.kept
-    a, b, c = left.pull[t, 0], left.pull[t, 1], left.pull[t, 2]
-    x = G[t, 0, 0] * a + G[t, 0, 1] * b + G[t, 0, 2] * c
-    y = G[t, 1, 0] * a + G[t, 1, 1] * b + G[t, 1, 2] * c
-    z = G[t, 2, 0] * a + G[t, 2, 1] * b + G[t, 2, 2] * c
-    for r in range(3):
-        a, b, c = S[t, r, 0], S[t, r, 1], S[t, r, 2]
-        left.point_gradient[j, r] += gradient[t, r] - (a * x + b * y + c * z)
-        for q in range(3):
-            block[r, q] += a * K[t, 0, q] + b * K[t, 1, q] + c * K[t, 2, q]
+    S, strays, P = equations.track_block, seen.strays, equations.offset_information[seen.strays]
+    own_m2, kept = np.zeros(S.shape), np.tile(np.eye(3), (len(S), 1, 1))
+    own_m2[strays] = inverses(S[strays] + P[:, None, None] * np.eye(3))
+    kept[strays] = P[:, None, None] * own_m2[strays]
+    pull = equations.track_gradient + equations.offset_gradient
+    gradient = equations.track_gradient - times_vectors(S, times_vectors(own_m2, pull))
+    owner, n = seen.landmark_of_track, seen.n_landmarks
+    block = sums_by(owner, times_blocks(S, kept), n)
+    if seen.n_dimensions == 2:
+        block[:, 2, 2] = 1.0
+    return Reduced(own_m2, pull, kept, sums_by(owner, gradient, n), inverses(block))
 
 
 def moved_points(
@@ -140,38 +82,12 @@ def moved_points(
         left: the equations after the offsets are eliminated.
         along: sum of coupling' dx for each track, where dx is the step of the path, shape (B, 3).
     """
-    points, offsets = np.empty((seen.n_landmarks, 3)), np.empty((len(seen.strays), 3))
-    _put_moved(seen.first_track, equations.track_block, left, along, points, offsets)
-    return points, offsets
-
-
-@kernel
-def _put_moved(
-    first_track: np.ndarray,
-    block: Float,
-    left: Reduced,
-    along: Float,
-    points: Float,
-    offsets: Float,
-) -> None:
-    asked, way, moved = np.empty(3), np.empty(3), np.empty(3)
-    for j in range(len(first_track) - 1):
-        for q in range(3):
-            asked[q] = left.point_gradient[j, q]
-        for t in range(first_track[j], first_track[j + 1]):
-            for q in range(3):
-                way[q] = along[t, q]
-            add_along(left.kept, t, way, asked)  # it is symmetric
-        put_along(left.landmark_m2, j, asked, moved)
-        for q in range(3):
-            points[j, q] = way[q] = -moved[q]
-        for t in range(first_track[j], first_track[j + 1]):
-            for q in range(3):
-                asked[q] = left.pull[t, q] + along[t, q]
-            add_along(block, t, way, asked)
-            put_along(left.own_m2, t, asked, moved)
-            for q in range(3):
-                offsets[t, q] = -moved[q]
+    owner, n = seen.landmark_of_track, seen.n_landmarks
+    asked = np.concatenate([left.point_gradient, times_vectors(left.kept, along)])
+    asked = sums_by(np.concatenate([np.arange(n), owner]), asked, n)
+    points = -times_vectors(left.landmark_m2, asked)
+    asked = left.pull + along + times_vectors(equations.track_block, points[owner])
+    return points, -times_vectors(left.own_m2, asked)
 
 
 class Points(NamedTuple):
@@ -187,34 +103,13 @@ class Points(NamedTuple):
 
 
 def known_points(seen: Sightings, left: Reduced) -> Points:
-    """Return the covariances of offsets and tracks' points for a known path."""
-    made = np.empty((2, *left.own_m2.shape))
-    _put_known(seen.landmark_of_track, left, made)
-    return Points(made[0], made[1])
-
-
-@kernel
-def _put_known(landmark: np.ndarray, left: Reduced, made: Float) -> None:
-    """Write G plus the propagated covariance of the landmark, for offsets and for points."""
-    A, G, kept = left.landmark_m2, left.own_m2, left.kept
-    follows, half = np.empty((3, 3)), np.empty((3, 3))
-    for which in range(2):
-        for t in range(len(landmark)):
-            j = landmark[t]
-            for r in range(3):
-                for q in range(3):
-                    follows[r, q] = kept[t, r, q]
-                    if which == 0:  # -db / dl
-                        follows[r, q] = (1.0 if r == q else 0.0) - kept[t, r, q]
-            for r in range(3):
-                x, y, z = follows[r, 0], follows[r, 1], follows[r, 2]
-                for q in range(3):
-                    half[r, q] = x * A[j, 0, q] + y * A[j, 1, q] + z * A[j, 2, q]
-            for r in range(3):
-                x, y, z = half[r, 0], half[r, 1], half[r, 2]
-                for q in range(3):
-                    moved = x * follows[0, q] + y * follows[1, q] + z * follows[2, q]
-                    made[which, t, r, q] = G[t, r, q] + moved
+    """What is known of offsets and tracks' points, their landmark's own covariance in it."""
+    of_landmark = left.landmark_m2[seen.landmark_of_track]
+    made = [
+        left.own_m2 + times_blocks(times_blocks(follows, of_landmark), follows)
+        for follows in (np.eye(3) - left.kept, left.kept)  # -db / dl, and that of the point
+    ]
+    return Points(*made)
 
 
 def subtract_points(seen: Sightings, equations: NormalEquations, left: Reduced, S: Float) -> None:
@@ -248,43 +143,33 @@ def _subtract(
             for i in range(own, track_starts[t + 1]):
                 if place[i] < 0:
                     continue
-                _put_gains(left, j, t, coupling, coupling_left, i, by_landmark, by_track)
-                _add_product(by_landmark, left.kept, t, by_track)
+                A, G = left.landmark_m2, left.own_m2
+                for r in range(3):
+                    x, y, z = coupling_left[i, r, 0], coupling_left[i, r, 1], coupling_left[i, r, 2]
+                    for q in range(3):
+                        by_landmark[r, q] = x * A[j, 0, q] + y * A[j, 1, q] + z * A[j, 2, q]
+                    x, y, z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
+                    for q in range(3):
+                        by_track[r, q] = x * G[t, 0, q] + y * G[t, 1, q] + z * G[t, 2, q]
+                B = left.kept
+                for r in range(3):
+                    for q in range(3):
+                        by_track[r, q] += (
+                            by_landmark[r, 0] * B[t, 0, q]
+                            + by_landmark[r, 1] * B[t, 1, q]
+                            + by_landmark[r, 2] * B[t, 2, q]
+                        )
                 _subtract_rows(by_landmark, starts[j], own, i, place, coupling_left, offset, S)
                 _subtract_rows(by_track, own, i, i, place, coupling, offset, S)
-                _subtract_own(by_track, coupling, i, 3 * place[i], offset, S)
+                row = 3 * place[i]
+                for q in range(3):
+                    a, b, c = coupling[i, q, 0], coupling[i, q, 1], coupling[i, q, 2]
+                    for r in range(3):
+                        at = offset[row + r] + row + q
+                        S[at] -= by_track[r, 0] * a + by_track[r, 1] * b + by_track[r, 2] * c
 
 
-# Kernels take an array and a row: a view of a row costs more than the sums.
-@kernel_part
-def _put_gains(
-    left: Reduced,
-    j: int,
-    t: int,
-    coupling: Float,
-    coupling_left: Float,
-    i: int,
-    by_landmark: Float,
-    by_track: Float,
-) -> None:
-    A, G = left.landmark_m2, left.own_m2
-    for r in range(3):
-        x, y, z = coupling_left[i, r, 0], coupling_left[i, r, 1], coupling_left[i, r, 2]
-        for q in range(3):
-            by_landmark[r, q] = x * A[j, 0, q] + y * A[j, 1, q] + z * A[j, 2, q]
-        x, y, z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
-        for q in range(3):
-            by_track[r, q] = x * G[t, 0, q] + y * G[t, 1, q] + z * G[t, 2, q]
-
-
-@kernel_part
-def _add_product(A: Float, B: Float, t: int, total: Float) -> None:
-    for r in range(3):
-        for q in range(3):
-            total[r, q] += A[r, 0] * B[t, 0, q] + A[r, 1] * B[t, 1, q] + A[r, 2] * B[t, 2, q]
-
-
-@inner_kernel
+@kernel
 def _subtract_rows(
     X: Float,
     begin: int,
@@ -321,51 +206,17 @@ def _subtract_rows(
                 S[at + 2] -= v2
 
 
-@kernel_part
-def _subtract_own(
-    X: Float, coupling: Float, i: int, row: int, offset: np.ndarray, S: Float
-) -> None:
-    for q in range(3):
-        a, b, c = coupling[i, q, 0], coupling[i, q, 1], coupling[i, q, 2]
-        for r in range(3):
-            at = offset[row + r] + row + q
-            S[at] -= X[r, 0] * a + X[r, 1] * b + X[r, 2] * c
-
-
 def left_couplings(seen: Sightings, coupling: Float, left: Reduced) -> Float:
-    """Return the blocks (N, 3, 3) of pose and landmark after the offsets are eliminated."""
-    made = np.empty_like(coupling)
-    _put_left(seen.track_starts, coupling, left.kept, made)
-    return made
-
-
-@kernel
-def _put_left(track_starts: np.ndarray, coupling: Float, kept: Float, made: Float) -> None:
-    for t in range(len(kept)):
-        for i in range(track_starts[t], track_starts[t + 1]):
-            for r in range(3):
-                x, y, z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
-                for q in range(3):
-                    made[i, r, q] = x * kept[t, 0, q] + y * kept[t, 1, q] + z * kept[t, 2, q]
+    """(N, 3, 3) a pose's block with a landmark once offsets are eliminated, by observation."""
+    return times_blocks(coupling, left.kept[seen.track])
 
 
 def along_way(seen: Sightings, coupling: Float, way: Float) -> Float:
-    """Sum coupling' way over the observations of each track, shape (B, 3); `way` is (T, 3)."""
-    total = np.zeros((len(seen.strays), 3))
-    _add_along_way(seen.track_starts, seen.frame, coupling, way, total)
-    return total
-
-
-@kernel
-def _add_along_way(
-    track_starts: np.ndarray, frame: np.ndarray, coupling: Float, way: Float, total: Float
-) -> None:
-    for t in range(len(total)):
-        for i in range(track_starts[t], track_starts[t + 1]):
-            x, y, turned = way[frame[i], 0], way[frame[i], 1], way[frame[i], 2]
-            for q in range(3):
-                total[t, q] += coupling[i, 0, q] * x + coupling[i, 1, q] * y
-                total[t, q] += coupling[i, 2, q] * turned
+    """(B, 3) sum of coupling' way over the observations of each track; `way` (T, 3) by frame."""
+    moved, turned = way[seen.frame, :2, None], way[seen.frame, 2, None]
+    parts = coupling[:, 0] * moved[:, 0] + coupling[:, 1] * moved[:, 1], coupling[:, 2] * turned
+    both = np.stack(parts, axis=1).reshape(-1, 3)
+    return sums_by(np.repeat(seen.track, 2), both, len(seen.strays))
 
 
 def along_points(seen: Sightings, coupling: Float, point: Float, offset: Float) -> Float:

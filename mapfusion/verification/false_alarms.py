@@ -25,7 +25,7 @@ from mapfusion.align.alignment import MIN_PAIRS, Alignment, Pairs, Status
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.nearest_neighbours import Grid, runs_about
 from mapfusion.align.rigid_motion import fit_rigid
-from mapfusion.geometry.numerics import Float, inner_kernel, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import moved_point
 from mapfusion.parameters import Range, require_in_range
 
@@ -77,7 +77,7 @@ def _mark_thinned(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.nd
     return kept
 
 
-@kernel_part
+@kernel
 def _has_neighbour(
     i: int,
     p_a: Float,
@@ -96,7 +96,7 @@ def _has_neighbour(
     return False
 
 
-@inner_kernel
+@kernel
 def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
     """Whether points i and j of (N, D) are less than a distance apart."""
     if abs(p[i, 0] - p[j, 0]) >= distance_m:  # most are already told apart by this
@@ -129,7 +129,7 @@ def log10_tail(k: int, n: int, p: float) -> float:
     return min((first + math.log(total)) / math.log(10.0), 0.0)
 
 
-@kernel_part
+@kernel
 def moved_points(T_a_b: Float, p_b: Float) -> Float:
     """T p_b (n, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -149,34 +149,7 @@ def residuals_m(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
     return distance
 
 
-@kernel_part
-def nearest_first(distance: Float, n: int, gate_m: float) -> np.ndarray:
-    """Rows (k,) among the first n whose distance (N,) is within the gate.
-
-    The nearest, as many as `minimal_motion` seeks among, come first, by ascending distance; they
-    are kept by insertion, since Numba takes seconds to compile its sorts.
-    """
-    rows = np.empty(n, np.int64)
-    k = 0
-    for i in range(n):
-        if distance[i] <= gate_m:
-            place, rows[k] = k, i
-            if k >= _CANDIDATES:
-                place = _CANDIDATES - 1
-                if distance[rows[place]] > distance[i]:
-                    rows[k] = rows[place]
-                else:
-                    place = -1
-            k += 1
-            while place > 0 and distance[rows[place - 1]] > distance[i]:
-                rows[place] = rows[place - 1]
-                place -= 1
-            if place >= 0:
-                rows[place] = i
-    return rows[:k]
-
-
-@kernel_part
+@kernel
 def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float) -> Float:
     """The motion (3,) of two pairs nearest to T_a_b: least displacement of the supporters (RMS).
 
@@ -208,7 +181,7 @@ def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float)
     return found
 
 
-@kernel_part
+@kernel
 def same_height(heights: Float, i: int, j: int) -> bool:
     """Whether landmark a of pair i and landmark b of pair j can have one height."""
     dz = heights[i, 0] - heights[j, 1]
@@ -232,7 +205,7 @@ def possible_repairings(heights: Float) -> np.ndarray:
     return counts
 
 
-@kernel_part
+@kernel
 def agreeing_repairings(
     T_a_b: Float, pairs: IndependentPairs, gates_m: Float, first: int
 ) -> np.ndarray:
@@ -264,7 +237,7 @@ def agreeing_repairings(
     return agreeing
 
 
-@kernel_part
+@kernel
 def chance_of_agreeing(agreeing: np.ndarray, g: int, possible: int, of_all: int) -> float:
     """The larger p of the selection's and all pairs', from counts (2, G) at gate g and of possible.
 
@@ -292,7 +265,28 @@ def fewest_false_alarms(
     best, best_gate, best_n, best_k = math.inf, 0.0, total, 0
     for s in range(selections):
         n = total >> s
-        supporters = nearest_first(distance, n, gates_m[-1])
+        # Rows (k,) among the first n whose distance (N,) is within the gate.
+        # The nearest, as many as `minimal_motion` seeks among, come first, by ascending distance;
+        # they are kept by insertion, since Numba takes seconds to compile its sorts.
+        gate_m = gates_m[-1]
+        rows = np.empty(n, np.int64)
+        k = 0
+        for i in range(n):
+            if distance[i] <= gate_m:
+                place, rows[k] = k, i
+                if k >= _CANDIDATES:
+                    place = _CANDIDATES - 1
+                    if distance[rows[place]] > distance[i]:
+                        rows[k] = rows[place]
+                    else:
+                        place = -1
+                k += 1
+                while place > 0 and distance[rows[place - 1]] > distance[i]:
+                    rows[place] = rows[place - 1]
+                    place -= 1
+                if place >= 0:
+                    rows[place] = i
+        supporters = rows[:k]
         if len(supporters) < MIN_PAIRS:
             continue
         T_two = minimal_motion(p_a, p_b, supporters, T_a_b)

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.nearest_neighbours import Grid, runs_about
-from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import inverse, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.likelihood import (
@@ -92,7 +92,7 @@ def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> n
     return found
 
 
-@kernel_part
+@kernel
 def _alike(own: np.ndarray, i: int, other: np.ndarray, j: int, most: float) -> bool:
     """Whether descriptors i and j of (N, D) are no more than so much apart, squared."""
     square = 0.0

@@ -5,15 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.geometry.numerics import (
-    WORD,
-    Float,
-    kernel,
-    kernel_part,
-    ones,
-    packed,
-    trailing_zeros,
-)
+from mapfusion.geometry.numerics import WORD, Float, kernel, ones, packed, trailing_zeros
 from mapfusion.geometry.se2 import wrap
 from mapfusion.viewing import FieldOfView, Viewing
 
@@ -198,7 +190,8 @@ def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
     lanes = np.zeros(1, np.uint64)
     said = lanes.view(np.uint8)
     for i in range(len(p)):
-        r, ux, uy, levels = distance_m[i], direction[i, 0], direction[i, 1], 0
+        # a plain 0 is a type of its own, for which kernels would be compiled once more
+        r, ux, uy, levels = distance_m[i], direction[i, 0], direction[i, 1], np.int64(0)
         for step in range(len(height_m)):
             levels |= (height_m[step, 0] <= p[i, 2] <= height_m[step, 1]) << step
         own = p[i, 0], p[i, 1], ux, uy, max(r / _MAY_RATIO, range_m[0]), r * _MAY_RATIO
@@ -227,7 +220,7 @@ def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
     return how
 
 
-@kernel_part
+@kernel
 def _mark_possible(
     own: tuple[float, float, float, float, float, float],
     x: Float,
@@ -261,7 +254,7 @@ def _mark_possible(
         )
 
 
-@kernel_part
+@kernel
 def _look(
     sight: tuple[float, float, float, float, float],
     c: int,
@@ -313,7 +306,7 @@ def _look(
         said[k] = may * ((1 << _MAY_BIT) + (alike << _ALIKE_BIT) + (unsure << _UNSURE_BIT))
 
 
-@kernel_part
+@kernel
 def _is_in_view(
     sight: tuple[float, float, float, float, float],
     c: int,

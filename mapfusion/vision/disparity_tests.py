@@ -19,7 +19,7 @@ from functools import cache
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, cholesky, kernel, kernel_part, solve_lower
+from mapfusion.geometry.numerics import Float, cholesky, kernel, solve_lower
 from mapfusion.vision.subpixel import (
     DOWN,
     FIELDS,
@@ -101,7 +101,7 @@ def _asked() -> Iterator[Moment]:
 PLANE_MOMENTS = tuple(_asked())
 
 
-@kernel_part
+@kernel
 def score(sums: Float, place: np.ndarray, normal: Float, right: Float) -> float:
     """What a window holds against one plane.
 
@@ -156,7 +156,7 @@ def disagrees(squares: Float, noise: float, max_misfit: float, max_rows: float) 
     return np.any(squares[..., 1] > tolerated, axis=1)
 
 
-@kernel_part
+@kernel
 def fill_in_halves(sums: Float, place: np.ndarray, squares: Float, n: int) -> None:
     """Fill in the halves (4, 4) of window n, see `window_sums`; residuals less their own mean.
 
@@ -239,10 +239,81 @@ def _look_at_all(
         fill_down(left, u, v, half, window)
         fill_residuals(right, u, v, half, plane, n, window, room, share)
         shade = float(left[v, u])  # grey levels are counted from it: small numbers lose less
-        _leave_out(right, u, v, half, plane, n, shade, window)
+        # Mark which pixels of a window lie in both pictures, and let the others add nothing.
+        top, bottom, left_end, right_end = parts_inside(right, u, v, half)
+        d, a, b = plane[n, 0], plane[n, 1], plane[n, 2]
+        for k in range(window.shape[1]):
+            window[_INSIDE, k] = 1.0
+        for y in range(-half, half + 1):
+            first, last, start = left_end, right_end, u - d - b * y
+            if not top <= y <= bottom:
+                last = first - 1
+            while first <= last and not 1 <= start + first - a * first < right.shape[1] - 2:
+                first += 1
+            while first <= last and not 1 <= start + last - a * last < right.shape[1] - 2:
+                last -= 1
+            if first == -half and last == half:
+                continue
+            middle = (y + half) * (2 * half + 1) + half
+            for x in range(-half, half + 1):
+                if not first <= x <= last:
+                    window[LEVEL, middle + x] = shade
+                    window[SLOPE, middle + x] = window[DOWN, middle + x] = 0.0
+                    window[RESIDUAL, middle + x] = window[_INSIDE, middle + x] = 0.0
         for own in (plane_half, silhouette_half):
-            _sum_down(window, half, own, shade, down)
-            _sum_along(down, half, own, weight, column, sums)
+            # Sums down the columns of a window that are up to `own` from its middle, as far up
+            # and down.
+            for k in range(3 * N_PRODUCTS):
+                first = np.uintp(k) * WIDE
+                for i in range(2 * own + 1):
+                    down[first + np.uintp(i)] = 0.0
+            for y in range(-own, own + 1):
+                part = np.uintp((1 + (y > 0) - (y < 0)) * N_PRODUCTS) * WIDE
+                at, q = np.uintp((y + half) * (2 * half + 1) + half - own), float(y)
+                for i in range(2 * own + 1):
+                    m, k = part + np.uintp(i), at + np.uintp(i)
+                    L, g, h = window[LEVEL, k] - shade, window[SLOPE, k], window[DOWN, k]
+                    r, gy = window[RESIDUAL, k], g * q
+                    gyy = gy * q
+                    down[m] += g * g
+                    down[m + _AT[1]] += g * gy
+                    down[m + _AT[2]] += gy * gy
+                    down[m + _AT[3]] += gy * gyy
+                    down[m + _AT[4]] += gyy * gyy
+                    down[m + _AT[5]] += g
+                    down[m + _AT[6]] += gy
+                    down[m + _AT[7]] += gyy
+                    down[m + _AT[8]] += g * L
+                    down[m + _AT[9]] += gy * L
+                    down[m + _AT[10]] += gyy * L
+                    down[m + _AT[11]] += g * r
+                    down[m + _AT[12]] += gy * r
+                    down[m + _AT[13]] += gyy * r
+                    down[m + _AT[14]] += L
+                    down[m + _AT[15]] += L * L
+                    down[m + _AT[16]] += r
+                    down[m + _AT[17]] += L * r
+                    down[m + _AT[18]] += h * h
+                    down[m + _AT[19]] += r * r
+                    down[m + _AT[20]] += window[_INSIDE, k]
+            # Fill in what is asked for from sums down the columns; `column` is room for those of
+            # a row.
+            last = -1
+            for e in range(len(_SUMS)):
+                if _FROM[e] != last:
+                    last = _FROM[e]
+                    product, t = np.uintp(_DOWN_SUMS[last, 0]), _DOWN_SUMS[last, 1]
+                    above, at, below = SIDES[t, 0], SIDES[t, 1], SIDES[t, 2]
+                    m = product * WIDE
+                    for i in range(2 * own + 1):
+                        k = m + np.uintp(i)
+                        column[i] = (
+                            above * down[k] + at * down[k + _PART] + below * down[k + _PART + _PART]
+                        )
+                w, total = _SUMS[e, 2], 0.0
+                for i in range(2 * own + 1):
+                    total += column[i] * weight[w, np.uintp(half - own + i)]
+                sums[e] = total
             if own == plane_half:
                 pixels = max(sums[_OF_SLOPES[0]], 1.0)
                 scores[n, 0] = score(sums, _OF_PLANE, normal, moments)
@@ -251,96 +322,3 @@ def _look_at_all(
             if own == silhouette_half:
                 fill_in_halves(sums, _OF_HALVES, squares, n)
                 break
-
-
-@kernel_part
-def _leave_out(
-    right: np.ndarray, u: int, v: int, half: int, plane: Float, n: int, shade: float, window: Float
-) -> None:
-    """Mark which pixels of a window lie in both pictures, and let the others add nothing."""
-    top, bottom, left_end, right_end = parts_inside(right, u, v, half)
-    d, a, b = plane[n, 0], plane[n, 1], plane[n, 2]
-    for k in range(window.shape[1]):
-        window[_INSIDE, k] = 1.0
-    for y in range(-half, half + 1):
-        first, last, start = left_end, right_end, u - d - b * y
-        if not top <= y <= bottom:
-            last = first - 1
-        while first <= last and not 1 <= start + first - a * first < right.shape[1] - 2:
-            first += 1
-        while first <= last and not 1 <= start + last - a * last < right.shape[1] - 2:
-            last -= 1
-        if first == -half and last == half:
-            continue
-        middle = (y + half) * (2 * half + 1) + half
-        for x in range(-half, half + 1):
-            if not first <= x <= last:
-                window[LEVEL, middle + x] = shade
-                window[SLOPE, middle + x] = window[DOWN, middle + x] = 0.0
-                window[RESIDUAL, middle + x] = window[_INSIDE, middle + x] = 0.0
-
-
-@kernel_part
-def _sum_down(window: Float, half: int, own: int, shade: float, down: Float) -> None:
-    """Sums down the columns of a window that are up to `own` from its middle, as far up and down.
-
-    Args:
-        window: of half side `half`.
-        half: of the window.
-        own: of what is looked at.
-        shade: what grey levels are counted from.
-        down: (3 * N_PRODUCTS * WIDE,), changed: of the rows above the middle, of that in it and of
-            those below the sums of each product.
-    """
-    for k in range(3 * N_PRODUCTS):
-        first = np.uintp(k) * WIDE
-        for i in range(2 * own + 1):
-            down[first + np.uintp(i)] = 0.0
-    for y in range(-own, own + 1):
-        part = np.uintp((1 + (y > 0) - (y < 0)) * N_PRODUCTS) * WIDE
-        at, q = np.uintp((y + half) * (2 * half + 1) + half - own), float(y)
-        for i in range(2 * own + 1):
-            m, k = part + np.uintp(i), at + np.uintp(i)
-            L, g, h = window[LEVEL, k] - shade, window[SLOPE, k], window[DOWN, k]
-            r, gy = window[RESIDUAL, k], g * q
-            gyy = gy * q
-            down[m] += g * g
-            down[m + _AT[1]] += g * gy
-            down[m + _AT[2]] += gy * gy
-            down[m + _AT[3]] += gy * gyy
-            down[m + _AT[4]] += gyy * gyy
-            down[m + _AT[5]] += g
-            down[m + _AT[6]] += gy
-            down[m + _AT[7]] += gyy
-            down[m + _AT[8]] += g * L
-            down[m + _AT[9]] += gy * L
-            down[m + _AT[10]] += gyy * L
-            down[m + _AT[11]] += g * r
-            down[m + _AT[12]] += gy * r
-            down[m + _AT[13]] += gyy * r
-            down[m + _AT[14]] += L
-            down[m + _AT[15]] += L * L
-            down[m + _AT[16]] += r
-            down[m + _AT[17]] += L * r
-            down[m + _AT[18]] += h * h
-            down[m + _AT[19]] += r * r
-            down[m + _AT[20]] += window[_INSIDE, k]
-
-
-@kernel_part
-def _sum_along(down: Float, half: int, own: int, weight: Float, column: Float, sums: Float) -> None:
-    """Fill in what is asked for from sums down the columns; `column` is room for those of a row."""
-    last = -1
-    for n in range(len(_SUMS)):
-        if _FROM[n] != last:
-            last = _FROM[n]
-            product, t = np.uintp(_DOWN_SUMS[last, 0]), _DOWN_SUMS[last, 1]
-            above, at, below = SIDES[t, 0], SIDES[t, 1], SIDES[t, 2]
-            m = product * WIDE
-            for i in range(2 * own + 1):
-                k = m + np.uintp(i)
-                column[i] = above * down[k] + at * down[k + _PART] + below * down[k + _PART + _PART]
-        w, total = _SUMS[n, 2], 0.0
-        for i in range(2 * own + 1):
-            total += column[i] * weight[w, np.uintp(half - own + i)]
-        sums[n] = total

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import require_finite, require_shape
 from mapfusion.tables import DESCRIPTOR_LENGTH
 
@@ -14,20 +14,10 @@ PATCH_SIDE_PX = 2 * _PATCH_HALF_PX + 1
 
 def cut_patches(image: np.ndarray, uv_px: Float) -> np.ndarray:
     """What is around the pixels nearest to points (N, 2), (N, P, P); outside the border repeats."""
-    patch = np.empty((len(uv_px), PATCH_SIDE_PX, PATCH_SIDE_PX), dtype=image.dtype)
-    _cut(image, np.rint(uv_px).astype(np.int64), patch)
-    return patch
-
-
-@kernel
-def _cut(image: np.ndarray, pixel: np.ndarray, patch: np.ndarray) -> None:
-    bottom, right = image.shape[0] - 1, image.shape[1] - 1
-    for n in range(len(pixel)):
-        left, top = pixel[n, 0] - _PATCH_HALF_PX, pixel[n, 1] - _PATCH_HALF_PX
-        for y in range(PATCH_SIDE_PX):
-            row = min(max(top + y, 0), bottom)
-            for x in range(PATCH_SIDE_PX):
-                patch[n, y, x] = image[row, min(max(left + x, 0), right)]
+    middle, around = np.rint(uv_px).astype(np.int64), np.arange(PATCH_SIDE_PX) - _PATCH_HALF_PX
+    u, v = (middle[:, axis, None] + around for axis in (0, 1))
+    rows, columns = (np.clip(at, 0, n - 1) for at, n in zip((v, u), image.shape, strict=True))
+    return image[rows[:, :, None], columns[:, None, :]]
 
 
 @dataclass(frozen=True)

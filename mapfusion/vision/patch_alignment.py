@@ -23,14 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.geometry.numerics import (
-    Float,
-    cholesky,
-    kernel,
-    kernel_part,
-    solve_lower,
-    solve_upper,
-)
+from mapfusion.geometry.numerics import Float, cholesky, kernel, solve_lower, solve_upper
 
 # A smaller window tells scale from shift less well, a larger one is less a plane.
 WINDOW_HALF_PX = 10
@@ -148,93 +141,74 @@ def _prepare(
         middle, reach = patch.shape[1] // 2, max(abs(point[n, 0]), abs(point[n, 1]))
         if reach + WINDOW_HALF_PX + 2 > middle:
             continue
-        _read_grid(patch, n, middle + point[n, 0], middle + point[n, 1], shown)
-        _fill_window(shown, window, i)
-        sum_of_squares = _normal_matrix(window, i, factor, variance, square_misfit, down)
+        # Fill in grey levels between pixels, bilinear, of a window around (u, v) and one pixel
+        # more. All have the same shares of the pixels around them, since u and v have no more
+        # digits than their sums with whole numbers.
+        u = middle + point[n, 0]
+        v = middle + point[n, 1]
+        half, side = WINDOW_HALF_PX + 1, _SIDE_PX + 2
+        leftmost, j = np.uintp(int(u) - half), np.uintp(int(v) - half)
+        a, b = u - int(u), v - int(v)
+        for y in range(side):
+            row, below = j + np.uintp(y), j + np.uintp(y + 1)
+            for x in range(side):
+                k, after = leftmost + np.uintp(x), leftmost + np.uintp(x + 1)
+                upper = (1 - a) * patch[n, row, k] + a * patch[n, row, after]
+                lower = (1 - a) * patch[n, below, k] + a * patch[n, below, after]
+                shown[np.uintp(y * side + x)] = (1 - b) * upper + b * lower
+        # Fill in window n's grey levels and their slopes from those of a grid around it.
+        wide = np.uintp(_SIDE_PX + 2)
+        one = np.uintp(1)
+        for y in range(_SIDE_PX):
+            for x in range(_SIDE_PX):
+                k, at = np.uintp(y * _SIDE_PX + x), np.uintp(y + 1) * wide + np.uintp(x + 1)
+                window[i, LEVEL, k] = shown[at]
+                window[i, SLOPE_U, k] = 0.5 * (shown[at + one] - shown[at - one])
+                window[i, SLOPE_V, k] = 0.5 * (shown[at + wide] - shown[at - wide])
+        # Fill in the lower half of the normal matrix, and find the tolerated sum of squared
+        # residuals: an error e of the place along some direction changes a grey level by g e, g its
+        # slope along it, whose square is a mean over directions. Sums are taken down the columns
+        # first, into `down`: so loops run in vectors.
+        for k in range(len(down)):
+            down[k] = 0.0
+        for row in range(_SIDE_PX):
+            y, at = float(row - WINDOW_HALF_PX), np.uintp(row * _SIDE_PX)
+            yy = y * y
+            for x in range(_SIDE_PX):
+                m, k = np.uintp(x), at + np.uintp(x)
+                u, v, level = window[i, SLOPE_U, k], window[i, SLOPE_V, k], window[i, LEVEL, k]
+                w = WEIGHT[k]
+                wu, wv, w_level = w * u, w * v, w * level
+                uu, uv, vv, u_level, v_level = wu * u, wu * v, wv * v, wu * level, wv * level
+                down[m] += uu
+                down[m + _AT[1]] += uu * y
+                down[m + _AT[2]] += uu * yy
+                down[m + _AT[3]] += uv
+                down[m + _AT[4]] += uv * y
+                down[m + _AT[5]] += uv * yy
+                down[m + _AT[6]] += vv
+                down[m + _AT[7]] += vv * y
+                down[m + _AT[8]] += vv * yy
+                down[m + _AT[9]] += wu
+                down[m + _AT[10]] += wu * y
+                down[m + _AT[11]] += wv
+                down[m + _AT[12]] += wv * y
+                down[m + _AT[13]] += u_level
+                down[m + _AT[14]] += u_level * y
+                down[m + _AT[15]] += v_level
+                down[m + _AT[16]] += v_level * y
+                down[m + _AT[17]] += w
+                down[m + _AT[18]] += w_level
+                down[m + _AT[19]] += w_level * level
+        for e in range(len(_ENTRIES)):
+            first, power, total = np.uintp(_ENTRIES[e, 2]) * np.uintp(WIDE), _ENTRIES[e, 3], 0.0
+            for x in range(_SIDE_PX):
+                total += down[first + np.uintp(x)] * _X_POWERS[power, x]
+            factor[i, _ENTRIES[e, 0], _ENTRIES[e, 1]] = total
+        square_slopes = factor[i, 0, 0] + factor[i, 1, 1]
+        sum_of_squares = variance * factor[i, 6, 6] + 0.5 * square_misfit * square_slopes
         if cholesky(factor[i], _SINGULAR):
             tolerated[i] = sum_of_squares
-
-
-@kernel_part
-def _read_grid(patch: np.ndarray, n: int, u: float, v: float, shown: Float) -> None:
-    """Fill in grey levels between pixels, bilinear: of a window around (u, v) and one pixel more.
-
-    All have the same shares of the pixels around them, since u and v have no more digits than
-    their sums with whole numbers.
-    """
-    half, side = WINDOW_HALF_PX + 1, _SIDE_PX + 2
-    i, j = np.uintp(int(u) - half), np.uintp(int(v) - half)
-    a, b = u - int(u), v - int(v)
-    for y in range(side):
-        row, below = j + np.uintp(y), j + np.uintp(y + 1)
-        for x in range(side):
-            k, after = i + np.uintp(x), i + np.uintp(x + 1)
-            upper = (1 - a) * patch[n, row, k] + a * patch[n, row, after]
-            lower = (1 - a) * patch[n, below, k] + a * patch[n, below, after]
-            shown[np.uintp(y * side + x)] = (1 - b) * upper + b * lower
-
-
-@kernel_part
-def _fill_window(shown: Float, window: Float, n: int) -> None:
-    """Fill in window n's grey levels and their slopes from those of a grid around it."""
-    wide = np.uintp(_SIDE_PX + 2)
-    one = np.uintp(1)
-    for y in range(_SIDE_PX):
-        for x in range(_SIDE_PX):
-            k, at = np.uintp(y * _SIDE_PX + x), np.uintp(y + 1) * wide + np.uintp(x + 1)
-            window[n, LEVEL, k] = shown[at]
-            window[n, SLOPE_U, k] = 0.5 * (shown[at + one] - shown[at - one])
-            window[n, SLOPE_V, k] = 0.5 * (shown[at + wide] - shown[at - wide])
-
-
-@kernel_part
-def _normal_matrix(
-    window: Float, n: int, normal: Float, variance: float, square_misfit: float, down: Float
-) -> float:
-    """Fills in the lower half of matrix n of `normal`; returns which sum of squares is tolerated.
-
-    That is weighted, of residuals: an error e of the place along some direction changes a grey
-    level by g e, g its slope along it, whose square is a mean over directions.
-    Sums are taken down the columns first, into `down`: so loops run in vectors.
-    """
-    for k in range(len(down)):
-        down[k] = 0.0
-    for row in range(_SIDE_PX):
-        y, at = float(row - WINDOW_HALF_PX), np.uintp(row * _SIDE_PX)
-        yy = y * y
-        for x in range(_SIDE_PX):
-            m, k = np.uintp(x), at + np.uintp(x)
-            u, v, level = window[n, SLOPE_U, k], window[n, SLOPE_V, k], window[n, LEVEL, k]
-            w = WEIGHT[k]
-            wu, wv, w_level = w * u, w * v, w * level
-            uu, uv, vv, u_level, v_level = wu * u, wu * v, wv * v, wu * level, wv * level
-            down[m] += uu
-            down[m + _AT[1]] += uu * y
-            down[m + _AT[2]] += uu * yy
-            down[m + _AT[3]] += uv
-            down[m + _AT[4]] += uv * y
-            down[m + _AT[5]] += uv * yy
-            down[m + _AT[6]] += vv
-            down[m + _AT[7]] += vv * y
-            down[m + _AT[8]] += vv * yy
-            down[m + _AT[9]] += wu
-            down[m + _AT[10]] += wu * y
-            down[m + _AT[11]] += wv
-            down[m + _AT[12]] += wv * y
-            down[m + _AT[13]] += u_level
-            down[m + _AT[14]] += u_level * y
-            down[m + _AT[15]] += v_level
-            down[m + _AT[16]] += v_level * y
-            down[m + _AT[17]] += w
-            down[m + _AT[18]] += w_level
-            down[m + _AT[19]] += w_level * level
-    for e in range(len(_ENTRIES)):
-        first, power, total = np.uintp(_ENTRIES[e, 2]) * np.uintp(WIDE), _ENTRIES[e, 3], 0.0
-        for x in range(_SIDE_PX):
-            total += down[first + np.uintp(x)] * _X_POWERS[power, x]
-        normal[n, _ENTRIES[e, 0], _ENTRIES[e, 1]] = total
-    square_slopes = normal[n, 0, 0] + normal[n, 1, 1]
-    return variance * normal[n, 6, 6] + 0.5 * square_misfit * square_slopes
 
 
 _MAX_STEPS = 15
@@ -295,7 +269,7 @@ def _fit_all(
             found[n] = 0 <= square <= tolerated[i]
 
 
-@kernel_part
+@kernel
 def _settle(
     window: Float,
     i: int,
@@ -318,20 +292,70 @@ def _settle(
         if not _stays_inside(after.shape[1] // 2, warp, bend, n):
             return -1.0
         _find_places(after.shape[1], warp, bend, n, cell, share)
-        _look_up(after, n, cell)
-        _compare(window, i, cell, share, residual)
-        square = _moments(window, i, residual, down, step)
+        # Replace pixels by the grey levels there, to the right and below, the bytes of one
+        # number.
+        side = np.uintp(after.shape[2])
+        patch = after[n].ravel()
+        for k in range(len(cell)):
+            at = np.uintp(cell[k])
+            upper = np.uint32(patch[at]) | np.uint32(patch[at + _ONE]) << _BYTE
+            lower = np.uint32(patch[at + side]) | np.uint32(patch[at + side + _ONE]) << _BYTE
+            cell[k] = upper | lower << _HALF
+        # Fill in after - before; between pixels grey levels are bilinear.
+        for k in range(len(cell)):
+            a, b, levels = share[0, k], share[1, k], cell[k]
+            p, q = float(levels & _LOW), float((levels >> _BYTE) & _LOW)
+            r, s = float((levels >> _HALF) & _LOW), float(levels >> (_HALF + _BYTE))
+            upper, lower = (1 - a) * p + a * q, (1 - a) * r + a * s
+            residual[k] = (1 - b) * upper + b * lower - window[i, LEVEL, k]
+        # Sum weighted squared residuals, and J^T W r into `step`.
+        # Sums are taken down the columns first, into `down`: so loops run in vectors.
+        for k in range(len(down)):
+            down[k] = 0.0
+        for row in range(_SIDE_PX):
+            y, at = float(row - WINDOW_HALF_PX), np.uintp(row * _SIDE_PX)
+            for x in range(_SIDE_PX):
+                m, k = np.uintp(x), at + np.uintp(x)
+                gu, gv, off = window[i, SLOPE_U, k], window[i, SLOPE_V, k], residual[k]
+                weighted = WEIGHT[k] * off
+                along_u, along_v = weighted * gu, weighted * gv
+                down[m] += weighted * off
+                down[m + _PIXEL_AT[1]] += along_u
+                down[m + _PIXEL_AT[2]] += along_v
+                down[m + _PIXEL_AT[3]] += along_u * y
+                down[m + _PIXEL_AT[4]] += along_v * y
+                down[m + _PIXEL_AT[5]] += weighted
+                down[m + _PIXEL_AT[6]] += weighted * window[i, LEVEL, k]
+        square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
+        for k in range(_SIDE_PX):
+            m, x = np.uintp(k), float(k - WINDOW_HALF_PX)
+            along_u, along_v = down[m + _PIXEL_AT[1]], down[m + _PIXEL_AT[2]]
+            square, m0, m1 = square + down[m], m0 + along_u, m1 + along_v
+            m2, m3 = m2 + along_u * x, m3 + down[m + _PIXEL_AT[3]]
+            m4, m5 = m4 + along_v * x, m5 + down[m + _PIXEL_AT[4]]
+            m6, m7 = m6 + down[m + _PIXEL_AT[5]], m7 + down[m + _PIXEL_AT[6]]
+        step[0], step[1], step[2], step[3] = m0, m1, m2, m3
+        step[4], step[5], step[6], step[7] = m4, m5, m6, m7
         solve_lower(factor, step)
         for k in range(N_PARAMETERS):
             square -= step[k] ** 2  # what the step explains: all of gain and offset
         solve_upper(factor, step)
-        _compose(warp[n], step)
+        # Warp after the inverse of the step's own, which moved the earlier picture.
+        # To first order in h: steps go to zero, and with them what that leaves out.
+        own = warp[n]
+        a, b, c, d = 1 + step[2], step[3], step[4], 1 + step[5]
+        determinant = a * d - b * c
+        for r in range(2):
+            first, second = own[r, 0], own[r, 1]
+            own[r, 0] = (first * d - second * c) / determinant
+            own[r, 1] = (second * a - first * b) / determinant
+            own[r, 2] -= own[r, 0] * step[0] + own[r, 1] * step[1]
         if abs(step[0]) < _CONVERGED_PX and abs(step[1]) < _CONVERGED_PX:
             return max(square, 0.0)
     return -1.0
 
 
-@kernel_part
+@kernel
 def _stays_inside(middle: int, warp: Float, bend: Float, n: int) -> bool:
     """Whether all of a window lies on a patch."""
     least = 1.0 - (abs(bend[n, 0]) + abs(bend[n, 1])) * WINDOW_HALF_PX
@@ -363,76 +387,3 @@ def _find_places(
             cell[first + np.uintp(k)] = row * np.int32(side) + column
             share[0, first + np.uintp(k)] = at_u - float(column)
             share[1, first + np.uintp(k)] = at_v - float(row)
-
-
-@kernel_part
-def _look_up(after: np.ndarray, n: int, cell: np.ndarray) -> None:
-    """Replace pixels by the grey levels there, to the right and below, the bytes of one number."""
-    side = np.uintp(after.shape[2])
-    patch = after[n].ravel()
-    for k in range(len(cell)):
-        at = np.uintp(cell[k])
-        upper = np.uint32(patch[at]) | np.uint32(patch[at + _ONE]) << _BYTE
-        lower = np.uint32(patch[at + side]) | np.uint32(patch[at + side + _ONE]) << _BYTE
-        cell[k] = upper | lower << _HALF
-
-
-@kernel_part
-def _compare(window: Float, i: int, cell: np.ndarray, share: Float, residual: Float) -> None:
-    """Fill in after - before; between pixels grey levels are bilinear."""
-    for k in range(len(cell)):
-        a, b, levels = share[0, k], share[1, k], cell[k]
-        p, q = float(levels & _LOW), float((levels >> _BYTE) & _LOW)
-        r, s = float((levels >> _HALF) & _LOW), float(levels >> (_HALF + _BYTE))
-        upper, lower = (1 - a) * p + a * q, (1 - a) * r + a * s
-        residual[k] = (1 - b) * upper + b * lower - window[i, LEVEL, k]
-
-
-@kernel_part
-def _moments(window: Float, i: int, residual: Float, down: Float, moment: Float) -> float:
-    """Weighted sum of squared residuals; `moment` gets J^T W r.
-
-    Sums are taken down the columns first, into `down`: so loops run in vectors.
-    """
-    for k in range(len(down)):
-        down[k] = 0.0
-    for row in range(_SIDE_PX):
-        y, at = float(row - WINDOW_HALF_PX), np.uintp(row * _SIDE_PX)
-        for x in range(_SIDE_PX):
-            m, k = np.uintp(x), at + np.uintp(x)
-            gu, gv, off = window[i, SLOPE_U, k], window[i, SLOPE_V, k], residual[k]
-            weighted = WEIGHT[k] * off
-            along_u, along_v = weighted * gu, weighted * gv
-            down[m] += weighted * off
-            down[m + _PIXEL_AT[1]] += along_u
-            down[m + _PIXEL_AT[2]] += along_v
-            down[m + _PIXEL_AT[3]] += along_u * y
-            down[m + _PIXEL_AT[4]] += along_v * y
-            down[m + _PIXEL_AT[5]] += weighted
-            down[m + _PIXEL_AT[6]] += weighted * window[i, LEVEL, k]
-    square = m0 = m1 = m2 = m3 = m4 = m5 = m6 = m7 = 0.0
-    for k in range(_SIDE_PX):
-        m, x = np.uintp(k), float(k - WINDOW_HALF_PX)
-        along_u, along_v = down[m + _PIXEL_AT[1]], down[m + _PIXEL_AT[2]]
-        square, m0, m1 = square + down[m], m0 + along_u, m1 + along_v
-        m2, m3 = m2 + along_u * x, m3 + down[m + _PIXEL_AT[3]]
-        m4, m5 = m4 + along_v * x, m5 + down[m + _PIXEL_AT[4]]
-        m6, m7 = m6 + down[m + _PIXEL_AT[5]], m7 + down[m + _PIXEL_AT[6]]
-    moment[0], moment[1], moment[2], moment[3] = m0, m1, m2, m3
-    moment[4], moment[5], moment[6], moment[7] = m4, m5, m6, m7
-    return square
-
-
-@kernel_part
-def _compose(warp: Float, step: Float) -> None:
-    """Warp after the inverse of the step's own, which moved the earlier picture.
-
-    To first order in h: steps go to zero, and with them what that leaves out.
-    """
-    a, b, c, d = 1 + step[2], step[3], step[4], 1 + step[5]
-    determinant = a * d - b * c
-    for r in range(2):
-        first, second = warp[r, 0], warp[r, 1]
-        warp[r, 0] = (first * d - second * c) / determinant
-        warp[r, 1] = (second * a - first * b) / determinant
-        warp[r, 2] -= warp[r, 0] * step[0] + warp[r, 1] * step[1]

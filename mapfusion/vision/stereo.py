@@ -22,7 +22,7 @@ from typing import Annotated
 import numpy as np
 
 from mapfusion.geometry.camera import StereoCamera
-from mapfusion.geometry.numerics import Float, chi_square_bound, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, chi_square_bound, kernel
 from mapfusion.parameters import (
     Range,
     require_at_least,
@@ -166,7 +166,7 @@ def _search_row(
     return first + best, Verdict.MATCHED
 
 
-@kernel_part
+@kernel
 def _correlate(
     image: np.ndarray,
     other: np.ndarray,
@@ -186,10 +186,21 @@ def _correlate(
     side = 2 * half + 1
     area, candidates = side * side, last - first + 1
     padded = -(-candidates // _AT_ONCE) * _AT_ONCE
-    _clear(room, padded + 2 * half)
+    count = padded + 2 * half
+    for i in range(len(room)):
+        for k in range(count):
+            room[i, k] = 0
     total, total_square = np.int64(0), np.int64(0)
     for y in range(v - half, v + half + 1):
-        _take_strip(other, y, first - half, candidates + 2 * half, strip, room)
+        # Copy part of a row, and add it to the columns' sums and sums of squares.
+        begin = first - half
+        wide = candidates + 2 * half
+        at = np.uintp(begin)
+        for k in range(wide):
+            grey = other[y, at + np.uintp(k)]
+            strip[k] = grey
+            room[_SUM, k] += np.int32(grey)
+            room[_SQUARE, k] += np.int32(grey) * np.int32(grey)
         _add_products(image, y, u - half, half, strip, padded, room)
         row_total, row_square = _add_up(image, y, u - half, side)
         total += row_total
@@ -214,7 +225,7 @@ def _correlate(
     return True
 
 
-@kernel_part
+@kernel
 def _add_up(image: np.ndarray, y: int, begin: int, count: int) -> tuple[np.int32, np.int32]:
     """Sum and sum of squares of part of a row."""
     total, total_square, at = np.int32(0), np.int32(0), np.uintp(begin)
@@ -225,27 +236,7 @@ def _add_up(image: np.ndarray, y: int, begin: int, count: int) -> tuple[np.int32
     return total, total_square
 
 
-@kernel_part
-def _clear(room: np.ndarray, count: int) -> None:
-    for i in range(len(room)):
-        for k in range(count):
-            room[i, k] = 0
-
-
-@kernel_part
-def _take_strip(
-    other: np.ndarray, y: int, begin: int, count: int, strip: np.ndarray, room: np.ndarray
-) -> None:
-    """Copy part of a row, and add it to the columns' sums and sums of squares."""
-    at = np.uintp(begin)
-    for k in range(count):
-        grey = other[y, at + np.uintp(k)]
-        strip[k] = grey
-        room[_SUM, k] += np.int32(grey)
-        room[_SQUARE, k] += np.int32(grey) * np.int32(grey)
-
-
-@kernel_part
+@kernel
 def _add_products(
     image: np.ndarray,
     y: int,

@@ -16,7 +16,6 @@ from mapfusion.geometry.numerics import (
     cholesky,
     copy_lower,
     kernel,
-    kernel_part,
     solve_lower,
     solve_upper,
 )
@@ -60,7 +59,7 @@ def fill_left(left: np.ndarray, u: int, v: int, half: int, window: Float) -> Non
             window[LEVEL, m], window[SLOPE, m] = left[row, k + _ONE], 0.5 * slope
 
 
-@kernel_part
+@kernel
 def fill_down(left: np.ndarray, u: int, v: int, half: int, window: Float) -> None:
     """Fill in the slopes along v; at the border that to the row inside."""
     side = 2 * half + 1
@@ -100,24 +99,10 @@ def fill_residuals(
         room: (ROOM, S * S) uint32, on the way.
         share: (S * S,) likewise.
     """
-    _find_columns(right, u, v, half, plane[n, 0], plane[n, 1], plane[n, 2], room, share)
-    _look_up(right, u, v, half, room)
-    _compare(window, room, share)
-
-
-@kernel_part
-def _find_columns(
-    right: np.ndarray,
-    u: int,
-    v: int,
-    half: int,
-    d: float,
-    a: float,
-    b: float,
-    room: np.ndarray,
-    share: Float,
-) -> None:
-    """Where pixels are read; at the border what is beside the picture is left out by others."""
+    # Where pixels are read; at the border what is beside the picture is left out by others.
+    d = plane[n, 0]
+    a = plane[n, 1]
+    b = plane[n, 2]
     highest, side = np.int32(right.shape[1] - 4), 2 * half + 1
     for y in range(-half, half + 1):
         start, at = u - d - b * y, np.uintp((y + half) * side)
@@ -127,10 +112,6 @@ def _find_columns(
             column = min(max(np.int32(place) - np.int32(1), np.int32(0)), highest)
             room[_COLUMN, at + np.uintp(i)] = column
             share[at + np.uintp(i)] = place - float(column + np.int32(1))
-
-
-@kernel_part
-def _look_up(right: np.ndarray, u: int, v: int, half: int, room: np.ndarray) -> None:
     side = 2 * half + 1
     for y in range(-half, half + 1):
         row, at = np.uintp(min(max(v + y, 0), len(right) - 1)), np.uintp((y + half) * side)
@@ -142,10 +123,6 @@ def _look_up(right: np.ndarray, u: int, v: int, half: int, room: np.ndarray) -> 
             levels |= np.uint32(right[row, k + _ONE + _ONE]) << (_BYTE + _BYTE)
             levels |= np.uint32(right[row, k + _ONE + _ONE + _ONE]) << (_BYTE + _BYTE + _BYTE)
             room[_LEVELS, m] = levels
-
-
-@kernel_part
-def _compare(window: Float, room: np.ndarray, share: Float) -> None:
     for i in range(len(share)):
         levels, t = room[_LEVELS, i], share[i]
         a, b = float(levels & _LOW), float((levels >> _BYTE) & _LOW)
@@ -249,7 +226,7 @@ def _fit_all(
         )
 
 
-@kernel_part
+@kernel
 def _fit_plane(
     left: np.ndarray,
     right: np.ndarray,
@@ -275,13 +252,37 @@ def _fit_plane(
     """
     seen, factor, step = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
     fill_left(left, u, v, half, window)
-    _normal_matrix(window, half, seen)
+    # Add up the lower half of J^T J, of the offset in brightness, d, a and b.
+    # Slopes are multiples of a half, so that in whatever order the sums are exact.
+    for y in range(-half, half + 1):
+        g0 = g1 = s0 = s1 = s2 = 0.0
+        middle = (y + half) * (2 * half + 1) + half
+        for x in range(-half, half + 1):
+            g = window[SLOPE, middle + x]
+            gx = g * x
+            g0, g1 = g0 + g, g1 + gx
+            s0, s1, s2 = s0 + g * g, s1 + g * gx, s2 + gx * gx
+        seen[0, 0] += 2 * half + 1
+        seen[1, 0] += g0
+        seen[2, 0] += g1
+        seen[3, 0] += g0 * y
+        seen[1, 1] += s0
+        seen[2, 1] += s1
+        seen[2, 2] += s2
+        seen[3, 1] += s0 * y
+        seen[3, 2] += s1 * y
+        seen[3, 3] += s0 * y * y
     variance_grey = _settle(
         right, u, v, half, seen, slope_sigma, noise, window, room, share, plane, n
     )
     if math.isnan(variance_grey):
         return np.nan
-    _without_noise(seen, half, noise, factor)
+    # J^T J (4, 4), its lower half, less what the noise of slopes has added to their squares.
+    copy_lower(seen, factor)
+    added = noise**2 / 2 * (2 * half + 1) ** 2
+    for i in range(1, 4):
+        factor[i, i] -= min(added, (1 - _LEAST_TEXTURE) * seen[i, i])
+        added = noise**2 / 2 * (2 * half + 1) ** 2 * half * (half + 1) / 3  # mean of x^2
     for i in range(1, 4):  # the moments' covariance
         seen[i, i] = (seen[i, i] + factor[i, i]) / 2
     prior = variance_grey / slope_sigma**2
@@ -298,7 +299,7 @@ def _fit_plane(
     return _counted(variance_grey, noise, alike_px) * _square(seen, prior, step)
 
 
-@kernel_part
+@kernel
 def _settle(
     right: np.ndarray,
     u: int,
@@ -326,7 +327,29 @@ def _settle(
             _give_up(plane, n)
             return np.nan
         fill_residuals(right, u, v, half, plane, n, window, room, share)
-        square = _moments(window, half, down, step)
+        # Sum of the squared residuals; `moment` gets J^T r.
+        # Sums are taken down the columns first, into `down`: so loops run in vectors.
+        side = 2 * half + 1
+        for i in range(side):
+            m = np.uintp(i)
+            down[m] = down[m + _AT[1]] = down[m + _AT[2]] = down[m + _AT[3]] = 0.0
+        for row in range(side):
+            y, at = float(row - half), np.uintp(row * side)
+            for i in range(side):
+                m, k = np.uintp(i), at + np.uintp(i)
+                r = window[RESIDUAL, k]
+                along = window[SLOPE, k] * r
+                down[m] += r * r
+                down[m + _AT[1]] += r
+                down[m + _AT[2]] += along
+                down[m + _AT[3]] += along * y
+        square = m0 = m1 = m2 = m3 = 0.0
+        for i in range(side):
+            m = np.uintp(i)
+            along = down[m + _AT[2]]
+            square, m0, m1 = square + down[m], m0 + down[m + _AT[1]], m1 + along
+            m2, m3 = m2 + along * (i - half), m3 + down[m + _AT[3]]
+        step[0], step[1], step[2], step[3] = m0, m1, m2, m3
         prior = variance_grey / slope_sigma**2
         copy_lower(seen, factor)
         factor[2, 2] += prior
@@ -352,7 +375,7 @@ def _give_up(plane: np.ndarray, n: int) -> None:
         plane[n, i] = np.nan
 
 
-@kernel_part
+@kernel
 def _square(moments: np.ndarray, prior: float, weight: np.ndarray) -> float:
     """Of an estimate w' J^T r: w' (M + prior) w, in variances of the grey levels.
 
@@ -367,42 +390,6 @@ def _square(moments: np.ndarray, prior: float, weight: np.ndarray) -> float:
         for j in range(i):
             square += 2 * weight[i] * weight[j] * moments[i, j]
     return square
-
-
-@kernel_part
-def _without_noise(seen: np.ndarray, half: int, noise: float, normal: np.ndarray) -> None:
-    """J^T J (4, 4), its lower half, less what the noise of slopes has added to their squares."""
-    copy_lower(seen, normal)
-    added = noise**2 / 2 * (2 * half + 1) ** 2
-    for i in range(1, 4):
-        normal[i, i] -= min(added, (1 - _LEAST_TEXTURE) * seen[i, i])
-        added = noise**2 / 2 * (2 * half + 1) ** 2 * half * (half + 1) / 3  # mean of x^2
-
-
-@kernel_part
-def _normal_matrix(window: Float, half: int, normal: np.ndarray) -> None:
-    """Add up the lower half of J^T J, of the offset in brightness, d, a and b.
-
-    Slopes are multiples of a half, so that in whatever order the sums are exact.
-    """
-    for y in range(-half, half + 1):
-        g0 = g1 = s0 = s1 = s2 = 0.0
-        middle = (y + half) * (2 * half + 1) + half
-        for x in range(-half, half + 1):
-            g = window[SLOPE, middle + x]
-            gx = g * x
-            g0, g1 = g0 + g, g1 + gx
-            s0, s1, s2 = s0 + g * g, s1 + g * gx, s2 + gx * gx
-        normal[0, 0] += 2 * half + 1
-        normal[1, 0] += g0
-        normal[2, 0] += g1
-        normal[3, 0] += g0 * y
-        normal[1, 1] += s0
-        normal[2, 1] += s1
-        normal[2, 2] += s2
-        normal[3, 1] += s0 * y
-        normal[3, 2] += s1 * y
-        normal[3, 3] += s0 * y * y
 
 
 @kernel
@@ -426,38 +413,8 @@ def _add_rows(
         variance[n] += (row_sigma * change) ** 2
 
 
-@kernel_part
+@kernel
 def _counted(variance_grey: float, noise: float, alike_px: float) -> float:
     """Variance of residuals as if all were independent: noise is, what exceeds it is not."""
     independent = min(variance_grey, 2 * noise**2)
     return independent + alike_px**2 * (variance_grey - independent)
-
-
-@kernel_part
-def _moments(window: Float, half: int, down: Float, moment: np.ndarray) -> float:
-    """Sum of the squared residuals; `moment` gets J^T r.
-
-    Sums are taken down the columns first, into `down`: so loops run in vectors.
-    """
-    side = 2 * half + 1
-    for i in range(side):
-        m = np.uintp(i)
-        down[m] = down[m + _AT[1]] = down[m + _AT[2]] = down[m + _AT[3]] = 0.0
-    for row in range(side):
-        y, at = float(row - half), np.uintp(row * side)
-        for i in range(side):
-            m, k = np.uintp(i), at + np.uintp(i)
-            r = window[RESIDUAL, k]
-            along = window[SLOPE, k] * r
-            down[m] += r * r
-            down[m + _AT[1]] += r
-            down[m + _AT[2]] += along
-            down[m + _AT[3]] += along * y
-    square = m0 = m1 = m2 = m3 = 0.0
-    for i in range(side):
-        m = np.uintp(i)
-        along = down[m + _AT[2]]
-        square, m0, m1 = square + down[m], m0 + down[m + _AT[1]], m1 + along
-        m2, m3 = m2 + along * (i - half), m3 + down[m + _AT[3]]
-    moment[0], moment[1], moment[2], moment[3] = m0, m1, m2, m3
-    return square

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 import cv2
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.parameters import (
     Range,
     require_at_least,
@@ -121,10 +121,47 @@ def _describe(
     fraction = np.empty(NODES)
     sums = np.empty((4, SAMPLES))
     for n in range(len(uv)):
-        _read_nodes(integral, uv[n, 0], uv[n, 1], scale[n], column, fraction, node)
+        # Fill `node` (22, 22) with the integral image at the wavelets' corners.
+        u = uv[n, 0]
+        v = uv[n, 1]
+        own_scale = scale[n]
+        height, width = integral.shape[0] - 1, integral.shape[1] - 1
+        middle = (NODES - 1) / 2
+        for j in range(NODES):
+            # the integral image counts from the pixel's corner
+            x = u + 0.5 + (j - middle) * own_scale
+            column[j] = min(max(int(np.floor(x)), 0), width - 1)
+            fraction[j] = x - column[j]
+        for i in range(NODES):
+            y = v + 0.5 + (i - middle) * own_scale
+            row = min(max(int(np.floor(y)), 0), height - 1)
+            below = y - row
+            for j in range(NODES):
+                x = column[j]
+                top_left, top_right = integral[row, x], integral[row, x + 1]
+                low_left, low_right = integral[row + 1, x], integral[row + 1, x + 1]
+                top = top_left + fraction[j] * (top_right - top_left)
+                low = low_left + fraction[j] * (low_right - low_left)
+                node[i, j] = top + below * (low - top)
         norm_squared = 0.0
         for cell_row in range(CELLS):
-            _sum_cell_row(node, weights, cell_row * SAMPLES_PER_CELL, sums)
+            # Column sums (4, 20) of weighted dx, dy, |dx|, |dy| over the five rows of one row of
+            # cells.
+            first_row = cell_row * SAMPLES_PER_CELL
+            sums[:] = 0.0
+            for i in range(first_row, first_row + SAMPLES_PER_CELL):
+                for j in range(SAMPLES):
+                    left = node[i + 2, j] - node[i, j]
+                    centre = node[i + 2, j + 1] - node[i, j + 1]
+                    right = node[i + 2, j + 2] - node[i, j + 2]
+                    bend_left = node[i, j] - 2.0 * node[i + 1, j] + node[i + 2, j]
+                    bend_right = node[i, j + 2] - 2.0 * node[i + 1, j + 2] + node[i + 2, j + 2]
+                    dx = weights[i, j] * (left - 2.0 * centre + right)
+                    dy = weights[i, j] * (bend_right - bend_left)
+                    sums[0, j] += dx
+                    sums[1, j] += dy
+                    sums[2, j] += abs(dx)
+                    sums[3, j] += abs(dy)
             for cell_column in range(CELLS):
                 first = cell_column * SAMPLES_PER_CELL
                 for k in range(4):
@@ -138,52 +175,3 @@ def _describe(
         factor = 0.0 if flat else 1.0 / np.sqrt(norm_squared)
         for k in range(LENGTH):
             out[n, k] *= factor
-
-
-@kernel_part
-def _read_nodes(
-    integral: np.ndarray,
-    u: float,
-    v: float,
-    scale: float,
-    column: np.ndarray,
-    fraction: np.ndarray,
-    node: np.ndarray,
-) -> None:
-    """Fill `node` (22, 22) with the integral image at the wavelets' corners."""
-    height, width = integral.shape[0] - 1, integral.shape[1] - 1
-    middle = (NODES - 1) / 2
-    for j in range(NODES):
-        x = u + 0.5 + (j - middle) * scale  # the integral image counts from the pixel's corner
-        column[j] = min(max(int(np.floor(x)), 0), width - 1)
-        fraction[j] = x - column[j]
-    for i in range(NODES):
-        y = v + 0.5 + (i - middle) * scale
-        row = min(max(int(np.floor(y)), 0), height - 1)
-        below = y - row
-        for j in range(NODES):
-            x = column[j]
-            top_left, top_right = integral[row, x], integral[row, x + 1]
-            low_left, low_right = integral[row + 1, x], integral[row + 1, x + 1]
-            top = top_left + fraction[j] * (top_right - top_left)
-            low = low_left + fraction[j] * (low_right - low_left)
-            node[i, j] = top + below * (low - top)
-
-
-@kernel_part
-def _sum_cell_row(node: np.ndarray, weights: np.ndarray, first: int, sums: np.ndarray) -> None:
-    """Column sums (4, 20) of weighted dx, dy, |dx|, |dy| over the five rows of one row of cells."""
-    sums[:] = 0.0
-    for i in range(first, first + SAMPLES_PER_CELL):
-        for j in range(SAMPLES):
-            left = node[i + 2, j] - node[i, j]
-            centre = node[i + 2, j + 1] - node[i, j + 1]
-            right = node[i + 2, j + 2] - node[i, j + 2]
-            bend_left = node[i, j] - 2.0 * node[i + 1, j] + node[i + 2, j]
-            bend_right = node[i, j + 2] - 2.0 * node[i + 1, j + 2] + node[i + 2, j + 2]
-            dx = weights[i, j] * (left - 2.0 * centre + right)
-            dy = weights[i, j] * (bend_right - bend_left)
-            sums[0, j] += dx
-            sums[1, j] += dy
-            sums[2, j] += abs(dx)
-            sums[3, j] += abs(dy)

@@ -22,7 +22,6 @@ from mapfusion.geometry.numerics import (
     cofactors,
     copy_lower,
     kernel,
-    kernel_part,
     solve_lower,
     solve_upper,
 )
@@ -144,9 +143,62 @@ def _narrow(
         for i in range(len(_TOLERANCES_M)):
             variance = _TOLERANCES_M[i] ** 2
             for _ in range(_STEPS):
-                _differences(T[b], p_before, p_after, lever, residual)
+                # Before minus after (N, 3) under a motion, and the turned points (N, 3), which
+                # are levers.
+                own_T = T[b]
+                for j in range(len(residual)):
+                    x, y, z = p_after[j, 0], p_after[j, 1], p_after[j, 2]
+                    for k in range(3):
+                        lever[j, k] = own_T[k, 0] * x + own_T[k, 1] * y + own_T[k, 2] * z
+                        residual[j, k] = p_before[j, k] - lever[j, k] - own_T[k, 3]
                 _information(T[b], variance, S_before, S_after, information)
-                _normal_equations(lever, residual, information, agree[b], normal[b], step)
+                # Sums of J^T I J (6, 6) and J^T I r (6,) over the links in use, J = (1,
+                # -[lever]x).
+                used = agree[b]
+                own_normal = normal[b]
+                own_normal[:], step[:] = 0.0, 0.0
+                for j in range(len(used)):
+                    if not used[j]:
+                        continue
+                    xx, xy, xz = information[j, 0], information[j, 1], information[j, 2]
+                    yy, yz, zz = information[j, 3], information[j, 4], information[j, 5]
+                    x, y, z = lever[j, 0], lever[j, 1], lever[j, 2]
+                    # I J of the turn, column by column: about x, y and z
+                    u0, u1, u2 = xz * y - xy * z, yz * y - yy * z, zz * y - yz * z
+                    v0, v1, v2 = xx * z - xz * x, xy * z - yz * x, xz * z - zz * x
+                    w0, w1, w2 = xy * x - xx * y, yy * x - xy * y, yz * x - xz * y
+                    own_normal[0, 0] += xx
+                    own_normal[1, 0] += xy
+                    own_normal[1, 1] += yy
+                    own_normal[2, 0] += xz
+                    own_normal[2, 1] += yz
+                    own_normal[2, 2] += zz
+                    own_normal[3, 0] += u0
+                    own_normal[3, 1] += u1
+                    own_normal[3, 2] += u2
+                    own_normal[4, 0] += v0
+                    own_normal[4, 1] += v1
+                    own_normal[4, 2] += v2
+                    own_normal[5, 0] += w0
+                    own_normal[5, 1] += w1
+                    own_normal[5, 2] += w2
+                    own_normal[3, 3] += u2 * y - u1 * z
+                    own_normal[4, 3] += u0 * z - u2 * x
+                    own_normal[4, 4] += v0 * z - v2 * x
+                    own_normal[5, 3] += u1 * x - u0 * y
+                    own_normal[5, 4] += v1 * x - v0 * y
+                    own_normal[5, 5] += w1 * x - w0 * y
+                    rx, ry, rz = residual[j, 0], residual[j, 1], residual[j, 2]
+                    step[0] += xx * rx + xy * ry + xz * rz
+                    step[1] += xy * rx + yy * ry + yz * rz
+                    step[2] += xz * rx + yz * ry + zz * rz
+                    step[3] += u0 * rx + u1 * ry + u2 * rz
+                    step[4] += v0 * rx + v1 * ry + v2 * rz
+                    step[5] += w0 * rx + w1 * ry + w2 * rz
+                for r in range(_SIZE):
+                    for c in range(r):
+                        own_normal[c, r] = own_normal[r, c]
+                    own_normal[r, r] *= 1 + _OPEN
                 copy_lower(normal[b], factor)
                 if cholesky(factor, 0.0):
                     solve_lower(factor, step)
@@ -159,17 +211,7 @@ def _narrow(
                 agree[b, j] = square[b, j] <= gate and (i >= _ALL_AFTER or start[b, j])
 
 
-@kernel_part(error_model="numpy")
-def _differences(T: Float, p_before: Float, p_after: Float, lever: Float, residual: Float) -> None:
-    """Before minus after (N, 3) under a motion, and the turned points (N, 3), which are levers."""
-    for j in range(len(residual)):
-        x, y, z = p_after[j, 0], p_after[j, 1], p_after[j, 2]
-        for k in range(3):
-            lever[j, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z
-            residual[j, k] = p_before[j, k] - lever[j, k] - T[k, 3]
-
-
-@kernel_part(error_model="numpy")
+@kernel(error_model="numpy")
 def _information(
     T: Float, variance: float, S_before: Float, S_after: Float, information: Float
 ) -> None:
@@ -198,57 +240,7 @@ def _information(
         own[3], own[4], own[5] = scale * ayy, scale * ayz, scale * azz
 
 
-@kernel_part(error_model="numpy")
-def _normal_equations(
-    lever: Float, residual: Float, information: Float, used: np.ndarray, normal: Float, right: Float
-) -> None:
-    """Sums of J^T I J (6, 6) and J^T I r (6,) over the links in use, J = (1, -[lever]x)."""
-    normal[:], right[:] = 0.0, 0.0
-    for j in range(len(used)):
-        if not used[j]:
-            continue
-        xx, xy, xz = information[j, 0], information[j, 1], information[j, 2]
-        yy, yz, zz = information[j, 3], information[j, 4], information[j, 5]
-        x, y, z = lever[j, 0], lever[j, 1], lever[j, 2]
-        # I J of the turn, column by column: about x, y and z
-        u0, u1, u2 = xz * y - xy * z, yz * y - yy * z, zz * y - yz * z
-        v0, v1, v2 = xx * z - xz * x, xy * z - yz * x, xz * z - zz * x
-        w0, w1, w2 = xy * x - xx * y, yy * x - xy * y, yz * x - xz * y
-        normal[0, 0] += xx
-        normal[1, 0] += xy
-        normal[1, 1] += yy
-        normal[2, 0] += xz
-        normal[2, 1] += yz
-        normal[2, 2] += zz
-        normal[3, 0] += u0
-        normal[3, 1] += u1
-        normal[3, 2] += u2
-        normal[4, 0] += v0
-        normal[4, 1] += v1
-        normal[4, 2] += v2
-        normal[5, 0] += w0
-        normal[5, 1] += w1
-        normal[5, 2] += w2
-        normal[3, 3] += u2 * y - u1 * z
-        normal[4, 3] += u0 * z - u2 * x
-        normal[4, 4] += v0 * z - v2 * x
-        normal[5, 3] += u1 * x - u0 * y
-        normal[5, 4] += v1 * x - v0 * y
-        normal[5, 5] += w1 * x - w0 * y
-        rx, ry, rz = residual[j, 0], residual[j, 1], residual[j, 2]
-        right[0] += xx * rx + xy * ry + xz * rz
-        right[1] += xy * rx + yy * ry + yz * rz
-        right[2] += xz * rx + yz * ry + zz * rz
-        right[3] += u0 * rx + u1 * ry + u2 * rz
-        right[4] += v0 * rx + v1 * ry + v2 * rz
-        right[5] += w0 * rx + w1 * ry + w2 * rz
-    for r in range(_SIZE):
-        for c in range(r):
-            normal[c, r] = normal[r, c]
-        normal[r, r] *= 1 + _OPEN
-
-
-@kernel_part(error_model="numpy")
+@kernel(error_model="numpy")
 def _move(T: Float, step: Float) -> None:
     """Shift, and turn about the origin's axes by the step's rotation vector (Rodrigues)."""
     x, y, z = step[3], step[4], step[5]
@@ -267,7 +259,7 @@ def _move(T: Float, step: Float) -> None:
         T[k, 3] += step[k]
 
 
-@kernel_part(error_model="numpy")
+@kernel(error_model="numpy")
 def _square(lever: Float, residual: Float, information: Float, step: Float) -> float:
     """Squared distance of a link's points, in standard deviations, after the step."""
     xx, xy, xz = information[0], information[1], information[2]

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from sim.raycast.scene import Level
 from sim.raycast.visible_walls import Pinhole, anywhere
 
@@ -136,7 +136,9 @@ def _fill(
                     while end < last and row < open_rows[end]:
                         end += 1
                 count = end - begin
-                _start(sums, count, SUM_UNIT * int(BACKGROUND) if n == 0 else 0)
+                value = SUM_UNIT * int(BACKGROUND) if n == 0 else 0
+                for i in range(count):
+                    sums[i] = value
                 for side in range(across):
                     u = begin + (0.0 if across == 1 else side / 2 - 0.25)
                     for s in range(n if count else 0):
@@ -147,30 +149,40 @@ def _fill(
                             _add_at_the_edge(cells, corner, line, size, count, sums)
                         else:
                             wide = size[1] + 1
-                            _walk(line, lowest, leftmost, wide, count, place)
+                            # Fill in places: along x and y from the lowest cell, and in cells
+                            # from it.
+                            x, y, x_step, y_step = line
+                            first_x, first_y = x - leftmost, y - lowest
+                            from_x, step_x = (
+                                np.int32(first_x * PLACE_UNIT),
+                                np.int32(x_step * PLACE_UNIT),
+                            )
+                            from_y, step_y = (
+                                np.int32(first_y * PLACE_UNIT),
+                                np.int32(y_step * PLACE_UNIT),
+                            )
+                            stride = np.int32(wide)
+                            for i in range(count):
+                                at_x = np.int32(from_x + np.int32(step_x * np.int32(i)))
+                                at_y = np.int32(from_y + np.int32(step_y * np.int32(i)))
+                                place[0, i], place[1, i] = at_x, at_y
+                                place[2, i] = np.int32((at_y >> PLACE_BITS) * stride) + (
+                                    at_x >> PLACE_BITS
+                                )
                             _look_up(cells, corner + lowest * wide + leftmost, place, count, cell)
-                            _add_between(cell, place, count, sums)
-                _show(sums, max(n * across, 1), v, begin, count, picture)
+                            for i in range(count):
+                                sums[i] += _between(
+                                    cell[i], np.uint32(place[0, i]), np.uint32(place[1, i])
+                                )
+                # Draw means of samples, rounded, into a row's pixels from `begin` on.
+                samples = max(n * across, 1)
+                scale, at = np.float32(1 / (SUM_UNIT * samples)), np.uintp(begin)
+                for i in range(count):
+                    shown = np.int32(scale * np.float32(sums[i]) + np.float32(0.5))
+                    picture[v, at + np.uintp(i)] = np.uint8(shown)
 
 
-@kernel_part
-def _start(sums: np.ndarray, count: int, value: int) -> None:
-    for i in range(count):
-        sums[i] = value
-
-
-@kernel_part
-def _show(
-    sums: np.ndarray, samples: int, v: int, begin: int, count: int, picture: np.ndarray
-) -> None:
-    """Draw means of samples, rounded, into a row's pixels from `begin` on."""
-    scale, at = np.float32(1 / (SUM_UNIT * samples)), np.uintp(begin)
-    for i in range(count):
-        shown = np.int32(scale * np.float32(sums[i]) + np.float32(0.5))
-        picture[v, at + np.uintp(i)] = np.uint8(shown)
-
-
-@kernel_part
+@kernel
 def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
     """Where a row's pixels lie on a copy of the picture, in cells, from the one at `u` on.
 
@@ -183,7 +195,7 @@ def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
     return x, y, right_zu * z * width, up_zu * z * height
 
 
-@kernel_part
+@kernel
 def _lowest_cell(line: Line, count: int, size: Size) -> tuple[int, int]:
     """Row and column that none of a line's cells is below or to the left of.
 
@@ -205,22 +217,7 @@ def _lowest_cell(line: Line, count: int, size: Size) -> tuple[int, int]:
 # whose arrays need not be held on to: that takes longer than such a loop.
 
 
-@kernel_part
-def _walk(line: Line, lowest: int, leftmost: int, wide: int, count: int, place: np.ndarray) -> None:
-    """Fill in places: along x and y from the lowest cell, and in cells from it."""
-    x, y, x_step, y_step = line
-    first_x, first_y = x - leftmost, y - lowest
-    from_x, step_x = np.int32(first_x * PLACE_UNIT), np.int32(x_step * PLACE_UNIT)
-    from_y, step_y = np.int32(first_y * PLACE_UNIT), np.int32(y_step * PLACE_UNIT)
-    across = np.int32(wide)
-    for i in range(count):
-        at_x = np.int32(from_x + np.int32(step_x * np.int32(i)))
-        at_y = np.int32(from_y + np.int32(step_y * np.int32(i)))
-        place[0, i], place[1, i] = at_x, at_y
-        place[2, i] = np.int32((at_y >> PLACE_BITS) * across) + (at_x >> PLACE_BITS)
-
-
-@kernel_part
+@kernel
 def _look_up(
     cells: np.ndarray, lowest: int, place: np.ndarray, count: int, cell: np.ndarray
 ) -> None:
@@ -229,13 +226,7 @@ def _look_up(
         cell[i] = cells[corner + np.uint64(place[2, i])]
 
 
-@kernel_part
-def _add_between(cell: np.ndarray, place: np.ndarray, count: int, sums: np.ndarray) -> None:
-    for i in range(count):
-        sums[i] += _between(cell[i], np.uint32(place[0, i]), np.uint32(place[1, i]))
-
-
-@kernel_part
+@kernel
 def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
     """What lies between a cell's corners, the bytes of one number, in 2^-16 grey levels."""
     right, up = (x >> TO_SHARE) & LOW_SHARE, (y >> TO_SHARE) & LOW_SHARE
@@ -246,7 +237,7 @@ def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
     return np.uint32(np.uint32(lower * (WHOLE_SHARE - up)) + np.uint32(upper * up))
 
 
-@kernel_part
+@kernel
 def _add_at_the_edge(
     cells: np.ndarray, corner: int, line: Line, size: Size, count: int, sums: np.ndarray
 ) -> None:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.geometry.numerics import Float
 from sim.raycast.floor_and_ceiling import Way, fill, row_depth_m, texels, ways
 from sim.raycast.robots import Body, by_distance, cast, draw, is_hidden, place, within_view
 from sim.raycast.scene import Level, Scene, Walls
@@ -75,7 +75,7 @@ def _still_depths(of: Sight, scene: Scene) -> np.ndarray:
     camera, plan = of.camera, of.plan
     levels_m = _depths_of_levels(anywhere(camera), scene.floor.height_m, scene.ceiling.height_m)
     depth_m = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    _fill_nearer(plan.middle_m.astype(np.float32), levels_m.astype(np.float32), depth_m)
+    np.minimum(plan.middle_m.astype(np.float32), levels_m.astype(np.float32)[:, None], out=depth_m)
     beside = np.flatnonzero(plan.middle == NONE)
     if len(beside):  # only a column without walls shows where floors end
         for level, rows in _sides(camera, scene):
@@ -92,14 +92,6 @@ def _depths_of_levels(camera: Pinhole, floor_m: float, ceiling_m: float) -> Floa
     v = np.arange(camera.height_px)
     height_m = np.where(v < camera.center_v, ceiling_m, floor_m)
     return row_depth_m(camera, height_m, v)
-
-
-@kernel
-def _fill_nearer(columns_m: np.ndarray, rows_m: np.ndarray, depth_m: np.ndarray) -> None:
-    """Fill in the nearer depth (H, W) of what columns (W,) and rows (H,) show."""
-    for v in range(len(rows_m)):
-        for u in range(len(columns_m)):
-            depth_m[v, u] = min(columns_m[u], rows_m[v])
 
 
 def _sides(camera: Pinhole, scene: Scene) -> list[tuple[Level, slice]]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from sim.raycast.solids import Solids, front_to_back
 from sim.raycast.visible_walls import Pinhole, Plan, inverse_depths
 
@@ -62,7 +62,7 @@ def fill_coverage(edges: Float, covered: Float) -> None:
             covered[row, column] = min(abs(total), 1.0)
 
 
-@kernel_part
+@kernel
 def _area(left: float, right: float, border: float) -> float:
     """Between an edge from `left` to `right` and a border to the right of it, for a unit's rise."""
     inside = min(max(border - left, 0.0), right - left)
@@ -254,21 +254,12 @@ def cast(
         for i in body.shown.tolist():
             nearness = _nearness(camera, solids, i, body)
             top, bottom, left, right = body.windows[i].tolist()
-            _put_nearer(nearness, top, left, depth_m)
+            behind_m = depth_m[top : bottom + 1, left : right + 1]
+            with np.errstate(invalid="ignore"):  # no nearness before nothing
+                is_nearer = nearness * behind_m > 1
+            behind_m[is_nearer] = 1 / nearness[is_nearer]
             if picture is not None:
-                picture[top : bottom + 1, left : right + 1][nearness > 0] = grey[i]
-
-
-@kernel
-def _put_nearer(nearness: Float, top: int, left: int, depth_m: np.ndarray) -> None:
-    """Put a window's inverse depths into a picture's where they are nearer; others become 0."""
-    height, width = nearness.shape
-    for i in range(height):
-        for j in range(width):
-            if nearness[i, j] * depth_m[top + i, left + j] > 1:
-                depth_m[top + i, left + j] = 1 / nearness[i, j]
-            else:
-                nearness[i, j] = 0.0
+                picture[top : bottom + 1, left : right + 1][is_nearer] = grey[i]
 
 
 def _nearness(camera: Pinhole, solids: Solids, i: int, body: Body) -> Float:
@@ -331,27 +322,13 @@ def draw(
             else:
                 covered = np.zeros((bottom + 1 - top, right + 1 - left))
                 fill_coverage(body.outline(i), covered)
-            is_open = open_share[i, left - first : right + 1 - first]
-            _paint(covered, is_open, grey[i], top - above, left - first, under, rest, seen)
+            columns = slice(left - first, right + 1 - first)
+            window = slice(top - above, bottom + 1 - above), columns
+            # what is nearer hides the others where it is, and nowhere else in a pixel
+            share = np.minimum(covered * open_share[i, columns], rest[window])
+            rest[window] -= share
+            seen[window] += share * (grey[i] - under[window])
     picture[above:below, first:last] = (seen + 0.5).astype(np.uint8)
-
-
-@kernel
-def _paint(
-    covered: Float, open_share: Float, grey: float, top: int, left: int, under: np.ndarray,
-    rest: np.ndarray, seen: np.ndarray,
-) -> None:  # fmt: skip
-    """Draw a solid by the shares of its window's pixels (H, W) and columns (W,), see `draw`.
-
-    What is nearer hides the others where it is, and nowhere else in a pixel.
-    """
-    height, width = covered.shape
-    for i in range(height):
-        for j in range(width):
-            v, u = top + i, left + j
-            share = min(covered[i, j] * open_share[j], rest[v, u])
-            rest[v, u] -= share
-            seen[v, u] += share * (grey - under[v, u])
 
 
 def _open_shares(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from sim.raycast.scene import Walls
 
 NONE = -1  # no wall
@@ -83,19 +83,9 @@ class Plan(NamedTuple):
 @kernel
 def look(camera: Pinhole, walls: Walls) -> Plan:
     """What a camera sees of the walls."""
-    seen = _project(camera, walls)
-    face, low, high, first, middle, middle_m = _strips(seen, camera.width_px)
-    above, below = _open_rows(camera, walls.height_m, seen, face, low, high, first)
-    return Plan(seen, face, low, high, first, middle, middle_m, above, below)
-
-
-@kernel_part
-def _project(camera: Pinhole, walls: Walls) -> Float:
-    """Faces (F, 7) in the picture: from u, to u, w0, w1, t0, t1, t2: w = w0 + w1 u.
-
-    t is the place along the face in metres: t = (t0 + t1 u) / w - t2. A face that is not seen,
-    being behind or turned away, is from infinity to minus infinity.
-    """
+    # Project faces (F, 7) into the picture: from u, to u, w0, w1, t0, t1, t2: w = w0 + w1 u.
+    # t is the place along the face in metres: t = (t0 + t1 u) / w - t2. A face that is not seen,
+    # being behind or turned away, is from infinity to minus infinity.
     cos, sin = np.cos(camera.theta), np.sin(camera.theta)
     f, c = camera.focal_px, camera.center_u
     seen = np.empty((len(walls.width_m), 7))
@@ -120,10 +110,12 @@ def _project(camera: Pinhole, walls: Walls) -> Float:
                 seen[i, k] = c - f * y / z
             else:  # cut where w is that of the near plane
                 seen[i, k] = (1 / camera.near_m - w_0) / w_u
-    return seen
+    face, low, high, first, middle, middle_m = _strips(seen, camera.width_px)
+    above, below = _open_rows(camera, walls.height_m, seen, face, low, high, first)
+    return Plan(seen, face, low, high, first, middle, middle_m, above, below)
 
 
-@kernel_part
+@kernel
 def _strips(
     seen: Float, width_px: int
 ) -> tuple[np.ndarray, Float, Float, np.ndarray, np.ndarray, Float]:
@@ -171,7 +163,7 @@ def _strips(
     return face[:n], low[:n], high[:n], first, middle, middle_m
 
 
-@kernel_part
+@kernel
 def _open_rows(
     camera: Pinhole,
     height_m: float,

@@ -10,7 +10,7 @@ its arrays by themselves: to hold on to them while it calls others would take as
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, kernel, kernel_part
+from mapfusion.geometry.numerics import Float, kernel
 from sim.raycast.scene import Walls
 from sim.raycast.visible_walls import NONE, Pinhole, Plan
 
@@ -46,7 +46,8 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: Plan, columns: np.ndarray) -
     for j in range(camera.width_px):
         first, last = height - 1, 0
         lowest_top, highest_bottom = 0, height - 1
-        _clear(total, covered)
+        for v in range(len(total)):
+            total[v], covered[v] = 0.0, 0.0
         for s in range(plan.first[j], plan.first[j + 1]):
             i, low, high = face[s], lows[s], highs[s]
             n = 0 if i == NONE else _cuts(camera, height_m, seen, i, low, high)
@@ -64,8 +65,16 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: Plan, columns: np.ndarray) -
                 rows, edges = top_row - bottom_row, lower + 2 - upper
                 _add_columns(table, begins[i], size, i, begin, end, bottom_row, top_row, sums)
                 _find_rows(highest_q - bottom_row, step, rows, edges, row, share)
-                _interpolate(sums, row, share, edges, below)
-                _add_means(below, (b - a) / ((end - begin) * step), upper, lower, total)
+                # Fill in the sums below edges.
+                for v in range(edges):
+                    k = np.uint64(row[v])
+                    at_row = sums[k]
+                    below[v] = at_row + share[v] * (sums[k + np.uint64(1)] - at_row)
+                # Add means over footprints, from the sums below the edges between them.
+                scale = (b - a) / ((end - begin) * step)
+                start, weight = np.uint64(upper), np.float32(scale)
+                for v in range(lower + 1 - upper):
+                    total[start + np.uint64(v)] += weight * (below[v] - below[v + 1])
                 _cover(covered, b - a, top, bottom, upper, lower)
                 first, last = min(first, upper), max(last, lower)
                 lowest_top, highest_bottom = max(lowest_top, upper), min(highest_bottom, lower)
@@ -73,11 +82,25 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: Plan, columns: np.ndarray) -
         begin, end = lowest_top + 1, highest_bottom
         if begin >= end or covered[begin] < COVERED:
             begin = end = last + 1
-        _round(total, begin, end, j, columns)
-        _blend(total, covered, first, begin, end, last, j, columns)
+        # Draw a column's rows from `begin` to before `end`, which walls cover.
+        start = np.uintp(begin)
+        for i in range(end - begin):
+            v = start + np.uintp(i)
+            columns[j, v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
+        # Draw its other rows, from `first` to `last`, over what is there.
+        v = first
+        while v <= last:
+            if v == begin:
+                v = end
+                continue
+            if covered[v] < COVERED:
+                columns[j, v] = np.uint8(total[v] + (1 - covered[v]) * columns[j, v] + 0.5)
+            else:
+                columns[j, v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
+            v += 1
 
 
-@kernel_part
+@kernel
 def _most_rows(size: np.ndarray) -> int:
     most = 0
     for i in range(len(size)):
@@ -85,46 +108,7 @@ def _most_rows(size: np.ndarray) -> int:
     return most
 
 
-@kernel_part
-def _clear(total: np.ndarray, covered: np.ndarray) -> None:
-    for v in range(len(total)):
-        total[v], covered[v] = 0.0, 0.0
-
-
-@kernel_part
-def _round(total: np.ndarray, begin: int, end: int, j: int, columns: np.ndarray) -> None:
-    """Draw a column's rows from `begin` to before `end`, which walls cover."""
-    start = np.uintp(begin)
-    for i in range(end - begin):
-        v = start + np.uintp(i)
-        columns[j, v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
-
-
-@kernel_part
-def _blend(
-    total: np.ndarray,
-    covered: np.ndarray,
-    first: int,
-    begin: int,
-    end: int,
-    last: int,
-    j: int,
-    columns: np.ndarray,
-) -> None:
-    """Draw its other rows, from `first` to `last`, over what is there."""
-    v = first
-    while v <= last:
-        if v == begin:
-            v = end
-            continue
-        if covered[v] < COVERED:
-            columns[j, v] = np.uint8(total[v] + (1 - covered[v]) * columns[j, v] + 0.5)
-        else:
-            columns[j, v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
-        v += 1
-
-
-@kernel_part
+@kernel
 def _cuts(camera: Pinhole, height_m: float, seen: Float, i: int, low: float, high: float) -> int:
     """Into how many strips one of face i is cut."""
     slope = seen[i, 3]
@@ -135,7 +119,7 @@ def _cuts(camera: Pinhole, height_m: float, seen: Float, i: int, low: float, hig
     return min(int(crossed / STEEPEST_ROWS) + 1, MOST_CUTS)
 
 
-@kernel_part
+@kernel
 def _rows(
     camera: Pinhole,
     height_m: float,
@@ -152,7 +136,7 @@ def _rows(
     return top, bottom, size[i, 1] / (height_m * camera.focal_px * w)
 
 
-@kernel_part
+@kernel
 def _texels(
     seen: Float, i: int, low: float, high: float, width_m: Float, size: np.ndarray
 ) -> tuple[float, float]:
@@ -165,7 +149,7 @@ def _texels(
     return begin, min(max(end * per_m, begin + LEAST_TEXELS), n)
 
 
-@kernel_part
+@kernel
 def _cover(
     covered: np.ndarray, share: float, top: float, bottom: float, first: int, last: int
 ) -> None:
@@ -177,7 +161,7 @@ def _cover(
     covered[last] -= share * max(last + 0.5 - bottom, 0.0)
 
 
-@kernel_part
+@kernel
 def _add_columns(
     table: np.ndarray,
     first: int,
@@ -207,7 +191,7 @@ def _add_columns(
         sums[r] = np.float32(whole) + (b * np.float32(gained) - a * np.float32(lost))
 
 
-@kernel_part
+@kernel
 def _find_rows(
     q: float, texels: float, n: int, edges: int, row: np.ndarray, share: np.ndarray
 ) -> None:
@@ -220,22 +204,3 @@ def _find_rows(
         at = min(max(begin - step * np.float32(v), np.float32(0)), top)
         row[v] = min(np.int32(at), last_row)
         share[v] = at - np.float32(row[v])
-
-
-@kernel_part
-def _interpolate(
-    sums: np.ndarray, row: np.ndarray, share: np.ndarray, edges: int, below: np.ndarray
-) -> None:
-    """Fill in the sums below edges."""
-    for v in range(edges):
-        k = np.uint64(row[v])
-        lower = sums[k]
-        below[v] = lower + share[v] * (sums[k + np.uint64(1)] - lower)
-
-
-@kernel_part
-def _add_means(below: np.ndarray, scale: float, first: int, last: int, total: np.ndarray) -> None:
-    """Add means over footprints, from the sums below the edges between them."""
-    start, weight = np.uint64(first), np.float32(scale)
-    for v in range(last + 1 - first):
-        total[start + np.uint64(v)] += weight * (below[v] - below[v + 1])

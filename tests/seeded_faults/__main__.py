@@ -22,7 +22,7 @@ from tests.seeded_faults.faults import ROOT, Fault, all_faults
 
 _COPIED = (*PACKAGES, "tests", "scenarios", "pyproject.toml", "README.md", "CONTRIBUTING.md")
 _TIME_LIMIT_S = 1800  # a fault may make a loop endless
-_NOT_TOLD = {"NUMBA_CACHE_DIR", "NUMBA_CACHE_LOCATOR_CLASSES"}  # kernels are the copy's own
+_NOT_TOLD = {"NUMBA_CACHE_DIR"}  # kernels are the copy's own
 _PASSED, _FAILED = 0, 1  # pytest's exit codes; others are no verdict
 
 

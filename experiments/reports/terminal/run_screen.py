@@ -230,26 +230,30 @@ _VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
 _VERDICTS |= columns(".2f", probability="prob.\nright") | columns(">", time="time\nms")
 
 
+def print_verdict(row: dict[str, Any]) -> None:
+    """Print the verdict on one aligner's estimate, as soon as there is one."""
+    status, why = verdict_on(row)
+    reason = why or row["reason"]
+    print_lines([f"  {row['aligner']}: {status}" + (f": {reason}" if reason else "")])
+
+
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
-    """Estimates of all aligners on two maps, and what is to be said of each."""
+    """Print the estimates of all aligners on two maps, and the verdicts on them."""
     found = pd.DataFrame(rows)
     sigma_m, sigma_rad = motion_sigma(covariances_of(found))
     stated = found.assign(sigma_m=sigma_m, sigma_rad=sigma_rad)
     note = "sigma: as stated for the refined one, of the distance and of the angle"
     print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
     inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
-    verdicts = [verdict_on(row) for row in rows]
+    verdicts = [str(verdict_on(row)[0]) for row in rows]
     times = (1e3 * found["elapsed_s"]).map(two_digits)
     print_frame(
-        found.assign(inliers=inliers, time=times, verdict=[str(status) for status, _ in verdicts]),
+        found.assign(inliers=inliers, time=times, verdict=verdicts),
         _VERDICTS,
         "Verdicts on the refined ones",
         "NFA: expected number of alignments that chance alone supports as well; evidence:\n"
         "how much likelier what both robots saw is if it is right; time: of the estimate",
     )
-    for row, (status, why) in zip(rows, verdicts, strict=True):
-        if reason := why or row["reason"]:
-            print_lines([f"  {row['aligner']}: {status}: {reason}"])
 
 
 def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:

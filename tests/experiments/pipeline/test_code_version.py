@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from experiments.pipeline import code_version
-from experiments.pipeline.code_version import PACKAGES, SOURCE_ROOT
+from experiments.pipeline.code_version import PACKAGES, SOURCE_ROOT, imports_of, use_kernel_cache
 
 FILES = {
     "ours/__init__.py": "",
@@ -35,17 +35,14 @@ class Late:
         case 1:
             import ours.by_case
 """,
-    "ours/spelled.py": """import os; import ours.by_semicolon
-if os: from ours import (  # not (only) this
-    by_comment as one,  # ours.unused)
-    by_bracket)
-else: from . import unused
-from ours \\
-    .kit import name, \\
-    other
+    "ours/spelled.py": """import os
+from ours import (  # not only this
+    by_comment as one,  # ours.unused
+    by_bracket,
+)
+from ours.kit import name, other
 import numpy as np, ours.by_comma as last
 """,
-    "ours/by_semicolon.py": "",
     "ours/by_comment.py": "",
     "ours/by_bracket.py": "",
     "ours/by_comma.py": "",
@@ -184,17 +181,22 @@ class Source:
         for package in PACKAGES:
             unwanted = shutil.ignore_patterns("__pycache__")
             shutil.copytree(SOURCE_ROOT / package, self._root / package, ignore=unwanted)
-        for name, text in KERNELS.items():
-            self.write(name, text)
+        for name in KERNELS:
+            self.restore(name)
 
     def write(self, module: str, text: str) -> None:
         """Put a module of kernels in place."""
         path = self._root / "mapfusion" / f"{module}.py"
         path.write_text("from numba import njit\n" + text, encoding="utf-8")
 
+    def restore(self, module: str) -> None:
+        """Put a module of kernels in place as it was first, its time of change included."""
+        self.write(module, KERNELS[module])
+        os.utime(self._root / "mapfusion" / f"{module}.py", (1e9, 1e9))
+
     def called(self) -> dict[str, list[object]]:
         """What the kernels give for 10, and whether they had been compiled before."""
-        left_out = {"NUMBA_CACHE_DIR", "NUMBA_CACHE_LOCATOR_CLASSES", "PYTHONPATH"}
+        left_out = {"NUMBA_CACHE_DIR", "PYTHONPATH"}
         environment = {name: value for name, value in os.environ.items() if name not in left_out}
         environment["XDG_CACHE_HOME"] = str(self.cache)
         # Python tells versions of a module apart by size and whole seconds; tests are faster
@@ -204,10 +206,9 @@ class Source:
         return json.loads(told.stdout)
 
     @property
-    def folders(self) -> set[str]:
-        """Those of the kernels' modules, without what their names say of the source."""
-        kept = (self.cache / "mapfusion" / "kernels").iterdir()
-        return {folder.name.rpartition("-")[0] for folder in kept}
+    def versions(self) -> list[Path]:
+        """The folders of kernels, one for each version of the source."""
+        return list((self.cache / "mapfusion" / "kernels").iterdir())
 
 
 @pytest.fixture
@@ -220,29 +221,44 @@ def source(tmp_path: Path) -> Source:
 
 def test_kernels_are_compiled_once(source: Source) -> None:
     assert source.called() == {"caller": [22, True], "apart": [30, True]}
-    assert source.folders == {"mapfusion.callee", "mapfusion.caller", "mapfusion.apart"}
+    assert len(source.versions) == 1
 
 
 def test_a_kernel_is_compiled_anew_when_one_that_it_calls_has_changed(source: Source) -> None:
     source.write("callee", KERNELS["callee"].replace("x + 1", "x + 2"))
-    assert source.called() == {"caller": [24, False], "apart": [30, True]}
-    source.write("callee", KERNELS["callee"])
+    assert source.called() == {"caller": [24, False], "apart": [30, False]}
+    source.restore("callee")
     assert source.called() == {"caller": [22, True], "apart": [30, True]}
 
 
-def test_of_a_module_few_versions_are_kept(source: Source) -> None:
-    for k in range(5):
-        source.write("callee", KERNELS["callee"].replace("x + 1", f"x + {3 + k}"))
-        source.called()
-    kept = [path.name for path in (source.cache / "mapfusion" / "kernels").iterdir()]
-    # the last call leaves one more than it found
-    assert sum(name.startswith("mapfusion.caller-") for name in kept) == 5
-    assert sum(name.startswith("mapfusion.apart-") for name in kept) == 1
+def test_the_versions_used_last_are_kept(source: Source) -> None:
+    (first,) = source.versions
+    for age in range(20):
+        old = first.with_name(f"old{age}")
+        old.mkdir()
+        os.utime(old, (1e9 - age, 1e9 - age))
+    source.called()
+    kept = {path.name for path in source.versions}
+    assert kept == {first.name, *(f"old{age}" for age in range(7))}
 
 
-def test_a_kernel_that_numba_cannot_keep_is_compiled_each_time(source: Source) -> None:
-    """It has a large global array, of which the code holds nothing but the place in memory."""
-    large = "import numpy as np\nTABLE = np.ones(1_000_000)\n"
-    source.write("apart", large + KERNELS["apart"].replace("3 * x", "3 * x * TABLE[x]"))
-    for _ in range(2):
-        assert source.called() == {"caller": [22, True], "apart": [30, False]}
+def test_a_folder_chosen_by_the_user_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "chosen")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    use_kernel_cache()
+    assert os.environ["NUMBA_CACHE_DIR"] == "chosen"
+    assert not list(tmp_path.iterdir())
+
+
+def test_kernels_of_experiments_call_none_of_experiments() -> None:
+    """The name of the folder says nothing of the source of `experiments`."""
+    found = 0
+    for path in (SOURCE_ROOT / "experiments").rglob("*.py"):
+        name = path.relative_to(SOURCE_ROOT).as_posix()
+        imported = imports_of(SOURCE_ROOT, name)
+        if "mapfusion/geometry/numerics.py" in imported:
+            found += 1
+            assert all(each.startswith(("mapfusion/", "sim/")) for each in imported), name
+    assert found

@@ -15,7 +15,6 @@ from mapfusion.align.nearest_neighbours import (
     runs_about,
 )
 from mapfusion.geometry import se2
-from tests.helpers.inner_kernels import from_python
 
 
 def points(kind, rng):
@@ -36,7 +35,7 @@ def test_all_within_a_radius_are_in_the_runs_about_a_point(kind):
     runs = np.empty((grid.shape[1], 2), np.int64)
     queries = np.vstack([rng.uniform(-2, 22, (200, 3)), rng.uniform(-1000, 1000, (20, 3)), p[:20]])
     for q, radius in zip(queries, rng.uniform(0, 3, len(queries)), strict=True):
-        ranges = runs[: from_python(runs_about)(q[0], q[1], radius, grid, runs)]
+        ranges = runs[: runs_about(q[0], q[1], radius, grid, runs)]
         found = np.concatenate([grid.row[first:end] for first, end in ranges] + [np.zeros(0, int)])
         near = np.flatnonzero(np.hypot(*(p - q)[:, :2].T) <= radius)
         assert len(set(found)) == len(found)
@@ -48,7 +47,7 @@ def test_all_within_a_radius_are_in_the_runs_about_a_point(kind):
 def test_of_no_points_there_is_a_grid():
     grid = Grid.of(np.zeros((0, 2)))
     runs = np.empty((grid.shape[1], 2), np.int64)
-    assert from_python(runs_about)(0.0, 0.0, 1.0, grid, runs) <= 1
+    assert runs_about(0.0, 0.0, 1.0, grid, runs) <= 1
     np.testing.assert_array_equal(grid.start, 0)
 
 
@@ -106,7 +105,7 @@ def test_finds_what_looking_at_all_finds(kind: str, begins: str, n: int) -> None
     elif begins == "with the answer":
         nearest[:] = away.argmin(axis=1)
     for first in range(0, len(groups.row), GROUP):
-        from_python(look_up_group)(T, first, groups, tree, nearest, room)
+        look_up_group(T, first, groups, tree, nearest, room)
         own = away[first : first + GROUP]
         np.testing.assert_allclose(np.sqrt(room.square), own.min(axis=1), rtol=0, atol=1e-10)
         found = own[np.arange(GROUP), room.nearest.astype(int)]
@@ -123,7 +122,7 @@ def test_close_groups_find_theirs_in_a_large_tree(apart_m: float) -> None:
     away = cdist(asked[groups.row], tree.p)
     for before in (np.full(1600, -1), away.argpartition(9, axis=1)[:, 9]):
         for first in range(0, 1600, GROUP):
-            from_python(look_up_group)(np.zeros(3), first, groups, tree, before, room)
+            look_up_group(np.zeros(3), first, groups, tree, before, room)
             own = away[first : first + GROUP].min(axis=1)
             np.testing.assert_allclose(np.sqrt(room.square), own, rtol=0, atol=1e-10)
 

@@ -12,7 +12,6 @@ from mapfusion.align.ransac import Ransac, draw_pair, list_supporters, most_supp
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry import se2
 from mapfusion.registration import as_aligner
-from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 from tests.mapfusion.align.slow_twins import draw
 
@@ -120,7 +119,7 @@ def test_of_equal_support_the_nearer_wins():
 def test_every_two_pairs_are_drawn_equally_often():
     state, drawn = np.uint64(12345), np.zeros((7, 7))
     for _ in range(42_000):
-        state, i, j = from_python(draw_pair)(np.uint64(state), 7)
+        state, i, j = draw_pair(np.uint64(state), 7)
         drawn[i, j] += 1
     assert np.trace(drawn) == 0
     assert chisquare(drawn[~np.eye(7, dtype=bool)]).pvalue > 1e-3
@@ -171,9 +170,7 @@ def test_support_is_within_the_gate_in_all_dimensions_there_are():
     for gate_m, counted, counted_flat in ((0.29, 0, 0), (0.49, 0, 1), (0.51, 1, 1)):
         for points, n in (((p_a, p_b), counted), ((p_a[:, :2], p_b[:, :2]), counted_flat)):
             flat = [np.ascontiguousarray(each) for each in points]
-            found, cost = from_python(list_supporters)(
-                np.zeros(3), *flat, gate_m, 0, np.empty(1, np.int64)
-            )
+            found, cost = list_supporters(np.zeros(3), *flat, gate_m, 0, np.empty(1, np.int64))
             assert found == n
             assert cost == pytest.approx(n * (0.09 + 0.16 * (len(points[0][0]) == 3)))
 

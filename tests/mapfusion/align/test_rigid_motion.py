@@ -13,7 +13,6 @@ from mapfusion.align.rigid_motion import (
     residuals,
 )
 from mapfusion.geometry import se2
-from tests.helpers.inner_kernels import from_python
 from tests.mapfusion.align.map_pairs import covariances, error, motion
 
 
@@ -131,7 +130,7 @@ def test_weighted_fit_minimises_what_a_general_optimiser_minimises(noisy):
 def test_two_pairs_are_fitted_as_many(noisy):
     _, p_a, p_b = noisy
     T_a_b = np.empty(3)
-    shorter = from_python(fit_two)(p_a, p_b, 4, 17, T_a_b)
+    shorter = fit_two(p_a, p_b, 4, 17, T_a_b)
     assert tuple(T_a_b) == pytest.approx(fit_rigid(p_a, p_b, np.array([4, 17])), abs=1e-12)
     lengths = [np.linalg.norm(p[4, :2] - p[17, :2]) for p in (p_a, p_b)]
     assert shorter == pytest.approx(min(lengths))

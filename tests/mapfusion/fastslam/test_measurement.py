@@ -12,7 +12,6 @@ from mapfusion.fastslam.measurement import (
     sightings,
 )
 from mapfusion.geometry.se2 import rotation_about_z, transform_points
-from tests.helpers.inner_kernels import from_python
 
 UPPER = np.triu_indices(3)
 
@@ -52,12 +51,10 @@ def test_innovation_gives_the_distance_and_determinant_of_the_matrix(planar):
     seen = Sightings(point[None], flat_noise)
     own = Estimates(mean[None], flat_sigma, np.ones((1, 50), dtype=np.int32))
     for m in range(50):
-        *form, determinant = from_python(innovation)(seen, 0, own, 0, m, planar)
+        *form, determinant = innovation(seen, 0, own, 0, m, planar)
         Z = (noise[m] + sigma[m])[:n, :n]
         difference = (point[m] - mean[m])[:n]
-        assert from_python(quadratic_form)(*form) == pytest.approx(
-            difference @ np.linalg.solve(Z, difference)
-        )
+        assert quadratic_form(*form) == pytest.approx(difference @ np.linalg.solve(Z, difference))
         assert determinant == pytest.approx(np.linalg.det(Z))
 
 

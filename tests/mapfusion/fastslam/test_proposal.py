@@ -110,9 +110,8 @@ def test_a_false_pair_does_not_take_the_pose_along() -> None:
     slots.own.mean_m[7, 0, :2] += [0.5, -0.5]
     seen = sightings(np.zeros((1, 3)), points, np.tile(1e-4 * np.eye(3), (20, 1, 1)), False)
     chosen = np.arange(20)[:, None]
-    eta, _ = informed_disturbance(
-        slots, chosen, seen, np.zeros((1, 3)), 0.0, np.full(3, 0.05), 21.0, False, np.zeros((1, 3))
-    )
+    at, given = np.zeros((1, 3)), (0.0, np.full(3, 0.05), 21.0, False)
+    eta, _ = informed_disturbance(slots.own, slots.row, chosen, seen, at, *given, at)
     np.testing.assert_allclose(0.05 * eta[0], pose, atol=0.003)
 
 
@@ -135,7 +134,9 @@ def test_a_particle_is_drawn_as_if_it_were_alone(n: int) -> None:
     slots, seen, pose, chosen = many_particles(n, 9)
     sigma, gate, turn = np.array([0.1, 0.05, 0.08]), 21.0, 0.1
     normal = np.random.default_rng(9).standard_normal((n, 3))
-    found, ratio = informed_disturbance(slots, chosen, seen, pose, turn, sigma, gate, False, normal)
+    found, ratio = informed_disturbance(
+        slots.own, slots.row, chosen, seen, pose, turn, sigma, gate, False, normal
+    )
     for m in range(n):
         eta, before = np.zeros(3), pose[m, 2] - turn
         axes = np.array([[np.cos(before), -np.sin(before)], [np.sin(before), np.cos(before)]])
@@ -221,7 +222,9 @@ def one_sighting() -> Sightings:
 def draw(slots, seen, pose, sigma, standard_normal):
     """With a gate so wide that no pair is doubted."""
     chosen = np.zeros((1, 1), dtype=np.int64)
-    return informed_disturbance(slots, chosen, seen, pose, 0.0, sigma, 1e12, False, standard_normal)
+    return informed_disturbance(
+        slots.own, slots.row, chosen, seen, pose, 0.0, sigma, 1e12, False, standard_normal
+    )
 
 
 def full(upper: np.ndarray) -> np.ndarray:
