@@ -212,8 +212,6 @@ class JudgedRun:
         require_memory(self.pipeline, jobs)
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
-        if jobs > 1:
-            left = with_head_start(self.pipeline, self.store, left)
         try:
             with workers(jobs) as pool:
                 run_tasks(left, pool, on_progress, None if only else self._load_task())
