@@ -21,10 +21,15 @@ from threadpoolctl import threadpool_limits
 
 Float = NDArray[np.float64]
 
-# Kernels are compiled once for each version of their source and kept on disk. Nothing calls them
-# from C, so they need no wrapper for that.
-_OPTIONS: dict[str, Any] = {"cache": True, "no_cfunc_wrapper": True}
-kernel: Callable[..., Any] = partial(njit, **_OPTIONS)
+
+def kernel(function: Any = None, **options: Any) -> Any:
+    """Compile a function with Numba, once for each version of its source, and keep it on disk.
+
+    Nothing calls kernels from C, so they have no wrapper for that.
+    """
+    if function is None:
+        return partial(kernel, **options)
+    return cast(Any, njit)(function, cache=True, no_cfunc_wrapper=True, **options)
 
 
 def source_of(compiled: Callable[..., Any]) -> Callable[..., Any]:
