@@ -219,6 +219,6 @@ def calibration_from(attributes: Mapping[str, str], where: object) -> Calibratio
         raise InputError(f"{where}: {keys} in its metadata: {error}") from error
 
 
-def usual_calibration(camera: StereoCamera) -> CalibrationError:
+def default_calibration_error(camera: StereoCamera) -> CalibrationError:
     """Of a camera that somebody calibrated, and said no more."""
     return CalibrationError(math.hypot(_PRINCIPAL_PX / camera.focal_px, _MOUNT_RAD), _SCALE)

@@ -182,7 +182,7 @@ class StackedErrors:
         return self.first.gathered(self.known.common.T)
 
 
-def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> JointCovariance:
+def reduce_rank(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> JointCovariance:
     """A joint covariance of own (N, 3, 3) and common (R, 3N), by its largest `rank` directions.
 
     Marginal covariances stay as they are: what is left out is counted as the landmarks' own.

@@ -221,7 +221,7 @@ def _ones(typing_context: Any, word: Any) -> Any:
 
 # inside kernels only: number of the lowest bit set of a word that is not 0, and number of bits set
 trailing_zeros = cast(Callable[[Any], int], _trailing_zeros)
-ones = cast(Callable[[Any], int], _ones)
+popcount = cast(Callable[[Any], int], _ones)
 
 
 @kernel
@@ -229,7 +229,7 @@ def count_common(first: np.ndarray, second: np.ndarray) -> int:
     """Size of the intersection of two sets (W,) uint64."""
     count = 0
     for w in range(len(first)):
-        count += ones(first[w] & second[w])
+        count += popcount(first[w] & second[w])
     return count
 
 

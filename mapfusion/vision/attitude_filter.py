@@ -84,7 +84,7 @@ _IN_VIEW = 1 - 1 / 20
 
 
 @dataclass(frozen=True)
-class Measured:
+class AttitudeMeasurement:
     """What was measured of an attitude.
 
     Attributes:
@@ -147,7 +147,7 @@ class AttitudeFilter:
         self.fresh = _IN_VIEW * (jacobian @ self.fresh @ jacobian.T) + told
         self.carried, self._moved = np.ones(3), True
 
-    def measure(self, measured: Measured) -> None:
+    def measure(self, measured: AttitudeMeasurement) -> None:
         """Take in what was measured in this frame."""
         rows = np.flatnonzero(np.isfinite(measured.value))
         pick = np.eye(3)[rows]
@@ -168,7 +168,7 @@ class AttitudeFilter:
 _BODY_RAD = 0.025
 
 
-class Levelling:
+class AttitudeEstimator:
     """The attitude of a robot along its log, by what is measured of it and by its links.
 
     Args:
@@ -196,7 +196,7 @@ class Levelling:
             sigma[:, :2] = np.sqrt(sigma[:, :2] ** 2 + self._shared_rad2)
         return Attitude(np.array(self._values), sigma, carried)
 
-    def expected_turn(self, measured: Measured) -> Float | None:
+    def expected_turn(self, measured: AttitudeMeasurement) -> Float | None:
         """R_after_before (3, 3) in the camera's frame, by what is measured of the next frame.
 
         None where nothing is, and for the first frame.
@@ -213,7 +213,7 @@ class Levelling:
     def add(
         self,
         motion: RigidMotion | None,
-        measured: Measured,
+        measured: AttitudeMeasurement,
         counted: tuple[Float, float] | None = None,
     ) -> None:
         """The next frame: how the links say that the camera moved, and what was measured.
@@ -230,7 +230,9 @@ class Levelling:
             self._filter.move(motion)
         if motion is None and np.isnan(measured.value[:2]).any():
             told = np.array([0.0, 0.0, measured.value[2]])
-            measured = Measured(told, np.array([_BODY_RAD, _BODY_RAD, measured.sigma[2]]))
+            measured = AttitudeMeasurement(
+                told, np.array([_BODY_RAD, _BODY_RAD, measured.sigma[2]])
+            )
         self._filter.measure(measured)
         self._values.append(self._filter.value)
         self._sigmas.append(self._filter.sigma)

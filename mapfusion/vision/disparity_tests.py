@@ -139,7 +139,9 @@ _HALVES = ((LEFT, ALL), (RIGHT, ALL), (ALL, ABOVE), (ALL, BELOW))
 SILHOUETTE_MOMENTS = tuple(moment(product, s=s, t=t) for s, t in _HALVES for product in _OF_A_HALF)
 
 
-def disagrees(squares: Float, noise: float, max_misfit: float, max_rows: float) -> np.ndarray:
+def fails_silhouette_test(
+    squares: Float, noise: float, max_misfit: float, max_rows: float
+) -> np.ndarray:
     """Whether any half (left, right, upper, lower) of each window does not fit the plane (N,) bool.
 
     An error e in disparity changes the grey level by g e, g its slope along u, and rows that are
@@ -185,7 +187,7 @@ _PART = np.uintp(N_PRODUCTS) * WIDE
 _INSIDE = FIELDS  # of a window's pixels, after its other fields: 1 in both pictures, else 0
 
 
-def window_sums(
+def window_statistics(
     left: np.ndarray,
     right: np.ndarray,
     pixel: np.ndarray,

@@ -10,11 +10,10 @@ from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import Observations
-from mapfusion.vision.features import Features, cut_patches
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.stereo import StereoParameters, Verdict, match
+from mapfusion.vision.stereo import MatchStatus, StereoParameters, match
 from mapfusion.vision.surf import USurfParameters, describe
-from mapfusion.vision.tracking import Tracker, TrackParameters, Tracks
+from mapfusion.vision.tracking import Features, Tracker, TrackParameters, Tracks, cut_patches
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class FrontEnd:
                 raise ValueError(f"{name}: is {image.dtype} {image.shape}, expected uint8 {size}")
         corners = detect(left, self.parameters.harris)
         matches = match(left, right, corners, self.camera, self.parameters.stereo)
-        matched = matches.verdict == Verdict.MATCHED
+        matched = matches.verdict == MatchStatus.MATCHED
         uv, disparity = corners[matched], matches.disparity_px[matched]
         depth = self.camera.focal_px * self.camera.baseline_m / disparity
         scale = self.parameters.usurf.scales_px(depth, self.camera.focal_px)
@@ -147,7 +146,7 @@ class Observer:
         return ObservedFrame(tracks, rows, observations)
 
 
-def joined(frames: Sequence[Observations]) -> tuple[np.ndarray, Observations]:
+def concatenate_observations(frames: Sequence[Observations]) -> tuple[np.ndarray, Observations]:
     """Iterations (N,) and observations of a whole log from those of its frames."""
     iteration = np.repeat(np.arange(len(frames)), [len(own) for own in frames])
     names = ("position_m", "covariance_m2", "descriptor", "uvd_px", "track")

@@ -30,11 +30,11 @@ from mapfusion.parameters import (
     require_in_range,
     require_shape,
 )
-from mapfusion.vision.disparity_tests import FURTHER_TERMS, disagrees, window_sums
+from mapfusion.vision.disparity_tests import FURTHER_TERMS, fails_silhouette_test, window_statistics
 from mapfusion.vision.subpixel import MOST_HALF_PX, fit_planes
 
 
-class Verdict(IntEnum):
+class MatchStatus(IntEnum):
     """MATCHED, or why not."""
 
     MATCHED = 0
@@ -103,7 +103,7 @@ def _search_all(
         first, last = max(u - max_disparity, half), u - min_disparity
         inside = half < u < width - half - 1 and half <= v < height - half
         if not inside or first > last:
-            verdict[n] = Verdict.OUTSIDE
+            verdict[n] = MatchStatus.OUTSIDE
             continue
         found, verdict[n] = _search_row(
             left,
@@ -119,14 +119,14 @@ def _search_all(
             strip,
             room,
         )
-        if verdict[n] != Verdict.MATCHED:
+        if verdict[n] != MatchStatus.MATCHED:
             continue
         back_first, back_last = found + min_disparity, min(found + max_disparity, width - half - 1)
         back, _ = _search_row(
             right, left, found, v, back_first, back_last, half, -1.0, 1.0, scores, strip, room
         )
         if abs(back - u) > max_round_trip:
-            verdict[n] = Verdict.ONE_SIDED
+            verdict[n] = MatchStatus.ONE_SIDED
             continue
         disparity[n] = u - found
 
@@ -148,22 +148,22 @@ def _search_row(
 ) -> tuple[int, int]:
     """Column of `other` in first..last that looks most like (u, v) of `image`, and a verdict."""
     if last < first:
-        return u, Verdict.OUTSIDE
+        return u, MatchStatus.OUTSIDE
     if not _correlate(image, other, u, v, first, last, half, scores, strip, room):
-        return u, Verdict.FLAT
+        return u, MatchStatus.FLAT
     best = 0
     for k in range(1, last - first + 1):
         if scores[k] > scores[best]:
             best = k
     if scores[best] < min_correlation:
-        return first + best, Verdict.WEAK
+        return first + best, MatchStatus.WEAK
     rival = -1.0
     for k in range(last - first + 1):
         if abs(k - best) > _PEAK_HALF_WIDTH_PX and scores[k] > rival:
             rival = scores[k]
     if 1 - scores[best] >= max_ambiguity * (1 - rival):
-        return first + best, Verdict.AMBIGUOUS
-    return first + best, Verdict.MATCHED
+        return first + best, MatchStatus.AMBIGUOUS
+    return first + best, MatchStatus.MATCHED
 
 
 @kernel
@@ -373,23 +373,23 @@ def match(
     disparity, sigma = np.full(len(uv), np.nan), np.full(len(uv), np.nan)
     slope = np.full((len(uv), 2), np.nan)
 
-    rows = np.nonzero(verdict == Verdict.MATCHED)[0]
+    rows = np.nonzero(verdict == MatchStatus.MATCHED)[0]
     plane, disparity[rows], sigma[rows] = _refine(
         left, right, pixel[rows], uv[rows], found[rows], camera, parameters
     )
     jump = np.abs(plane[:, 0] - found[rows])
     lost = ~((jump <= parameters.max_jump_px) & (disparity[rows] > 0))
-    verdict[rows[lost]] = Verdict.DIVERGED
+    verdict[rows[lost]] = MatchStatus.DIVERGED
 
     rows, plane = rows[~lost], plane[~lost]
     slope[rows] = plane[:, 1:]
     half = (parameters.silhouette_half_px, parameters.plane_half_px)
-    squares, scores = window_sums(left, right, pixel[rows], plane, *half)
+    squares, scores = window_statistics(left, right, pixel[rows], plane, *half)
     tolerated = (parameters.noise_grey, parameters.max_misfit_px, parameters.max_rows_px)
-    verdict[rows[_bent(scores, parameters)]] = Verdict.BENT
-    verdict[rows[disagrees(squares, *tolerated)]] = Verdict.SILHOUETTE
+    verdict[rows[_bent(scores, parameters)]] = MatchStatus.BENT
+    verdict[rows[fails_silhouette_test(squares, *tolerated)]] = MatchStatus.SILHOUETTE
 
-    unmatched = verdict != Verdict.MATCHED
+    unmatched = verdict != MatchStatus.MATCHED
     disparity[unmatched] = sigma[unmatched] = slope[unmatched] = np.nan
     return StereoMatches(disparity, sigma, slope, verdict)
 

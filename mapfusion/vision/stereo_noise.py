@@ -17,9 +17,9 @@ import numpy as np
 
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, chi_square_bound
-from mapfusion.vision.disparity_tests import window_sums
+from mapfusion.vision.disparity_tests import window_statistics
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.stereo import StereoParameters, Verdict, search_rows
+from mapfusion.vision.stereo import MatchStatus, StereoParameters, search_rows
 from mapfusion.vision.subpixel import fit_planes
 from mapfusion.vision.surf import describe
 
@@ -53,7 +53,7 @@ class NoiseModel:
         return 2 * self.noise_grey**2 + slopes @ own
 
 
-def measured_noise(
+def estimate_noise(
     pairs: Sequence[tuple[np.ndarray, np.ndarray]],
     camera: StereoCamera,
     harris: HarrisParameters,
@@ -85,7 +85,9 @@ def measured_noise(
     return NoiseModel(noise, misfit, rows, texture)
 
 
-def limits_for(stereo: StereoParameters, noise: NoiseModel, probability: float) -> StereoParameters:
+def parameters_for_noise(
+    stereo: StereoParameters, noise: NoiseModel, probability: float
+) -> StereoParameters:
     """Limits that true surfaces keep with this probability.
 
     A half's square is a sum over so many independent parts as squares of the length over which
@@ -127,7 +129,7 @@ def _windows(
     nearest, farthest = reach / stereo.min_depth_m, reach / stereo.max_depth_m
     span = int(np.floor(farthest)), int(np.ceil(nearest))
     found, verdict = search_rows(left, right, pixel, *span, stereo.half_px, *_SEARCH)
-    kept = verdict == Verdict.MATCHED
+    kept = verdict == MatchStatus.MATCHED
     pixel, start = pixel[kept], found[kept].astype(np.float64)
     slope_sigma = camera.baseline_m / stereo.nearest_plane_m
     plane, _ = fit_planes(
@@ -136,7 +138,7 @@ def _windows(
     fine = np.abs(plane[:, 0] - start) <= stereo.max_jump_px  # NaN is not
     pixel, plane = pixel[fine], plane[fine]
     half = (stereo.silhouette_half_px, stereo.plane_half_px)
-    squares, _ = window_sums(left, right, pixel, plane, *half)
+    squares, _ = window_statistics(left, right, pixel, plane, *half)
     whole = squares[:, 2] + squares[:, 3]
     slopes = whole[:, 2:] / np.maximum(whole[:, :1], 1.0)
     return squares, np.column_stack([_variance(left, pixel, stereo.half_px), slopes])
@@ -154,7 +156,9 @@ _MAX_DISTANCE = 0.3  # of two descriptors of one point, as tracks have it
 _MAX_RATIO = 0.8  # of the nearest descriptor's distance over the second's (Lowe 2004)
 
 
-def offsets(left: np.ndarray, right: np.ndarray, parameters: HarrisParameters) -> Float:
+def rectification_offsets(
+    left: np.ndarray, right: np.ndarray, parameters: HarrisParameters
+) -> Float:
     """Columns and rows (N, 2) by which matched corners lie farther right and lower on the right.
 
     Images are (H, W) uint8. One false match in several is to be expected: use the median.

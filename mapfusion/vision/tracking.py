@@ -11,10 +11,62 @@ import numpy as np
 
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.parameters import Probability, Range, require_in_range
-from mapfusion.vision.features import Features
+from mapfusion.parameters import Probability, Range, require_finite, require_in_range, require_shape
+from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.patch_alignment import Templates, fit_patches
-from mapfusion.vision.visual_odometry import RigidMotion, rigid_links
+from mapfusion.vision.visual_odometry import RigidMotion, estimate_rigid_motion
+
+_PATCH_HALF_PX = 17  # room for a fit's window when what it shows has grown by half
+PATCH_SIDE_PX = 2 * _PATCH_HALF_PX + 1
+
+
+def cut_patches(image: np.ndarray, uv_px: Float) -> np.ndarray:
+    """What is around the pixels nearest to points (N, 2), (N, P, P); outside the border repeats."""
+    middle, around = np.rint(uv_px).astype(np.int64), np.arange(PATCH_SIDE_PX) - _PATCH_HALF_PX
+    u, v = (middle[:, axis, None] + around for axis in (0, 1))
+    rows, columns = (np.clip(at, 0, n - 1) for at, n in zip((v, u), image.shape, strict=True))
+    return image[rows[:, :, None], columns[:, None, :]]
+
+
+@dataclass(frozen=True)
+class Features:
+    """Matched and described corners of one frame, the strongest corner first.
+
+    Attributes:
+        uv_px: (N, 2) in the left image.
+        disparity_px: (N,) positive.
+        sigma_disparity_px: (N,) standard deviation of the disparity.
+        descriptor: (N, 64) float32, unit length.
+        slope: (N, 2) change of the disparity along u and v, on the corner's surface; None: none.
+        patch: (N, P, P) uint8, what the left image shows around the pixel nearest to the corner,
+            see `cut_patches`; None: corners are followed by their own places.
+    """
+
+    uv_px: Float
+    disparity_px: Float
+    sigma_disparity_px: Float
+    descriptor: np.ndarray
+    slope: Float | None = None
+    patch: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.uv_px)
+        require_shape("uv_px", self.uv_px, (n, 2))
+        require_shape("disparity_px", self.disparity_px, (n,))
+        require_shape("sigma_disparity_px", self.sigma_disparity_px, (n,))
+        require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
+        if self.slope is not None:
+            require_shape("slope", self.slope, (n, 2))
+            require_finite("slope", self.slope)
+        if self.patch is not None:
+            require_shape("patch", self.patch, (n, PATCH_SIDE_PX, PATCH_SIDE_PX))
+        for name in ("uv_px", "disparity_px", "sigma_disparity_px", "descriptor"):
+            require_finite(name, getattr(self, name))
+        if np.any(self.disparity_px <= 0):
+            raise ValueError("disparity_px: must be positive")
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
 
 
 @dataclass(frozen=True)
@@ -30,7 +82,7 @@ class Likeness:
 
 
 @dataclass(frozen=True)
-class Followed:
+class TrackedPoints:
     """Of each feature of one frame the point that it stands for, and how that looked at first.
 
     Attributes:
@@ -51,7 +103,7 @@ class Followed:
     template: np.ndarray
 
     @classmethod
-    def unseen(cls, features: Features, templates: Templates) -> "Followed":
+    def unseen(cls, features: Features, templates: Templates) -> "TrackedPoints":
         """Points at the corners themselves, before `begin` says how they look.
 
         `templates` are those of the frame before, which go on into this one.
@@ -73,9 +125,9 @@ class Followed:
             likeness.fill(self.templates, fresh, features.patch[rows], uv - np.rint(uv))
 
 
-def followed(
-    points: Followed, before: Features, after: Features, source: np.ndarray, likeness: Likeness
-) -> tuple[Followed, np.ndarray]:
+def follow_points(
+    points: TrackedPoints, before: Features, after: Features, source: np.ndarray, likeness: Likeness
+) -> tuple[TrackedPoints, np.ndarray]:
     """The points of the next frame, and which of its features are (N,) of points seen before.
 
     A point is fitted to the picture that its track began with; where that fails, as it does when
@@ -89,7 +141,7 @@ def followed(
         source: (N,) row of `before` that each feature of `after` is linked to, or -1.
         likeness: beyond which two views show different points.
     """
-    new, rows = Followed.unseen(after, points.templates), np.flatnonzero(source >= 0)
+    new, rows = TrackedPoints.unseen(after, points.templates), np.flatnonzero(source >= 0)
     if before.patch is None or after.patch is None:
         return new, source >= 0
     old = source[rows]
@@ -98,7 +150,7 @@ def followed(
     start = corner + points.uv_px[old] - before.uv_px[old] - middle
     shown, warp = after.patch[rows], _with_place(points.warp[old], start)
     now, first = after.disparity_px[rows], points.first_px[old]
-    fits = fit_patches(points.templates, template, shown, warp, bend_of(first, now))
+    fits = fit_patches(points.templates, template, shown, warp, projective_terms(first, now))
     again = np.flatnonzero(~fits)
     if len(again):  # what a track began with has no use any more, whether this fits or not
         last = old[again]
@@ -106,7 +158,7 @@ def followed(
         likeness.fill(points.templates, template[again], before.patch[last], beside)
         nearer = _with_place(_upright(len(again)), start[again])
         first[again] = _plane(before, last, points.disparity_px[last])
-        bend = bend_of(first[again], now[again])
+        bend = projective_terms(first[again], now[again])
         fits[again] = fit_patches(points.templates, template[again], shown[again], nearer, bend)
         warp[again] = nearer
 
@@ -123,7 +175,7 @@ def followed(
     return new, found
 
 
-def bend_of(first_px: Float, disparity_px: Float) -> Float:
+def projective_terms(first_px: Float, disparity_px: Float) -> Float:
     """(N, 2) h of `patch_fit.py`, per pixel: how the homography of a plane bends a window.
 
     A point of disparity d has depth f B / d, and by t nearer, d / d' = 1 - t d / (f B) of it. In
@@ -230,7 +282,7 @@ class Tracker:
         self._camera = camera
         self._sigma_uv_px = sigma_uv_px
         self._likeness = Likeness(parameters.noise_grey, parameters.max_misfit_px)
-        self._previous: tuple[Features, Followed, Tracks] | None = None
+        self._previous: tuple[Features, TrackedPoints, Tracks] | None = None
         self._points_m = np.empty((0, 3)), np.empty((0, 3, 3))
         self._next_id = 0
 
@@ -250,7 +302,7 @@ class Tracker:
             np.ones(n, np.int64),
         )
         if self._previous is None:
-            points, motion = Followed.unseen(features, Templates.room(n)), None
+            points, motion = TrackedPoints.unseen(features, Templates.room(n)), None
             self._points_m = self._triangulated(points, features, slice(None))
         else:
             before, points_before, tracks = self._previous
@@ -259,7 +311,7 @@ class Tracker:
                 turned = self._camera.turned(before.uv_px, R_after_before)
                 expected = replace(before, uv_px=turned)
             source = link(expected, features, self.parameters, steps)
-            points, found = followed(points_before, before, features, source, self._likeness)
+            points, found = follow_points(points_before, before, features, source, self._likeness)
             source[~found] = _NO_MATCH
             motion = self._keep_rigid(points, features, source)
             linked = source != _NO_MATCH
@@ -279,7 +331,7 @@ class Tracker:
         return self._points_m
 
     def _keep_rigid(
-        self, points: Followed, features: Features, source: np.ndarray
+        self, points: TrackedPoints, features: Features, source: np.ndarray
     ) -> RigidMotion | None:
         """Cut the links that the motion which explains most does not, and tell that motion.
 
@@ -288,7 +340,7 @@ class Tracker:
         rows = np.flatnonzero(source != _NO_MATCH)
         position_before, covariance_before = (values[source[rows]] for values in self._points_m)
         position, covariance = self._triangulated(points, features, slice(None))
-        agree, motion = rigid_links(
+        agree, motion = estimate_rigid_motion(
             position_before,
             covariance_before,
             position[rows],
@@ -303,7 +355,7 @@ class Tracker:
         return motion
 
     def _triangulated(
-        self, points: Followed | Features, features: Features, rows: np.ndarray | slice
+        self, points: TrackedPoints | Features, features: Features, rows: np.ndarray | slice
     ) -> tuple[Float, Float]:
         return self._camera.triangulate(
             points.uv_px[rows],

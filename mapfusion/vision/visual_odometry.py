@@ -68,7 +68,7 @@ class RigidMotion:
         return RigidMotion(T, jacobian @ self.covariance @ jacobian.T, self.n_links)
 
 
-def rigid_links(
+def estimate_rigid_motion(
     p_before_m: Float,
     covariance_before_m2: Float,
     p_after_m: Float,

@@ -17,7 +17,7 @@ from mapfusion.geometry.camera import (
     CalibrationError,
     StereoCamera,
     calibration_from,
-    usual_calibration,
+    default_calibration_error,
 )
 from mapfusion.landmark_map import read_map, write_map
 from mapfusion.robot_log import Observations, RobotLog, read_log, write_log
@@ -62,7 +62,7 @@ def test_what_is_no_deviation_is_one_line(text: str) -> None:
 
 
 def test_a_pixel_is_less_in_a_longer_lens() -> None:
-    short, long = (usual_calibration(StereoCamera(focal_px=f)) for f in (300.0, 3000.0))
+    short, long = (default_calibration_error(StereoCamera(focal_px=f)) for f in (300.0, 3000.0))
     assert short.heading_rad > long.heading_rad > 0.002
     assert short.scale == long.scale
 

@@ -10,7 +10,7 @@ from mapfusion.attitude import Attitude
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import between, transform_points
-from mapfusion.vision.visual_odometry import RigidMotion, rigid_links, visual_odometry
+from mapfusion.vision.visual_odometry import RigidMotion, estimate_rigid_motion, visual_odometry
 from tests.mapfusion.vision.rigid_links_twin import rigid_links_twin
 
 CAMERA = StereoCamera()
@@ -148,7 +148,9 @@ def test_true_links_pass_at_the_stated_rate(turn_rad: float, repeats: int) -> No
     """Also where the far longer uncertainty in depth points elsewhere in the frame before."""
     rng = np.random.default_rng(0)
     motion = np.array([0.1, 0.01, turn_rad])
-    passed = [rigid_links(*frames(60, rng, motion), probability=0.9)[0] for _ in range(repeats)]
+    passed = [
+        estimate_rigid_motion(*frames(60, rng, motion), probability=0.9)[0] for _ in range(repeats)
+    ]
     # The three numbers of the motion are fitted to the links themselves and to those that pass, so
     # the share lies by some parts in a thousand off; 12 000 links tell it to 0.003.
     assert np.mean(passed) == pytest.approx(0.9, abs=0.015)
@@ -171,7 +173,7 @@ def test_any_motion_of_space_keeps_its_links_and_is_found() -> None:
         T = tilting(rng)
         after = rng.uniform((2, -1.5, 0), (6, 1.5, 2), (40, 3))
         S = np.tile(np.eye(3) * 0.01**2, (40, 1, 1))
-        agree, motion = rigid_links(after @ T[:3, :3].T + T[:3, 3], S, after, S, 0.999)
+        agree, motion = estimate_rigid_motion(after @ T[:3, :3].T + T[:3, 3], S, after, S, 0.999)
         assert agree.all()
         assert motion is not None
         np.testing.assert_allclose(motion.T_before_after, T, atol=1e-9)
@@ -183,7 +185,7 @@ def test_errors_of_the_motion_obey_its_covariance() -> None:
     squares = []
     for _ in range(300):
         T = tilting(rng)
-        _, motion = rigid_links(*moved_frames(60, rng, T), 0.999)
+        _, motion = estimate_rigid_motion(*moved_frames(60, rng, T), 0.999)
         assert motion is not None
         turn = Rotation.from_matrix(T[:3, :3] @ motion.T_before_after[:3, :3].T).as_rotvec()
         error = np.concatenate([(T - motion.T_before_after)[:3, 3], turn])
@@ -195,8 +197,8 @@ def test_errors_of_the_motion_obey_its_covariance() -> None:
 def test_noise_beyond_what_is_stated_widens_the_covariance() -> None:
     rng = np.random.default_rng(8)
     before, S_before, after, S_after = moved_frames(200, rng, tilting(rng))
-    _, stated = rigid_links(before, S_before, after, S_after, 0.999)
-    _, doubted = rigid_links(before, S_before / 4, after, S_after / 4, 1 - 1e-9)
+    _, stated = estimate_rigid_motion(before, S_before, after, S_after, 0.999)
+    _, doubted = estimate_rigid_motion(before, S_before / 4, after, S_after / 4, 1 - 1e-9)
     assert stated is not None
     assert doubted is not None
     ratio = np.sqrt(np.diag(doubted.covariance) / np.diag(stated.covariance))
@@ -216,7 +218,7 @@ def test_slips_are_cut_and_the_rest_is_kept(share: float) -> None:
         before, S_before = CAMERA.triangulate(
             uvd[:, :2], uvd[:, 2], SIGMA_UV_PX, SIGMA_DISPARITY_PX
         )
-        agree, _ = rigid_links(before, S_before, after, S_after, 0.999)
+        agree, _ = estimate_rigid_motion(before, S_before, after, S_after, 0.999)
         assert not agree[slipped].any()
         assert agree[~slipped].mean() > 0.9
 
@@ -225,7 +227,7 @@ def test_another_robot_is_cut() -> None:
     rng = np.random.default_rng(2)
     still, other = frames(30, rng), frames(8, rng, np.array([0.25, 0.1, -0.05]))
     together = (np.concatenate([a, b]) for a, b in zip(still, other, strict=True))
-    agree, _ = rigid_links(*together, probability=0.999)
+    agree, _ = estimate_rigid_motion(*together, probability=0.999)
     assert agree[:30].all()
     assert agree[30:].sum() <= 1
 
@@ -237,7 +239,7 @@ def test_a_robot_that_passes_close_before_walls_is_cut() -> None:
     body = rng.uniform((1.1, 0.0, 0.05), (1.2, 0.35, 0.25), (5, 3))
     before = seen(np.concatenate([wall, body - np.array([0, 0.087, 0])]), rng)
     after = seen(np.concatenate([wall, body]), rng)
-    agree, _ = rigid_links(*before, *after, probability=0.999)
+    agree, _ = estimate_rigid_motion(*before, *after, probability=0.999)
     assert agree[:80].mean() > 0.95
     assert not agree[80:].any()
 
@@ -251,7 +253,7 @@ def test_finds_the_largest_set_that_one_motion_explains() -> None:
         wrong = rng.choice(8, 2, replace=False)
         before[wrong] += rng.choice([-1, 1], (2, 3)) * rng.uniform(0.3, 0.6, (2, 3))
         S = np.tile(np.eye(3) * 0.01**2, (8, 1, 1))
-        agree, _ = rigid_links(before, S, after, S, 0.999)
+        agree, _ = estimate_rigid_motion(before, S, after, S, 0.999)
         best = max(
             (rows for n in (8, 7, 6) for rows in combinations(range(8), n)),
             key=lambda rows: (explained(before[list(rows)], after[list(rows)]), len(rows)),
@@ -270,8 +272,10 @@ def explained(before: np.ndarray, after: np.ndarray) -> bool:
 def test_units_do_not_matter() -> None:
     before, S_before, after, S_after = frames(40, np.random.default_rng(4))
     before[:4] += 0.2
-    metres, _ = rigid_links(before, S_before, after, S_after, 0.99)
-    millimetres, _ = rigid_links(before * 1e3, S_before * 1e6, after * 1e3, S_after * 1e6, 0.99)
+    metres, _ = estimate_rigid_motion(before, S_before, after, S_after, 0.99)
+    millimetres, _ = estimate_rigid_motion(
+        before * 1e3, S_before * 1e6, after * 1e3, S_after * 1e6, 0.99
+    )
     assert metres.tolist() == millimetres.tolist()
     assert 0 < metres.sum() < 40
 
@@ -279,14 +283,15 @@ def test_units_do_not_matter() -> None:
 @pytest.mark.parametrize("n", [0, 1, 3])
 def test_too_few_to_compare_are_kept(n: int) -> None:
     assert (
-        rigid_links(*frames(n, np.random.default_rng(5)), probability=0.5)[0].tolist() == [True] * n
+        estimate_rigid_motion(*frames(n, np.random.default_rng(5)), probability=0.5)[0].tolist()
+        == [True] * n
     )
 
 
 def test_one_point_seen_many_times_is_no_error() -> None:
     p = np.tile([3.0, 0.0, 1.0], (6, 1))
     S = np.tile(np.eye(3) * 1e-4, (6, 1, 1))
-    assert rigid_links(p, S, p, S, 0.999)[0].all()
+    assert estimate_rigid_motion(p, S, p, S, 0.999)[0].all()
 
 
 @pytest.mark.parametrize("n", [4, 5, 12, 80])
@@ -301,7 +306,7 @@ def test_equals_the_twin(n: int) -> None:
         before[same], after[same] = [3.1, 0.1, 1.0], [3.0, 0.0, 1.0]
         S_before[same], S_after[same] = 1e-4 * np.eye(3), 2e-4 * np.eye(3)
         links = before, S_before, after, S_after, 0.99
-        agree, motion = rigid_links(*links)
+        agree, motion = estimate_rigid_motion(*links)
         same, T = rigid_links_twin(*links)
         assert agree.tolist() == same.tolist()
         assert (motion is None) == (T is None)
