@@ -211,8 +211,8 @@ def _planar_motion(
 ) -> _Observed | None:
     """Motion of the plane by n links; None where fewer than two agree, or leave the turn open.
 
-    As `estimate_rigid_motion` does: least squares over the links inside the gate, while a tolerance that is
-    added to all covariances falls to nothing.
+    As `estimate_rigid_motion` does: least squares over the links inside the gate, while a
+    tolerance that is added to all covariances falls to nothing.
     """
     n = len(p_before)
     size = float(np.sqrt(np.mean(np.var(p_after, axis=0)))) or 1.0

@@ -62,7 +62,7 @@ class FrontEnd:
                 raise ValueError(f"{name}: is {image.dtype} {image.shape}, expected uint8 {size}")
         corners = detect(left, self.parameters.harris)
         matches = match(left, right, corners, self.camera, self.parameters.stereo)
-        matched = matches.verdict == MatchStatus.MATCHED
+        matched = matches.status == MatchStatus.MATCHED
         uv, disparity = corners[matched], matches.disparity_px[matched]
         depth = self.camera.focal_px * self.camera.baseline_m / disparity
         scale = self.parameters.usurf.scales_px(depth, self.camera.focal_px)

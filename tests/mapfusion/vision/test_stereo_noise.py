@@ -48,8 +48,8 @@ def test_true_surfaces_keep_the_limits_at_the_stated_rate(probability: float) ->
     limits = parameters_for_noise(replace(STEREO, residual_correlation_px=6.0), noise, probability)
     for seed in range(4):
         left, right = pair(12.3, noise=2.0, seed=seed, rows=rng.normal(0, 0.3))
-        verdict = match(left, right, uv, CAMERA, limits).verdict
-        kept.append(np.mean(verdict != MatchStatus.SILHOUETTE))
+        status = match(left, right, uv, CAMERA, limits).status
+        kept.append(np.mean(status != MatchStatus.SILHOUETTE))
     # more pass where noise, which is tolerated on top, hides what rows do
     assert np.mean(kept) >= probability - 0.1
 
