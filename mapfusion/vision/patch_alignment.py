@@ -43,49 +43,51 @@ class Templates:
         window: grey levels, row by row, and their slopes along u and v, shape (K, 3, W * W).
         factor: lower Cholesky factors of the normal matrices, shape (K, 8, 8).
         tolerated: largest weighted sum of squared residuals of a fit, or NO_FIT, shape (K,).
+        noise_grey: standard deviation of the grey levels of one image.
+        max_misfit_px: error of the place that a fit tolerates besides noise.
     """
 
     window: Float
     factor: Float
     tolerated: Float
+    noise_grey: float
+    max_misfit_px: float
 
     @classmethod
-    def room(cls, n: int) -> "Templates":
+    def allocate(cls, n: int, noise_grey: float, max_misfit_px: float) -> "Templates":
         """Allocate n templates."""
+        window = np.empty((n, 3, _SIDE_PX**2))
         factor = np.empty((n, N_PARAMETERS, N_PARAMETERS))
-        return cls(np.empty((n, 3, _SIDE_PX**2)), factor, np.empty(n))
+        return cls(window, factor, np.empty(n), noise_grey, max_misfit_px)
 
     @classmethod
     def of(cls, patch: np.ndarray, point: Float, noise: float, max_misfit: float) -> "Templates":
-        """Make the templates of N points, in their order; arguments as in `fill`."""
-        templates = cls.room(len(patch))
-        templates.fill(np.arange(len(patch)), patch, point, noise, max_misfit)
+        """Make the templates of N points, in their order; `patch` and `point` as in `fill`."""
+        templates = cls.allocate(len(patch), noise, max_misfit)
+        templates.fill(np.arange(len(patch)), patch, point)
         return templates
 
     def unused(self, used: np.ndarray, n: int) -> np.ndarray:
         """Return n unused rows; `used` (U,) are in use. A short table grows to twice the need."""
         if len(used) + n > len(self.tolerated):
-            larger = Templates.room(2 * (len(used) + n))
-            for name, values in vars(self).items():
+            larger = self.allocate(2 * (len(used) + n), self.noise_grey, self.max_misfit_px)
+            for name in ("window", "factor", "tolerated"):
+                values = getattr(self, name)
                 getattr(larger, name)[: len(values)] = values
-            self.window, self.factor, self.tolerated = vars(larger).values()
+                setattr(self, name, getattr(larger, name))
         is_free = np.ones(len(self.tolerated), dtype=bool)
         is_free[used] = False
         return np.flatnonzero(is_free)[:n]
 
-    def fill(
-        self, rows: np.ndarray, patch: np.ndarray, point: Float, noise: float, max_misfit: float
-    ) -> None:
+    def fill(self, rows: np.ndarray, patch: np.ndarray, point: Float) -> None:
         """Fill rows with the templates of points.
 
         Args:
             rows: shape (N,).
             patch: parts of images, shape (N, P, P) uint8.
             point: u and v of the points from the patches' middles, shape (N, 2).
-            noise: standard deviation of the grey levels of one image.
-            max_misfit: error of the place that a fit tolerates besides noise, pixels.
         """
-        given = (patch, point, 2 * noise**2, max_misfit**2, rows)
+        given = (patch, point, 2 * self.noise_grey**2, self.max_misfit_px**2, rows)
         _fill_templates(*given, self.window, self.factor, self.tolerated)
 
 
