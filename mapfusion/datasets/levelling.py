@@ -326,7 +326,7 @@ class LevelFrames:
             turn = self._levelling.expected_turn(measured)
             frame = self._observer.observe(found, steps, turn)
             self._levelling.add(frame.tracks.motion, measured, levels.counted(k))
-            own = self._levelling.applied(frame.observations)
+            own = self._levelling.to_level_frame(frame.observations)
         else:
             frame = self._observer.observe(found, steps)
             own = levelled(frame.observations, levels.camera, levels.T_robot_left)

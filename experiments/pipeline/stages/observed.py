@@ -60,7 +60,7 @@ def run(settings: ObservedSettings, job: Job) -> None:
             turn = levelling.expected_turn(measured)
             frame = observer.observe(found, R_after_before=turn)
             levelling.add(frame.tracks.motion, measured)
-            observed.append(levelling.applied(frame.observations))
+            observed.append(levelling.to_level_frame(frame.observations))
         state = frame.tracks
         truth.append(points.at(state.uv_px - found.uv_px)[frame.rows])
         if iteration in kept:

@@ -36,7 +36,7 @@ def test_it_is_the_sum_of_what_both_know() -> None:
     more = np.array([2e-4, -1e-4, 3e-4])
     turned = (Rotation.from_rotvec(more) * Rotation.from_matrix(T[:3, :3])).as_rotvec()
     own = (2e-4**2 * STEP_S + 1e-6) * STEP_S**2 * np.eye(3) + NOISE_RAD**2 * np.eye(3)
-    found = gyroscope.joined(turned, STEP_S, motion_of(T, C))
+    found = gyroscope.fuse(turned, STEP_S, motion_of(T, C))
     precision = np.linalg.inv(C)
     precision[3:, 3:] += np.linalg.inv(own)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(precision), rtol=1e-3, atol=1e-15)
@@ -58,7 +58,7 @@ def driven(seed: int, n: int, lost: slice) -> tuple[Gyroscope, np.ndarray, np.nd
         seen = Rotation.from_rotvec(rng.normal(0, 5e-4, 3)) * true
         motion = motion_of(se3.pose(seen.as_matrix(), rng.normal(0, 1e-3, 3)), C)
         blind = k in range(*lost.indices(n))
-        found = gyroscope.joined(counted, STEP_S, None if blind else motion)
+        found = gyroscope.fuse(counted, STEP_S, None if blind else motion)
         made = Rotation.from_matrix(found.T_before_after[:3, :3])
         errors[k] = (made * true.inv()).as_rotvec()
         sigmas[k] = np.sqrt(np.diag(found.covariance)[3:])
@@ -189,11 +189,11 @@ def test_a_mount_changes_nothing() -> None:
         told = AttitudeMeasurement(np.array([*se3.roll_pitch(body[:3, :3]), 0.0]), INCLINOMETER)
         turn, seen_turn = own.expected_turn(told), by_camera.expected_turn(told)
         motion = measured_motion(rng, bodies[k - 1], body) if k else None
-        seen = None if motion is None else motion.of(se3.inverse(mount))
+        seen = None if motion is None else motion.of_body(se3.inverse(mount))
         own.add(motion, told)
         by_camera.add(seen, told)
         points = [
-            levelling.applied(Observations(p, np.tile(1e-4 * np.eye(3), (7, 1, 1))))
+            levelling.to_level_frame(Observations(p, np.tile(1e-4 * np.eye(3), (7, 1, 1))))
             for levelling, p in ((own, p_body), (by_camera, p_camera))
         ]
         np.testing.assert_allclose(points[1].position_m, points[0].position_m, atol=1e-12)

@@ -2,13 +2,21 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from mapfusion.geometry.camera import StereoCamera
 from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.stereo import MatchStatus, StereoParameters, match
-from mapfusion.vision.stereo_noise import NoiseModel, estimate_noise, parameters_for_noise
+from mapfusion.vision.stereo_noise import (
+    NoiseModel,
+    estimate_noise,
+    parameters_for_noise,
+    rectification_offsets,
+)
+from tests.mapfusion.vision.rendered_scene import render, wall
 from tests.mapfusion.vision.shifted_pictures import CAMERA, grid, pair
 
 HARRIS = HarrisParameters(max_corners=400)
@@ -75,3 +83,27 @@ def test_limits_are_those_of_a_mean_of_so_many_squares() -> None:
     rms = np.sqrt(chi2.ppf(1 - 0.1 / 4, 34) / 34)
     assert limits.max_rows_px == pytest.approx(0.4 * rms)
     assert limits.plane_misfit_px == limits.max_misfit_px == pytest.approx(0.5 * rms)
+
+
+ROW_CAMERA = StereoCamera(width_px=320, height_px=240, focal_px=290.0)
+
+
+@pytest.fixture(scope="module")
+def rendered_pair() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    planes = [wall(rng, (4, 3), (3, -3), 8.0, -3.0)]
+    return render(planes, ROW_CAMERA, noise=2.0, rng=rng)[:2]
+
+
+@pytest.mark.parametrize("rows", [-6.0, 0.0, 2.5])
+def test_a_row_error_is_found(rendered_pair: tuple[np.ndarray, np.ndarray], rows: float) -> None:
+    moved = np.array([[1, 0, 0], [0, 1, rows]])
+    right = cv2.warpAffine(rendered_pair[1], moved, (320, 240), borderMode=cv2.BORDER_REPLICATE)
+    errors = rectification_offsets(rendered_pair[0], right, HarrisParameters())[:, 1]
+    assert len(errors) > 30
+    assert np.median(errors) == pytest.approx(rows, abs=0.15)
+
+
+def test_pictures_without_corners_have_no_row_error() -> None:
+    flat = np.full((240, 320), 90, np.uint8)
+    assert len(rectification_offsets(flat, flat, HarrisParameters())) == 0
