@@ -324,7 +324,7 @@ class Tracker:
             before, points_before, tracks = self._previous
             expected = before
             if R_after_before is not None:
-                turned = self._camera.turned(before.uv_px, R_after_before)
+                turned = self._camera.rotate_pixels(before.uv_px, R_after_before)
                 expected = replace(before, uv_px=turned)
             source = link(expected, features, self.parameters, steps)
             points, found = follow_points(points_before, before, features, source)

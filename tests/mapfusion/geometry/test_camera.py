@@ -147,6 +147,6 @@ def test_far_points_are_seen_where_a_turn_of_the_robot_leaves_them():
     rng = np.random.default_rng(3)
     far = 1e7 * np.column_stack([np.ones(20), rng.uniform(-0.4, 0.4, (20, 2))])
     R_robot_before = Rotation.from_euler("ZYX", [0.1, -0.06, 0.03]).as_matrix()
-    found = CAMERA.turned(CAMERA.project(far)[:, :2], R_robot_before)
+    found = CAMERA.rotate_pixels(CAMERA.project(far)[:, :2], R_robot_before)
     expected = CAMERA.project(np.array([R_robot_before @ p for p in far]))[:, :2]
     np.testing.assert_allclose(found, expected, atol=1e-4)
