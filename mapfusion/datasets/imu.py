@@ -3,7 +3,7 @@
 An accelerometer feels gravity and how the body speeds up, sways and shakes. Gravity alone stays, so
 its direction is right in the long run and turns from frame to frame are not: those come from the
 pictures, as a complementary filter takes them from gyroscopes (Mahony, Hamel, Pflimlin 2008,
-"Nonlinear complementary filters on the special orthogonal group"). The filter is `Levelling`'s;
+"Nonlinear complementary filters on the special orthogonal group"). `AttitudeEstimator` filters;
 here is what it takes for measured, and how far that strays.
 """
 

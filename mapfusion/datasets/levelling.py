@@ -15,9 +15,9 @@ from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se3 import inverse, pose, roll_pitch
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import Observations
-from mapfusion.vision.attitude_filter import Levelling, Measured
-from mapfusion.vision.features import Features
+from mapfusion.vision.attitude_filter import AttitudeEstimator, AttitudeMeasurement
 from mapfusion.vision.front_end import FrontEndParameters, Observer
+from mapfusion.vision.tracking import Features
 from mapfusion.vision.visual_odometry import RigidMotion
 
 _UP_TO_A_QUARTER = Range(-1.5, 1.5, "rad")  # a camera that looks straight up sees no walls
@@ -258,30 +258,32 @@ class Levels:
             return None
         return self._counted[0][k], float(self._counted[1][k])
 
-    def measured(self, k: int, found: Features, sigma_uv_px: float) -> Measured:
+    def measured(self, k: int, found: Features, sigma_uv_px: float) -> AttitudeMeasurement:
         """Of frame k, in which these features were found."""
         if self._known == "odometry":
             assert self._odometry is not None
             T = self._odometry[k]
             told = [*roll_pitch(T[:3, :3]), T[2, 3] - self._odometry[0, 2, 3]]
-            return Measured(np.array(told), np.array([_TOLD_SIGMA_RAD] * 2 + [_TOLD_SIGMA_M]))
+            return AttitudeMeasurement(
+                np.array(told), np.array([_TOLD_SIGMA_RAD] * 2 + [_TOLD_SIGMA_M])
+            )
         if self._known == "imu":
             assert self._tilts is not None
             value, sigma = self._tilts
             height = np.nan if k else 0.0  # the map's, and carried on
-            return Measured(np.array([*value[k], height]), np.array([*sigma, 0.0]))
+            return AttitudeMeasurement(np.array([*value[k], height]), np.array([*sigma, 0.0]))
         seen = self._floor(found, sigma_uv_px) if self._known == "floor" else None
         if seen is not None:
             return seen
         # what the first frame takes for level is, but for how the body stands, the map's plane
-        return Measured(np.full(3, np.nan if k else 0.0), _FIRST_SIGMA)
+        return AttitudeMeasurement(np.full(3, np.nan if k else 0.0), _FIRST_SIGMA)
 
-    def _floor(self, found: Features, sigma_uv_px: float) -> Measured | None:
+    def _floor(self, found: Features, sigma_uv_px: float) -> AttitudeMeasurement | None:
         noise = (sigma_uv_px, found.sigma_disparity_px)
         points = Observations(*self.camera.triangulate(found.uv_px, found.disparity_px, *noise))
         points = levelled(points, self.camera, self.T_robot_left)
         floor = floor_of(points, float(self.T_robot_left[2, 3]), _ON_THE_FLOOR)
-        return None if floor is None else Measured(*floor.attitude)
+        return None if floor is None else AttitudeMeasurement(*floor.attitude)
 
 
 class LevelFrames:
@@ -304,7 +306,9 @@ class LevelFrames:
         self._levels, self._sigma_uv_px = levels, vision.sigma_uv_px
         camera = levels.camera
         taken = se3.pose(camera.camera_axes, camera.p_robot_left)
-        self._levelling = Levelling(levels.T_robot_left @ se3.inverse(taken), levels.shared_rad)
+        self._levelling = AttitudeEstimator(
+            levels.T_robot_left @ se3.inverse(taken), levels.shared_rad
+        )
         self._observer = Observer.of(camera, vision)
         self._before = 0
 
@@ -322,7 +326,7 @@ class LevelFrames:
             turn = self._levelling.expected_turn(measured)
             frame = self._observer.observe(found, steps, turn)
             self._levelling.add(frame.tracks.motion, measured, levels.counted(k))
-            own = self._levelling.applied(frame.observations)
+            own = self._levelling.to_level_frame(frame.observations)
         else:
             frame = self._observer.observe(found, steps)
             own = levelled(frame.observations, levels.camera, levels.T_robot_left)

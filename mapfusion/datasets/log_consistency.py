@@ -35,7 +35,7 @@ from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import between, inverse, rotation, wrap
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.tables import NO_LABEL
-from mapfusion.vision.visual_odometry import MIN_LINKS, RigidMotion, rigid_links
+from mapfusion.vision.visual_odometry import MIN_LINKS, RigidMotion, estimate_rigid_motion
 
 # Probability that anything is said of a log whose agreement lies at the limit; that of sound logs
 # lies far above.
@@ -211,8 +211,8 @@ def _planar_motion(
 ) -> _Observed | None:
     """Motion of the plane by n links; None where fewer than two agree, or leave the turn open.
 
-    As `rigid_links` does: least squares over the links inside the gate, while a tolerance that is
-    added to all covariances falls to nothing.
+    As `estimate_rigid_motion` does: least squares over the links inside the gate, while a
+    tolerance that is added to all covariances falls to nothing.
     """
     n = len(p_before)
     size = float(np.sqrt(np.mean(np.var(p_after, axis=0)))) or 1.0
@@ -255,7 +255,7 @@ def _observed_motion(
         return _planar_motion(p[a, :2], S[a, :2, :2], p[b, :2], S[b, :2, :2])
     if log.planar or len(a) < MIN_LINKS:
         return None
-    _, found = rigid_links(p[a], S[a], p[b], S[b], _LINK_PROBABILITY)
+    _, found = estimate_rigid_motion(p[a], S[a], p[b], S[b], _LINK_PROBABILITY)
     if found is None:
         return None
     return _Observed(found.T_before_after, found.covariance, len(a), found.n_links)

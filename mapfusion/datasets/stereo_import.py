@@ -32,7 +32,7 @@ from mapfusion.datasets.tum import TimedPoses
 from mapfusion.errors import InputError, OutOfRangeError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import CalibrationError, StereoCamera, usual_calibration
+from mapfusion.geometry.camera import CalibrationError, StereoCamera, default_calibration_error
 from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import (
     TRUTH_FILES,
@@ -41,10 +41,18 @@ from mapfusion.robot_log import (
     write_odometry_covariance,
     write_truth_poses,
 )
-from mapfusion.vision.features import Features
-from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, Observer, joined
-from mapfusion.vision.stereo_noise import limits_for, measured_noise, offsets
-from mapfusion.vision.tracking import Tracks
+from mapfusion.vision.front_end import (
+    FrontEnd,
+    FrontEndParameters,
+    Observer,
+    concatenate_observations,
+)
+from mapfusion.vision.stereo_noise import (
+    estimate_noise,
+    parameters_for_noise,
+    rectification_offsets,
+)
+from mapfusion.vision.tracking import Features, Tracks
 from mapfusion.vision.visual_odometry import RigidMotion, robot_motions, visual_odometry
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -105,9 +113,9 @@ def measured_vision(
         run: pairs that follow one another, for what tracks do.
     """
     vision = derived_vision(camera)
-    noise = measured_noise(apart, camera, vision.harris, vision.stereo)
+    noise = estimate_noise(apart, camera, vision.harris, vision.stereo)
     if noise is not None:
-        stereo = limits_for(vision.stereo, noise, _TRUE_SHARE)
+        stereo = parameters_for_noise(vision.stereo, noise, _TRUE_SHARE)
         tracks = replace(
             vision.tracks,
             noise_grey=noise.noise_grey,
@@ -268,7 +276,7 @@ class StereoImport:
             raise InputError(f"{recording.calibrated_by or recording.name}: {error}") from error
         self.camera: StereoCamera = self._rectification.camera
         by_camera = self._vision_of_camera()
-        self.calibration_error = calibration(usual_calibration(self.camera))
+        self.calibration_error = calibration(default_calibration_error(self.camera))
         pairs = [self.rectified(k) for k in sampled(len(recording))]
         self._require_rows(pairs, by_camera)
         middle = max((len(recording) - _RUN) // 2, 0)
@@ -299,7 +307,7 @@ class StereoImport:
     def _require_rows(
         self, pairs: Sequence[tuple[np.ndarray, np.ndarray]], vision: FrontEndParameters
     ) -> None:
-        off = np.concatenate([offsets(*pair, vision.harris) for pair in pairs])
+        off = np.concatenate([rectification_offsets(*pair, vision.harris) for pair in pairs])
         if len(off) < _LEAST_MATCHES:
             return
         rows = float(np.median(np.abs(off[:, 1])))
@@ -344,7 +352,7 @@ class StereoImport:
         attitude, linked = self._attitude(frames, known), np.array(frames.linked)
         seen = visual_odometry(frames.motions, steps, self.camera, self.T_robot_camera, attitude)
         odometry = seen.increments if reckoned is None else _increments(reckoned)
-        observed = joined(frames.observed)
+        observed = concatenate_observations(frames.observed)
         log = RobotLog(cut.robot, False, time_s, odometry, *observed, self.calibration_error)
         shown = robot_motions(frames.motions, self.camera, self.T_robot_camera)
         findings = _findings(shown, reckoned, T_world_robot)

@@ -24,7 +24,7 @@ from mapfusion.fusion.joint_estimate import (
     weighted_information,
 )
 from mapfusion.fusion.kalman import KalmanDrift
-from mapfusion.geometry.joint_covariance import JointCovariance, condensed
+from mapfusion.geometry.joint_covariance import JointCovariance, reduce_rank
 from mapfusion.geometry.numerics import Float, inverses, one_blas_thread
 from mapfusion.geometry.se2 import IDENTITY
 from mapfusion.landmark_map import LandmarkMap
@@ -131,7 +131,7 @@ class JointlyFused:
         position[:, :n_dimensions] = total
         shared = np.zeros((n_unknowns, n, 3))
         shared[:, :, :n_dimensions] = moved.transpose(2, 0, 1)
-        return position, condensed(covariance, shared.reshape(n_unknowns, 3 * n))
+        return position, reduce_rank(covariance, shared.reshape(n_unknowns, 3 * n))
 
 
 # What is one point is judged anew with each estimate, until nothing changes or for so many rounds.

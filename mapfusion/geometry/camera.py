@@ -4,11 +4,11 @@ The cameras look along the robot's x axis, unless their mount tilts them. Pixels
 down, the centre of the top left pixel is (0, 0). A point at depth Z has disparity
 d = u_left - u_right = f B / Z.
 
-Whoever calibrates a pair of cameras and measures its mount errs once, and every observation is off
-by the same. No residual within one map shows it: a map turned about its beginning, or larger by a
-share, fits itself as well. Between the maps of two robots it does: T_a_b and what is fused by it
-are no surer than the cameras are. Robots whose cameras were calibrated alike err alike, and no
-number of them averages it out. Simulated cameras are known exactly.
+An error of the calibration or of the mount affects all observations of a robot in the same way. The
+residuals within one map do not show the error: a map rotated about its origin or scaled has the
+same residuals. The error affects T_a_b between the maps of two robots, and the fused map. Robots
+with the same calibration share the error, so averaging over robots does not remove it. Simulated
+cameras are known exactly.
 """
 
 import math
@@ -33,14 +33,14 @@ class StereoCamera:
     """Intrinsics and mount; the defaults are the STH-MDCS2 head (640x480, 1/2" sensor, 6 mm lens).
 
     Attributes:
-        width_px: of either image.
-        height_px: of either image.
+        width_px: width of both images.
+        height_px: height of both images.
         focal_px: focal length.
-        baseline_m: between the two optical centres; the left one is half of it to the left.
-        mount_x_m: of the middle between the optical centres, ahead of the middle of the axles.
-        mount_z_m: of the same, above the floor.
-        mount_roll_rad: about the axis ahead, the right camera down.
-        mount_pitch_rad: about the axis to the left, looking down.
+        baseline_m: distance of the two optical centres.
+        mount_x_m: distance of the middle of the optical centres ahead of the middle of the axles.
+        mount_z_m: height of the middle of the optical centres above the floor.
+        mount_roll_rad: rotation about the axis ahead; positive lowers the right camera.
+        mount_pitch_rad: rotation about the axis to the left; positive looks down.
     """
 
     width_px: Annotated[int, Range(1, MAX_IMAGE_SIDE_PX, "px")] = 640
@@ -57,12 +57,12 @@ class StereoCamera:
 
     @property
     def center_px(self) -> tuple[float, float]:
-        """Principal point: the middle of the image."""
+        """Principal point, in the middle of the image."""
         return (self.width_px - 1) / 2, (self.height_px - 1) / 2
 
-    @cached_property  # asked for several times a frame
+    @cached_property  # used several times per frame
     def camera_axes(self) -> Float:
-        """The cameras' axes ahead, left and up, as columns (3, 3) in the robot frame."""
+        """Camera axes ahead, left and up in the robot frame, as columns (3, 3)."""
         axes = tilt(self.mount_roll_rad, self.mount_pitch_rad)
         axes.flags.writeable = False
         return axes
@@ -73,12 +73,16 @@ class StereoCamera:
         return self.p_robot_eye(self.baseline_m / 2)
 
     def p_robot_eye(self, y_m: float) -> Float:
-        """Optical centre (3,) of a camera so far to the left of the middle of the pair."""
+        """Return the optical centre (3,) of a camera at `y_m` to the left of the pair's middle."""
         middle = np.array([self.mount_x_m, 0.0, self.mount_z_m])
         return middle + y_m * self.camera_axes[:, 1]
 
     def project(self, p_robot: ArrayLike) -> Float:
-        """Points (N, 3) of the robot frame to (N, 3) u, v (left image) and disparity, in pixels."""
+        """Project points (N, 3) of the robot frame.
+
+        Returns:
+            u and v in the left image, and disparity, pixels, shape (N, 3).
+        """
         p_camera = (np.asarray(p_robot, dtype=np.float64) - self.p_robot_left) @ self.camera_axes
         depth = p_camera[:, 0]
         center_u, center_v = self.center_px
@@ -92,7 +96,7 @@ class StereoCamera:
         )
 
     def back_project(self, uv_px: ArrayLike, depth_m: ArrayLike) -> Float:
-        """Left pixels (N, 2) at depths (N,) along the optical axis to robot-frame points (N, 3)."""
+        """Return points (N, 3) of the robot frame at left pixels (N, 2) and depths (N,)."""
         uv = np.asarray(uv_px, dtype=np.float64)
         depth = np.asarray(depth_m, dtype=np.float64)
         center_u, center_v = self.center_px
@@ -106,10 +110,12 @@ class StereoCamera:
         )
         return p_camera @ self.camera_axes.T + self.p_robot_left
 
-    def turned(self, uv_px: ArrayLike, R_robot_before: Float) -> Float:
-        """Pixels (N, 2) to where far points are seen after the robot has turned about itself.
+    def rotate_pixels(self, uv_px: ArrayLike, R_robot_before: Float) -> Float:
+        """Return the pixels of far points after a rotation of the robot.
 
-        `R_robot_before` (3, 3) is how it stood before in the axes that it has now.
+        Args:
+            uv_px: pixels before the rotation, shape (N, 2).
+            R_robot_before: axes of the robot before, in its axes after, shape (3, 3).
         """
         ray = self.back_project(uv_px, np.ones(len(np.asarray(uv_px)))) - self.p_robot_left
         return self.project(ray @ R_robot_before.T + self.p_robot_left)[:, :2]
@@ -121,11 +127,19 @@ class StereoCamera:
         sigma_uv_px: float,
         sigma_disparity_px: ArrayLike,
     ) -> tuple[Float, Float]:
-        """Points (N, 3) of the robot frame and their covariances (N, 3, 3) from matched pixels.
+        """Triangulate matched pixels.
 
-        First-order propagation of independent noise in u, v and disparity through the triangulation
-        (this is the R_t of eq. 6): the error along the ray grows with the square of the depth.
-        `sigma_disparity_px` is one number or (N,).
+        First-order propagation of independent noise in u, v and disparity (R_t of eq. 6): the error
+        along the ray grows with the square of the depth.
+
+        Args:
+            uv_px: pixels of the left image, shape (N, 2).
+            disparity_px: disparities, shape (N,).
+            sigma_uv_px: standard deviation of u and v.
+            sigma_disparity_px: standard deviation of the disparity, a number or shape (N,).
+
+        Returns:
+            Points of the robot frame, shape (N, 3), and their covariances, shape (N, 3, 3).
         """
         uv = np.asarray(uv_px, dtype=np.float64)
         disparity = np.asarray(disparity_px, dtype=np.float64)
@@ -145,29 +159,28 @@ class StereoCamera:
         return position, np.einsum("nij,nj,nkj->nik", jacobian, variance, jacobian)
 
 
-# Of the middle of a rectified image: checkerboards tell it to about a pixel, and to no more once
-# lens and pair were moved to another day's temperature.
+# Standard deviations of a usual calibration. Checkerboards determine the principal point to about a
+# pixel, and temperature changes it afterwards.
 _PRINCIPAL_PX = 1.0
-_MOUNT_RAD = 0.002  # of the camera's heading on its robot: what measuring a mount reaches, 0.1 deg
-# Of depths, by focal length, baseline and the right camera's turn: KITTI's published calibration
-# leaves some tenths of a percent (Kreso and Segvic 2015, "Improving the egomotion estimation by
-# correcting the calibration bias").
+_MOUNT_RAD = 0.002  # heading of the camera on its robot: accuracy of a measured mount, 0.1 deg
+# Scale of the depths, by focal length, baseline and rotation of the right camera: errors of KITTI's
+# published calibration are some tenths of a percent (Kreso and Segvic 2015, "Improving the
+# egomotion estimation by correcting the calibration bias").
 _SCALE = 0.003
 _ATTRIBUTES = {"heading_rad": "calibration_heading_rad", "scale": "calibration_scale"}
-N_OF_CAMERA = len(_ATTRIBUTES)  # independent errors of a camera
+N_OF_CAMERA = len(_ATTRIBUTES)  # number of independent errors of a camera
 _CAMERA_ATTRIBUTE = "calibration_camera"
 
 
 @dataclass(frozen=True)
 class CalibrationError:
-    """Standard deviations of what one robot's observations have in common; independent.
+    """Standard deviations of the independent errors that all observations of a robot share.
 
     Attributes:
-        heading_rad: of the camera's heading in the robot's frame: its mount, and the middle of its
-            image.
-        scale: of all lengths, as a share: focal length and baseline.
-        camera: whose errors they are: robots that name the same one err alike. Empty: the robot's
-            own.
+        heading_rad: heading of the camera in the robot frame, by mount and principal point.
+        scale: relative error of all lengths, by focal length and baseline.
+        camera: name of the camera; robots with the same name share the error. Empty for the robot's
+            own camera.
     """
 
     heading_rad: Annotated[float, Range(0, 1, "rad")] = 0.0
@@ -179,18 +192,24 @@ class CalibrationError:
 
     @property
     def is_none(self) -> bool:
-        """Whether the camera is known exactly."""
+        """True if the camera is known exactly."""
         return self.heading_rad == 0 and self.scale == 0
 
     def is_of_one_camera(self, other: "CalibrationError") -> bool:
-        """Whether the other robot's errors are the same."""
+        """Return True if two robots share the errors of one camera."""
         return self.camera != "" and self.camera == other.camera
 
     def moves_m(self, position_m: Float) -> Float:
-        """How far one sigma of each error moves points (N, 2 or 3) of the robot's map: (N, 2, 3).
+        """Return the displacement of points of the robot's map by one sigma of each error.
 
-        In the plane: the map turns about its beginning, and grows. Heights are of the order of the
-        camera's own, and roll and pitch are in the observations' covariances.
+        The heading error rotates the map about its origin, the scale error enlarges it. Errors of
+        heights are neglected; those of roll and pitch are part of the observations' covariances.
+
+        Args:
+            position_m: points, shape (N, 2) or (N, 3).
+
+        Returns:
+            Displacements, shape (N, 2, 3).
         """
         x, y = position_m[:, 0], position_m[:, 1]
         moved = np.zeros((len(position_m), N_OF_CAMERA, 3))
@@ -199,26 +218,30 @@ class CalibrationError:
         return moved
 
     def attributes(self) -> dict[str, str]:
-        """As files have it in their metadata; nothing of a camera that is known exactly."""
+        """Return the metadata of files; empty for a camera that is known exactly."""
         if self.is_none:
             return {}
-        told = {key: repr(float(getattr(self, name))) for name, key in _ATTRIBUTES.items()}
-        return told | ({_CAMERA_ATTRIBUTE: self.camera} if self.camera else {})
+        sigmas = {key: repr(float(getattr(self, name))) for name, key in _ATTRIBUTES.items()}
+        return sigmas | ({_CAMERA_ATTRIBUTE: self.camera} if self.camera else {})
 
 
 EXACT = CalibrationError()
 
 
 def calibration_from(attributes: Mapping[str, str], where: object) -> CalibrationError:
-    """What a file's metadata tell, EXACT where they tell nothing; raises InputError."""
+    """Read the calibration error from a file's metadata; EXACT if the metadata have none.
+
+    Raises:
+        InputError: a value is no number or out of its range; names the file `where`.
+    """
     try:
-        told = {name: float(attributes.get(key, "0")) for name, key in _ATTRIBUTES.items()}
-        return CalibrationError(**told, camera=attributes.get(_CAMERA_ATTRIBUTE, ""))
+        sigmas = {name: float(attributes.get(key, "0")) for name, key in _ATTRIBUTES.items()}
+        return CalibrationError(**sigmas, camera=attributes.get(_CAMERA_ATTRIBUTE, ""))
     except ValueError as error:
         keys = " and ".join(_ATTRIBUTES.values())
         raise InputError(f"{where}: {keys} in its metadata: {error}") from error
 
 
-def usual_calibration(camera: StereoCamera) -> CalibrationError:
-    """Of a camera that somebody calibrated, and said no more."""
+def default_calibration_error(camera: StereoCamera) -> CalibrationError:
+    """Return the usual errors of a calibrated camera without stated uncertainty."""
     return CalibrationError(math.hypot(_PRINCIPAL_PX / camera.focal_px, _MOUNT_RAD), _SCALE)

@@ -1,8 +1,9 @@
 """Joint covariance of a map's landmarks: block diagonal plus low rank.
 
-What landmarks have in common, the drift of the path that saw them, has few directions that count.
-So a landmark is its estimate plus an error of its own plus what a few shared, independent, standard
-normal variables z do to all of them: x_i = m_i + C_i' z + e_i, with e_i of covariance `own_m2`.
+The errors of all landmarks are correlated by the drift of the path, which has few dominant
+directions. So the error of a landmark is modelled as an error of its own plus the effect of a few
+shared, independent, standard normal variables z: x_i = m_i + C_i' z + e_i, with e_i of covariance
+`own_m2`.
 """
 
 from dataclasses import dataclass
@@ -15,28 +16,29 @@ import scipy.linalg
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import require_finite, require_shape
 
-# Of the shared variables that a log gives, three a frame, as many are kept: their variances fall
-# fast, and what they leave goes to the landmarks' own part.
+# Number of shared variables that are kept. A log has three per frame, but their variances fall
+# fast; the remainder is added to the landmarks' own covariances.
 RANK = 100
-# The subspace of the largest variances is found by iteration, with so many directions to spare; at
-# each what is not wanted shrinks by the ratio of its variance to the wanted ones.
-_TO_SPARE, _ITERATIONS = 20, 3
-# Sine of a direction's angle to those before it, below which products of both tell nothing of it.
+# Oversampling and iterations of the subspace iteration. In each iteration the unwanted directions
+# shrink by the ratio of their variance to the wanted ones.
+_OVERSAMPLING, _ITERATIONS = 20, 3
+# Sine of the angle between a direction and those before it, below which CholeskyQR is inaccurate.
 _DEPENDENT = 1e-6
-# Of so many rows all products of Y Y' cost no more than those with some columns by way of Y' do in
-# all iterations.
-_FEW = 2 * _ITERATIONS * (RANK + _TO_SPARE)
+# Largest number of rows for which computing Y Y' costs no more than its products with columns by
+# way of Y' in all iterations.
+_FEW = 2 * _ITERATIONS * (RANK + _OVERSAMPLING)
 
 (_cholesky,) = scipy.linalg.get_lapack_funcs(("potrf",), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class JointCovariance:
-    """Of N landmarks and R shared variables.
+    """Joint covariance of N landmarks by R shared variables.
 
     Attributes:
-        own_m2: (N, 3, 3) of what is each landmark's own.
-        common_m: (N, R, 3) C_i: how far one sigma of each shared variable moves the landmark.
+        own_m2: covariance of each landmark's own error, shape (N, 3, 3).
+        common_m: C_i, displacement of each landmark by one sigma of each shared variable, shape
+            (N, R, 3).
     """
 
     own_m2: Float
@@ -57,16 +59,16 @@ class JointCovariance:
 
     @property
     def rank(self) -> int:
-        """R."""
+        """Number R of shared variables."""
         return self.common_m.shape[1]
 
     @property
     def marginal_m2(self) -> Float:
-        """(N, 3, 3) covariance of each landmark for itself."""
+        """Marginal covariance of each landmark, shape (N, 3, 3)."""
         return self.own_m2 + _squares(self.common_m)
 
     def dense_m2(self) -> Float:
-        """(3N, 3N), for small maps."""
+        """Return the dense covariance, shape (3N, 3N), for small maps."""
         n, each = len(self), np.arange(len(self))
         stacked = self.common_m.transpose(1, 0, 2).reshape(self.rank, 3 * n)
         joint = stacked.T @ stacked
@@ -75,36 +77,36 @@ class JointCovariance:
 
 
 class SharedErrors(Protocol):
-    """Y (R, 3N): what R independent, standard normal variables do to N landmarks."""
+    """Matrix Y (R, 3N): displacement of N landmarks by R independent standard normal variables."""
 
     def __len__(self) -> int:
-        """R."""
+        """Return R."""
         ...
 
     def rows_by_all(self, rows: np.ndarray) -> Float:
-        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        """Return the columns `rows` (r,) of Y Y', shape (R, r)."""
         ...
 
     def gram(self, columns: Float) -> Float:
-        """Y Y' times columns (R, c)."""
+        """Return Y Y' times columns (R, c)."""
         ...
 
     def spread(self, columns: Float) -> Float:
-        """(3N, c) Y' times columns (R, c)."""
+        """Return Y' times columns (R, c), shape (3N, c)."""
         ...
 
     def gathered(self, by_landmark: Float) -> Float:
-        """Return (R, c) Y times columns (3N, c)."""
+        """Return Y times columns (3N, c), shape (R, c)."""
         ...
 
     def squares(self) -> Float:
-        """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        """Return the diagonal blocks of Y' Y, shape (N, 3, 3)."""
         ...
 
 
 @dataclass(frozen=True)
 class KnownErrors:
-    """Y as it is."""
+    """Shared errors by the matrix Y itself; methods as in `SharedErrors`."""
 
     common: Float
 
@@ -112,38 +114,41 @@ class KnownErrors:
         return len(self.common)
 
     @cached_property
-    def _by_all(self) -> Float:
-        """(R, R) Y Y'."""
+    def _gram(self) -> Float:
+        """Y Y', shape (R, R)."""
         return self.common @ self.common.T
 
     def rows_by_all(self, rows: np.ndarray) -> Float:
-        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        """Return the columns `rows` (r,) of Y Y', shape (R, r)."""
         if len(self) <= _FEW:
-            return self._by_all[:, rows]
+            return self._gram[:, rows]
         return self.common @ np.ascontiguousarray(self.common[rows].T)
 
     def gram(self, columns: Float) -> Float:
-        """Y Y' times columns (R, c)."""
+        """Return Y Y' times columns (R, c)."""
         if len(self) <= _FEW:
-            return self._by_all @ columns
+            return self._gram @ columns
         return self.common @ self.spread(columns)
 
     def spread(self, columns: Float) -> Float:
-        """(3N, c) Y' times columns (R, c)."""
+        """Return Y' times columns (R, c), shape (3N, c)."""
         return self.common.T @ columns
 
     def gathered(self, by_landmark: Float) -> Float:
-        """Return (R, c) Y times columns (3N, c)."""
+        """Return Y times columns (3N, c), shape (R, c)."""
         return self.common @ by_landmark
 
     def squares(self) -> Float:
-        """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        """Return the diagonal blocks of Y' Y, shape (N, 3, 3)."""
         return _squares(_by_landmark(self.common))
 
 
 @dataclass(frozen=True)
 class StackedErrors:
-    """Y of the rows of one and, after them, of few known others, independent of the first."""
+    """Shared errors followed by a few known ones, independent of the first.
+
+    Methods as in `SharedErrors`.
+    """
 
     first: SharedErrors
     known: KnownErrors
@@ -152,49 +157,54 @@ class StackedErrors:
         return len(self.first) + len(self.known)
 
     def rows_by_all(self, rows: np.ndarray) -> Float:
-        """(R, r) columns of Y Y', those of `rows` (r,)."""
+        """Return the columns `rows` (r,) of Y Y', shape (R, r)."""
         chosen = np.zeros((len(self), len(rows)))
         chosen[rows, np.arange(len(rows))] = 1.0
         return self.gram(chosen)
 
     def gram(self, columns: Float) -> Float:
-        """Y Y' times columns (R, c)."""
+        """Return Y Y' times columns (R, c)."""
         upper, lower = columns[: len(self.first)], columns[len(self.first) :]
-        of_first = self.first.gram(upper) + self._between @ lower
-        return np.concatenate([of_first, self._between.T @ upper + self.known.gram(lower)])
+        of_first = self.first.gram(upper) + self._cross @ lower
+        return np.concatenate([of_first, self._cross.T @ upper + self.known.gram(lower)])
 
     def spread(self, columns: Float) -> Float:
-        """(3N, c) Y' times columns (R, c)."""
+        """Return Y' times columns (R, c), shape (3N, c)."""
         upper, lower = columns[: len(self.first)], columns[len(self.first) :]
         return self.first.spread(upper) + self.known.spread(lower)
 
     def gathered(self, by_landmark: Float) -> Float:
-        """Return (R, c) Y times columns (3N, c)."""
+        """Return Y times columns (3N, c), shape (R, c)."""
         return np.concatenate([self.first.gathered(by_landmark), self.known.gathered(by_landmark)])
 
     def squares(self) -> Float:
-        """(N, 3, 3) blocks of Y' Y, each landmark's with itself."""
+        """Return the diagonal blocks of Y' Y, shape (N, 3, 3)."""
         return self.first.squares() + self.known.squares()
 
     @cached_property
-    def _between(self) -> Float:
-        """Rows of the first times those that are known."""
+    def _cross(self) -> Float:
+        """Block of Y Y' between the first and the known errors."""
         return self.first.gathered(self.known.common.T)
 
 
-def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> JointCovariance:
-    """A joint covariance of own (N, 3, 3) and common (R, 3N), by its largest `rank` directions.
+def reduce_rank(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> JointCovariance:
+    """Reduce the shared variables of a joint covariance to the `rank` of largest variance.
 
-    Marginal covariances stay as they are: what is left out is counted as the landmarks' own.
-    Subspace iteration (Halko, Martinsson, Tropp 2011, alg. 4.4), from rows of `common`, which are
-    of frames, evenly spread over the path.
+    Subspace iteration (Halko, Martinsson, Tropp 2011, alg. 4.4). It starts from rows of `common`
+    evenly spread over the path, since the rows belong to frames. The marginal covariances stay the
+    same: the neglected part is added to the landmarks' own covariances.
+
+    Args:
+        own_m2: covariances of the landmarks' own errors, shape (N, 3, 3).
+        common: displacements by the shared variables, shape (R, 3N).
+        rank: largest number of remaining shared variables.
     """
     if isinstance(common, np.ndarray):
         common = KnownErrors(common)
     if len(common) > rank:
-        n_start = min(rank + _TO_SPARE, len(common))
+        n_start = min(rank + _OVERSAMPLING, len(common))
         rows = np.linspace(0, len(common) - 1, n_start).round().astype(int)
-        # onto single rows: common' times columns of the identity
+        # first iteration: columns of the identity select rows
         basis = _orthonormal(common.rows_by_all(np.unique(rows)))
         for _ in range(_ITERATIONS - 1):
             basis = _orthonormal(common.gram(basis))
@@ -208,11 +218,11 @@ def condensed(own_m2: Float, common: Float | SharedErrors, rank: int = RANK) -> 
 
 
 def _orthonormal(columns: Float) -> Float:
-    """(n, m) columns that span the same, by the Cholesky factor of their products.
+    """Return an orthonormal basis of columns (n, m) by CholeskyQR2.
 
-    That leaves them orthonormal but for the square of their condition, and a second time but for
-    rounding (Yamamoto et al. 2015, "Roundoff error analysis of the CholeskyQR2 algorithm"): tall
-    ones take a fifth of what reflections take. Those that are too near to each other take these.
+    The second pass reduces the error to rounding (Yamamoto et al. 2015, "Roundoff error analysis of
+    the CholeskyQR2 algorithm"). Nearly dependent columns use Householder reflections instead, which
+    take several times as long.
     """
     length = np.linalg.norm(columns, axis=0)
     basis = columns / np.where(length > 0, length, 1.0)
@@ -225,12 +235,12 @@ def _orthonormal(columns: Float) -> Float:
 
 
 def _squares(by_landmark: Float) -> Float:
-    """(N, 3, 3) covariance that each landmark has of what shared variables do to it (N, R, 3)."""
+    """Return the covariances (N, 3, 3) of landmarks by displacements (N, R, 3)."""
     return np.swapaxes(by_landmark, 1, 2) @ by_landmark
 
 
 def _by_landmark(common: Float) -> Float:
-    """(N, R, 3) of (R, 3N)."""
+    """Rearrange displacements (R, 3N) to (N, R, 3)."""
     return np.ascontiguousarray(
         common.reshape(len(common), common.shape[1] // 3, 3).transpose(1, 0, 2)
     )

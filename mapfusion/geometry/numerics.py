@@ -1,11 +1,11 @@
 """Numerical building blocks: compiled kernels, 3 x 3 matrices, bit sets, chi-square bounds.
 
-NumPy and SciPy bring a BLAS each, with threads of its own, and those of the one wait in a loop
-while the other computes. Where blocks of some ten rows go to both in turn, as in a factorisation by
-envelope, that takes several times as long as one thread does.
+BLAS threads: NumPy and SciPy each have a BLAS with its own threads, and the threads of one BLAS
+spin while the other computes. Alternating calls with small blocks, as in an envelope factorisation,
+are several times slower than with one thread (`one_blas_thread`).
 
-Products are written out by entries: BLAS would take longer to call than to compute so small a
-product, and may round differently on another processor.
+Products of 3 x 3 matrices are written out by entries: a BLAS call takes longer than the product,
+and its rounding depends on the processor.
 """
 
 import math
@@ -33,35 +33,35 @@ def kernel(function: Any = None, **options: Any) -> Any:
 
 
 def source_of(compiled: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the Python function that a kernel was made of, for whole NumPy arrays."""
+    """Return the Python function of a kernel, for use with whole NumPy arrays."""
     return getattr(compiled, "py_func", compiled)
 
 
 one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
-"""Decorator: BLAS has one thread while the function runs, and then what it had before."""
+"""Decorator that limits BLAS to one thread while the function runs."""
 
 
-@cache  # a filter asks for its gate in every step
+@cache  # a filter computes its gate in every step
 def chi_square_bound(probability: float, degrees_of_freedom: float) -> float:
-    """The value that a chi-square variable stays below with this probability.
+    """Return the quantile of the chi-square distribution at a probability.
 
-    Its distribution function is P(k / 2, x / 2), the regularised incomplete gamma function, whose
-    inverse comes without scipy.stats: that alone takes half a second to import, in every worker.
+    The distribution function is P(k / 2, x / 2), the regularised incomplete gamma function. Its
+    inverse avoids the slow import of scipy.stats in every worker.
     """
-    # Here, so that a process without gates does not pay for it.
+    # A local import: many processes need no gate.
     from scipy.special import gammaincinv
 
     return 2.0 * float(gammaincinv(degrees_of_freedom / 2, probability))
 
 
-_SINGULAR = 1e-12  # determinant of a matrix scaled to a unit diagonal that is rounding error
+_SINGULAR = 1e-12  # largest determinant by rounding errors, for a matrix of unit diagonal
 
 
 @kernel
 def cofactors(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Cofactors (six upper entries) and determinant of a symmetric 3x3 matrix."""
+    """Return the cofactors (six upper entries) and the determinant of a symmetric 3x3 matrix."""
     axx, axy, axz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     ayy, ayz, azz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
     return axx, axy, axz, ayy, ayz, azz, xx * axx + xy * axy + xz * axz
@@ -84,9 +84,9 @@ def invert(matrix: Float, inverse: Float) -> bool:
 
 @kernel
 def copy_lower(matrix: Float, copy: Float) -> None:
-    """Put the lower half of a matrix into another, which Numba's `copy[:] = matrix` would, too.
+    """Copy the lower half of a matrix.
 
-    That compiles what says in words how shapes differ, which takes seconds.
+    Numba's `copy[:] = matrix` takes seconds to compile, for its messages about unequal shapes.
     """
     for i in range(len(matrix)):
         for j in range(i + 1):
@@ -95,10 +95,11 @@ def copy_lower(matrix: Float, copy: Float) -> None:
 
 @kernel
 def cholesky(matrix: Float, singular: float) -> bool:
-    """Lower factor of a symmetric matrix in place, of which the lower half is read.
+    """Compute the lower Cholesky factor of a symmetric matrix in place, from its lower half.
 
     Returns:
-        False when it is not positive definite: a pivot is `singular` of its diagonal entry or less.
+        False if the matrix is not positive definite: a pivot is at most `singular` times its
+        diagonal entry.
     """
     for i in range(len(matrix)):
         for j in range(i + 1):
@@ -145,9 +146,12 @@ def times_blocks(A: Float, B: Float) -> Float:
 
 
 def sums_by(group: np.ndarray, values: Float, n: int) -> Float:
-    """Return the sums (n, ...) of values (N, ...) of each group 0, 1, ..., n - 1, in their order.
+    """Return the sums (n, ...) of values (N, ...) per group.
 
-    `group` (N,) is that of each value.
+    Args:
+        group: group of each value, 0 to n - 1, shape (N,).
+        values: shape (N, ...).
+        n: number of groups.
     """
     total = np.empty((n, *values.shape[1:]))
     for column in np.ndindex(*values.shape[1:]):
@@ -164,7 +168,7 @@ def inverses(blocks: Float) -> Float:
         LinAlgError: a block is not positive definite.
     """
     n, dimensions = blocks.shape[:2]
-    entries = np.zeros((6, n))  # lower halves; blocks of two dimensions get a third one
+    entries = np.zeros((6, n))  # lower halves; 2 x 2 blocks get a third row of the identity
     entries[5] = 1.0
     pairs = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
     for k, (r, q) in enumerate(pairs):
@@ -177,7 +181,7 @@ def inverses(blocks: Float) -> Float:
         rest = a21 - l20 * a10
         l21 = rest / d1
         d2 = a22 - l20 * a20 - l21 * rest
-        m20 = l10 * l21 - l20  # of L^-1, whose other entries are -l10 and -l21
+        m20 = l10 * l21 - l20  # entry of L^-1; the other entries are -l10 and -l21
         inverse = (
             1 / a00 + l10 * l10 / d1 + m20 * m20 / d2,
             -l10 / d1 - m20 * l21 / d2,
@@ -198,14 +202,19 @@ def inverses(blocks: Float) -> Float:
 
 WORD = 64
 
-# Times eight bytes of 0 or 1: bit 56 + k of the product is byte k (a sum of shifts by 7 to 56).
+# Factor that packs eight bytes of 0 or 1: bit 56 + k of the product is byte k (a sum of shifts by 7
+# to 56).
 _GATHER = np.uint64(0x0102040810204080)
 
-# Two instructions of every processor that Numba has no name for.
+# Processor instructions without a Numba function, for use inside kernels only. The type hides the
+# first argument, which Numba passes.
+_instruction = cast(Callable[..., Callable[[Any], int]], intrinsic)
 
 
-@intrinsic
-def _trailing_zeros(typing_context: Any, word: Any) -> Any:
+@_instruction
+def trailing_zeros(typing_context: Any, word: Any) -> Any:
+    """Return the number of the lowest bit set in a word that is not 0."""
+
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         del signature
         return builder.cttz(arguments[0], context.get_constant(types.boolean, True))
@@ -214,8 +223,10 @@ def _trailing_zeros(typing_context: Any, word: Any) -> Any:
     return types.int64(types.uint64), generate
 
 
-@intrinsic
-def _ones(typing_context: Any, word: Any) -> Any:
+@_instruction
+def popcount(typing_context: Any, word: Any) -> Any:
+    """Return the number of bits set in a word."""
+
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         del context, signature
         return builder.ctpop(arguments[0])
@@ -224,23 +235,23 @@ def _ones(typing_context: Any, word: Any) -> Any:
     return types.int64(types.uint64), generate
 
 
-# inside kernels only: number of the lowest bit set of a word that is not 0, and number of bits set
-trailing_zeros = cast(Callable[[Any], int], _trailing_zeros)
-ones = cast(Callable[[Any], int], _ones)
-
-
 @kernel
 def count_common(first: np.ndarray, second: np.ndarray) -> int:
-    """Size of the intersection of two sets (W,) uint64."""
+    """Return the size of the intersection of two bit sets (W,) uint64."""
     count = 0
     for w in range(len(first)):
-        count += ones(first[w] & second[w])
+        count += popcount(first[w] & second[w])
     return count
 
 
 @kernel
 def packed(eights: np.ndarray, w: int) -> np.uint64:
-    """Word w of a set whose members are bytes of 1, the others 0; `eights` are eight bytes each."""
+    """Pack word w of a bit set.
+
+    Args:
+        eights: members as bytes of 0 or 1, eight bytes per number.
+        w: index of the word.
+    """
     word = np.uint64(0)
     for k in range(8):
         word |= ((eights[8 * w + k] * _GATHER) >> np.uint64(56)) << np.uint64(8 * k)
@@ -249,7 +260,7 @@ def packed(eights: np.ndarray, w: int) -> np.uint64:
 
 @kernel
 def transpose(square: np.ndarray) -> None:
-    """Exchange rows and columns of 64 words: halves of halves change places (Warren 2012, 7-3)."""
+    """Transpose a matrix of 64 x 64 bits by recursive exchange of blocks (Warren 2012, 7-3)."""
     size, low = WORD // 2, np.uint64(0xFFFFFFFF)
     while size:
         shift = np.uint64(size)
@@ -264,7 +275,7 @@ def transpose(square: np.ndarray) -> None:
 
 @kernel
 def mirror(graph: np.ndarray) -> None:
-    """Make a graph (N, W) symmetric of which only the edges to later vertices are there."""
+    """Make an adjacency matrix (N, W) symmetric that has only the edges to later vertices."""
     n, words = graph.shape
     square = np.empty(WORD, np.uint64)
     for r in range(words):

@@ -10,12 +10,12 @@ IDENTITY.setflags(write=False)
 
 
 def wrap(angle_rad: ArrayLike) -> Float:
-    """Angles (...) brought into [-pi, pi)."""
+    """Wrap angles (...) to [-pi, pi)."""
     return np.mod(np.asarray(angle_rad, dtype=np.float64) + np.pi, 2 * np.pi) - np.pi
 
 
 def rotation(theta_rad: ArrayLike) -> Float:
-    """Counter-clockwise rotations (..., 2, 2) by theta (...)."""
+    """Return counter-clockwise rotation matrices (..., 2, 2) of angles theta (...)."""
     theta = np.asarray(theta_rad, dtype=np.float64)
     matrix = np.empty((*theta.shape, 2, 2))
     matrix[..., 0, 0] = matrix[..., 1, 1] = np.cos(theta)
@@ -25,7 +25,7 @@ def rotation(theta_rad: ArrayLike) -> Float:
 
 
 def rotation_about_z(theta_rad: ArrayLike) -> Float:
-    """Counter-clockwise rotations (..., 3, 3) about the height axis.
+    """Return counter-clockwise rotation matrices (..., 3, 3) about the z axis.
 
     The paper's eq. 11 and 16 disagree in sign; this is eq. 16: its theta is minus eq. 11's.
     """
@@ -37,7 +37,7 @@ def rotation_about_z(theta_rad: ArrayLike) -> Float:
 
 
 def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Float:
-    """T_a_c (..., 3) of two chained motions (..., 3)."""
+    """Return T_a_c (..., 3), the composition of T_a_b (..., 3) and T_b_c (..., 3)."""
     a_b = np.asarray(T_a_b, dtype=np.float64)
     b_c = np.asarray(T_b_c, dtype=np.float64)
     cos, sin = np.cos(a_b[..., 2]), np.sin(a_b[..., 2])
@@ -52,7 +52,7 @@ def compose(T_a_b: ArrayLike, T_b_c: ArrayLike) -> Float:
 
 
 def inverse(T_a_b: ArrayLike) -> Float:
-    """T_b_a (..., 3)."""
+    """Return T_b_a (..., 3)."""
     a_b = np.asarray(T_a_b, dtype=np.float64)
     cos, sin = np.cos(a_b[..., 2]), np.sin(a_b[..., 2])
     return np.stack(
@@ -66,12 +66,12 @@ def inverse(T_a_b: ArrayLike) -> Float:
 
 
 def between(T_w_a: ArrayLike, T_w_b: ArrayLike) -> Float:
-    """T_a_b (..., 3) of two poses given in one frame w."""
+    """Return T_a_b (..., 3) of two poses in one frame w."""
     return compose(inverse(T_w_a), T_w_b)
 
 
 def transform_points(T_a_b: ArrayLike, p_b: ArrayLike) -> Float:
-    """Points (N, 2) or (N, 3) of frame b in frame a; heights stay as they are."""
+    """Transform points (N, 2) or (N, 3) of frame b to frame a; heights stay the same."""
     a_b = np.asarray(T_a_b, dtype=np.float64)
     points = np.array(p_b, dtype=np.float64)
     points[..., :2] = points[..., :2] @ rotation(a_b[2]).T + a_b[:2]
@@ -79,15 +79,21 @@ def transform_points(T_a_b: ArrayLike, p_b: ArrayLike) -> Float:
 
 
 def transform_covariances(T_a_b: ArrayLike, covariance_m2: ArrayLike) -> Float:
-    """Covariances (N, 3, 3) of frame b in frame a: R S R^T (eq. 15 with our sign of theta)."""
+    """Transform covariances (N, 3, 3) of frame b to frame a by R S R^T.
+
+    This is eq. 15 with the sign of theta of `rotation_about_z`.
+    """
     rotation_a_b = rotation_about_z(np.asarray(T_a_b, dtype=np.float64)[2])
     return rotation_a_b @ np.asarray(covariance_m2, dtype=np.float64) @ rotation_a_b.T
 
 
 def motion_sigma(covariance: Float) -> tuple[Float, Float]:
-    """What covariances (..., 3, 3) of motions state: sigma in m, of the distance, and in rad.
+    """Return the standard deviations of position (m) and heading (rad) of motions.
 
-    That of the distance is the root of its mean square, as RMS errors are: sqrt(xx + yy).
+    The standard deviation of the position is the RMS distance sqrt(xx + yy).
+
+    Args:
+        covariance: covariances of motions, shape (..., 3, 3).
     """
     m2 = covariance[..., 0, 0] + covariance[..., 1, 1]
     return np.sqrt(m2), np.sqrt(covariance[..., 2, 2])
@@ -95,7 +101,7 @@ def motion_sigma(covariance: Float) -> tuple[Float, Float]:
 
 @kernel
 def moved_point(T_a_b: Float, cos: float, sin: float, x: float, y: float) -> tuple[float, float]:
-    """T p of the point (x, y); cos and sin are theta's."""
+    """Return T p of the point (x, y); `cos` and `sin` are those of theta."""
     return T_a_b[0] + cos * x - sin * y, T_a_b[1] + sin * x + cos * y
 
 
@@ -103,7 +109,7 @@ def moved_point(T_a_b: Float, cos: float, sin: float, x: float, y: float) -> tup
 def residual(
     T_a_b: Float, cos: float, sin: float, p_a: Float, p_b: Float, i: int
 ) -> tuple[float, float]:
-    """p_a - T p_b of pair i of points (N, 2 or more)."""
+    """Return p_a - T p_b of pair i of points (N, 2 or more)."""
     ex = p_a[i, 0] - T_a_b[0] - cos * p_b[i, 0] + sin * p_b[i, 1]
     ey = p_a[i, 1] - T_a_b[1] - sin * p_b[i, 0] - cos * p_b[i, 1]
     return ex, ey
@@ -111,7 +117,7 @@ def residual(
 
 @kernel
 def lever(cos: float, sin: float, p_b: Float, i: int) -> tuple[float, float]:
-    """d(T p_b) / d theta of point i of (N, 2 or more)."""
+    """Return d(T p_b) / d theta of point i of points (N, 2 or more)."""
     return -sin * p_b[i, 0] - cos * p_b[i, 1], cos * p_b[i, 0] - sin * p_b[i, 1]
 
 
@@ -119,7 +125,7 @@ def lever(cos: float, sin: float, p_b: Float, i: int) -> tuple[float, float]:
 def add_turned(
     xx: float, xy: float, yy: float, cos: float, sin: float, bxx: float, bxy: float, byy: float
 ) -> tuple[float, float, float]:
-    """The covariance (xx, xy, yy) plus R S R^T of another one (eq. 15)."""
+    """Return the sum of the covariance (xx, xy, yy) and of R S R^T of another one (eq. 15)."""
     return (
         xx + cos * cos * bxx - 2 * cos * sin * bxy + sin * sin * byy,
         xy + cos * sin * (bxx - byy) + (cos * cos - sin * sin) * bxy,

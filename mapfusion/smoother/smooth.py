@@ -23,7 +23,7 @@ from mapfusion.geometry.joint_covariance import (
     KnownErrors,
     SharedErrors,
     StackedErrors,
-    condensed,
+    reduce_rank,
 )
 from mapfusion.geometry.numerics import Float, chi_square_bound, one_blas_thread
 from mapfusion.geometry.se2 import between, rotation
@@ -396,7 +396,7 @@ def smoothed_map(
 def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, JointCovariance]:
     """Return the landmarks (L, 3) and their condensed joint covariance; planar z is zero."""
     point = smoothed.estimate.point_m.copy()
-    joint = condensed(smoothed.own_m2, smoothed.common, rank)
+    joint = reduce_rank(smoothed.own_m2, smoothed.common, rank)
     if smoothed.seen.n_dimensions == 2:
         point[:, 2] = 0.0
         joint.own_m2[:, 2, :] = joint.own_m2[:, :, 2] = joint.common_m[:, :, 2] = 0.0

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.geometry.numerics import WORD, Float, kernel, ones, packed, trailing_zeros
+from mapfusion.geometry.numerics import WORD, Float, kernel, packed, popcount, trailing_zeros
 from mapfusion.geometry.se2 import wrap
 from mapfusion.viewing import FieldOfView, Viewing
 
@@ -209,8 +209,8 @@ def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
                     k = trailing_zeros(unsure) >> 3
                     unsure &= unsure - np.uint64(1)
                     said[k] *= _is_in_view(sight, c, k, poses, bearing_rad, reach_m)
-                may += ones((lanes[0] >> np.uint64(_MAY_BIT)) & _ONES)
-                must += ones((lanes[0] >> np.uint64(_ALIKE_BIT)) & _ONES)
+                may += popcount((lanes[0] >> np.uint64(_MAY_BIT)) & _ONES)
+                must += popcount((lanes[0] >> np.uint64(_ALIKE_BIT)) & _ONES)
             if must >= LEAST_FRAMES:
                 break
         if must >= LEAST_FRAMES:

@@ -1,20 +1,19 @@
-"""Tests of a stereo window: does it show one plane, or the edge of an object?
+"""Plane test and silhouette test of stereo windows.
 
-They are taken in two steps: down the columns, with powers of y, apart above the middle row, in it
-and below; then along x. Only the first goes over all pixels, in the processor's vectors.
+Plane test: if a window shows two surfaces, the fitted plane lies between them in every image, and
+averaging over images does not remove the error. Under the plane d + a x + b y the residuals are
+noise. A further term of the disparity adds its derivative times the slope g of the grey levels. The
+score test (Rao 1948; Breusch and Pagan 1980) tests all further terms without a second fit.
 
-Where a window shows two surfaces the plane that fits best lies between them, in every picture
-again: many observations do not average that out. Under the plane d + a x + b y residuals are noise;
-where the disparity has further terms, each leaves its derivative times the slope g of the grey
-levels. The score test (Rao 1948; Breusch and Pagan 1980) asks for all of them without a second fit.
+Silhouette test: where two surfaces meet in the image but not in the world, one half of the window
+does not agree with the plane.
 
-Where two surfaces meet in the image and nothing in the world, one half is not on the plane.
-
-These are sums over their pixels, which the silhouette's test (`silhouette_test.py`) and the test
-for one plane (`plane_test.py`) ask for.
+Both tests need moments: sums over a window's pixels of products with powers of x and y. The sums
+are computed in two steps. The first step sums columns, with powers of y, separately above, in and
+below the middle row; it is vectorised over all pixels. The second step sums the columns with powers
+of x.
 """
 
-from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
@@ -24,8 +23,8 @@ from mapfusion.vision.subpixel import (
     DOWN,
     FIELDS,
     LEVEL,
+    LEVEL_FIELDS,
     RESIDUAL,
-    ROOM,
     SLOPE,
     WIDE,
     fill_down,
@@ -34,34 +33,36 @@ from mapfusion.vision.subpixel import (
     parts_inside,
 )
 
-# Products that are summed down the columns: with L the grey levels of the left picture, g and h
-# their slopes along u and v, r = right - left. Those of g also times y and its square, g^2 times
-# all powers up to the fourth.
+# Products that are summed down the columns: L are the grey levels of the left image, g and h their
+# slopes along u and v, and r = right - left. Products with g are also summed times y and y^2, g^2
+# times all powers of y up to the fourth.
 GG, G, GL, GR = 0, 5, 8, 11
 L, LL, R, LR, HH, RR, ONE = range(14, 21)
 N_PRODUCTS = 21
-# How the rows above the middle, in it and below count, and likewise columns: all, by their sign and
-# by its square; what is above (or to the left) alone, and what is below.
+# Weights of the rows above, in and below the middle row, and likewise of the columns: all rows, the
+# sign of y, its square, the upper rows, the lower rows.
 SIDES = np.array([[1, 1, 1], [-1, 0, 1], [1, 0, 1], [1, 0, 0], [0, 0, 1]], dtype=np.float64)
 ALL = 0
 ABOVE = LEFT = 3
 BELOW = RIGHT = 4
-_SQUARED = 2  # place in it of the signs squared
-_POWERS = 5  # from 0 on
+_SQUARED = 2  # index of the squared sign
+_POWERS = 5  # powers 0 to 4
 
-Moment = tuple[int, int, int]  # a product times a power of y, how rows count, how columns do
+Moment = tuple[int, int, int]  # product times a power of y, row of SIDES, column of the weights
 
 
 def moment(product: int, p: int = 0, s: int = ALL, q: int = 0, t: int = ALL) -> Moment:
-    """The sum of a product times x^p y^q, where columns count as `SIDES` s and rows as t."""
-    # what has the sign's square as well as a power loses nothing without it
+    """Return the key of the sum of a product times x^p y^q with column and row weights SIDES s, t.
+
+    A squared sign beside a power has no effect and is left out.
+    """
     s, t = (ALL if power and side == _SQUARED else side for power, side in ((p, s), (q, t)))
     return product + q, t, s * _POWERS + p
 
 
 @cache
 def column_weights(half: int) -> Float:
-    """How the columns of a window count (S, 2 half + 1), by the last number of a moment."""
+    """Return the weights of a window's columns, shape (S, 2 half + 1), S as in `Moment`."""
     x = np.arange(-half, half + 1)
     powers = np.vander(x.astype(np.float64), _POWERS, increasing=True).T
     weights = (SIDES[:, None, np.sign(x) + 1] * powers).reshape(-1, len(x))
@@ -69,8 +70,8 @@ def column_weights(half: int) -> Float:
     return weights
 
 
-# Disparities g x^p sgn(x)^s y^q sgn(y)^t as (p, s, q, t): the plane, then what no plane has,
-# steps at the window's centre, creases there, and bends.
+# Disparities x^p sgn(x)^s y^q sgn(y)^t as (p, s, q, t): the plane, then further terms: steps at the
+# window's centre, creases there, and curvature.
 _PLANE = ((0, 0, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0))
 _FURTHER = (
     *((0, 1, 0, 0), (0, 0, 0, 1)),
@@ -78,43 +79,52 @@ _FURTHER = (
     *((2, 0, 0, 0), (1, 0, 1, 0), (0, 0, 2, 0)),
 )
 _TERMS = _PLANE + _FURTHER
-_BRIGHTNESS = 2  # columns: offset and gain of one picture against the other
+_BRIGHTNESS = 2  # columns: offset and gain between the images
 _KNOWN = _BRIGHTNESS + len(_PLANE)
 COLUMNS = _BRIGHTNESS + len(_TERMS)
 FURTHER_TERMS = len(_FURTHER)
-# Share of each term's square that stands against it: terms that the texture does not tell from
-# others then count nothing.
+# Ridge, as a share of each diagonal entry: terms that the texture does not observe then have no
+# effect.
 _RIDGE = 1e-6
 
-
-def _asked() -> Iterator[Moment]:
-    """Sums that fill in the normal matrix, its lower half row by row, and then the right side."""
-    yield from (moment(ONE), moment(L), moment(LL))
-    for n, term in enumerate(_TERMS):
-        yield from (moment(G, *term), moment(GL, *term))
-        for other in _TERMS[: n + 1]:  # of a product powers and signs add up
-            yield moment(GG, *(a + b for a, b in zip(term, other, strict=True)))
-    yield from (moment(R), moment(LR))
-    yield from (moment(GR, *term) for term in _TERMS)
-
-
-PLANE_MOMENTS = tuple(_asked())
+# Lower half of the normal matrix, row by row: two rows of brightness, then the disparity terms. The
+# powers and signs of two terms add up in their product. Then the right-hand side.
+PLANE_MOMENTS: tuple[Moment, ...] = (
+    moment(ONE),
+    moment(L),
+    moment(LL),
+    *(
+        entry
+        for n, term in enumerate(_TERMS)
+        for entry in (
+            moment(G, *term),
+            moment(GL, *term),
+            *(
+                moment(GG, *(a + b for a, b in zip(term, other, strict=True)))
+                for other in _TERMS[: n + 1]
+            ),
+        )
+    ),
+    moment(R),
+    moment(LR),
+    *(moment(GR, *term) for term in _TERMS),
+)
 
 
 @kernel
 def score(sums: Float, place: np.ndarray, normal: Float, right: Float) -> float:
-    """What a window holds against one plane.
+    """Compute the statistic of the plane test.
 
     Args:
-        sums: over its pixels.
-        place: among them of those that are `ASKED` for.
-        normal: (COLUMNS, COLUMNS), on the way.
-        right: (COLUMNS,), likewise.
+        sums: moments of a window.
+        place: indices of `PLANE_MOMENTS` in `sums`.
+        normal: work array, shape (COLUMNS, COLUMNS).
+        right: work array, shape (COLUMNS,).
 
     Returns:
-        r^T P K (K^T P K)^-1 K^T P r in squared grey levels, K the further terms and P the
-        projection that takes out brightness and plane: of white noise in r its variance times a
-        chi-square variable of `FURTHER_TERMS` degrees of freedom.
+        r^T P K (K^T P K)^-1 K^T P r in squared grey levels. K are the further terms, P is the
+        projection that removes brightness and plane. For white noise r the statistic is its
+        variance times a chi-square variable of `FURTHER_TERMS` degrees of freedom.
     """
     k = 0
     for i in range(COLUMNS):
@@ -132,25 +142,32 @@ def score(sums: Float, place: np.ndarray, normal: Float, right: Float) -> float:
     return against
 
 
-_OF_A_HALF = (ONE, R, RR, GG, HH)
-_EACH = len(_OF_A_HALF)
-# How columns and rows of the left half, the right, the upper and the lower one count.
+_HALF_PRODUCTS = (ONE, R, RR, GG, HH)
+_EACH = len(_HALF_PRODUCTS)
+# Weights of columns and rows for the left, right, upper and lower half.
 _HALVES = ((LEFT, ALL), (RIGHT, ALL), (ALL, ABOVE), (ALL, BELOW))
-SILHOUETTE_MOMENTS = tuple(moment(product, s=s, t=t) for s, t in _HALVES for product in _OF_A_HALF)
+SILHOUETTE_MOMENTS = tuple(
+    moment(product, s=s, t=t) for s, t in _HALVES for product in _HALF_PRODUCTS
+)
 
 
-def disagrees(squares: Float, noise: float, max_misfit: float, max_rows: float) -> np.ndarray:
-    """Whether any half (left, right, upper, lower) of each window does not fit the plane (N,) bool.
+def fails_silhouette_test(
+    squares: Float, noise: float, max_misfit: float, max_rows: float
+) -> np.ndarray:
+    """Return True for each window with a half (left, right, upper, lower) beside the plane.
 
-    An error e in disparity changes the grey level by g e, g its slope along u, and rows that are
-    off by f change it by h f, h its slope along v. So a half fits when
+    A disparity error e changes the grey level by g e, g its slope along u. A row error f changes
+    the grey level by h f, h its slope along v. So a half of n pixels agrees with the plane when
     sum r^2 <= n 2 noise^2 + max_misfit^2 sum g^2 + max_rows^2 sum h^2.
 
     Args:
-        squares: (N, 4, 4) from `window_sums`.
-        noise: standard deviation of one image's grey levels.
+        squares: sums of the halves from `window_statistics`, shape (N, 4, 4).
+        noise: standard deviation of the grey levels of one image.
         max_misfit: e, pixels.
         max_rows: f, pixels.
+
+    Returns:
+        Shape (N,) bool.
     """
     tolerated = squares[..., [0, 2, 3]] @ [2 * noise**2, max_misfit**2, max_rows**2]
     return np.any(squares[..., 1] > tolerated, axis=1)
@@ -158,14 +175,14 @@ def disagrees(squares: Float, noise: float, max_misfit: float, max_rows: float) 
 
 @kernel
 def fill_in_halves(sums: Float, place: np.ndarray, squares: Float, n: int) -> None:
-    """Fill in the halves (4, 4) of window n, see `window_sums`; residuals less their own mean.
+    """Fill in the halves of window n, see `window_statistics`; residuals without their mean.
 
-    `place` is that of the sums that are `ASKED` for.
+    `place` are the indices of `SILHOUETTE_MOMENTS` in `sums`.
     """
-    first, second = 2 * _EACH, 3 * _EACH  # the upper half and the lower one
-    count = sums[place[first]] + sums[place[second]]
-    off = sums[place[first + 1]] + sums[place[second + 1]]
-    offset = off / count if count > 0 else 0.0  # in brightness
+    upper, lower = 2 * _EACH, 3 * _EACH
+    count = sums[place[upper]] + sums[place[lower]]
+    total = sums[place[upper + 1]] + sums[place[lower + 1]]
+    offset = total / count if count > 0 else 0.0  # brightness offset
     for k in range(4):
         at = k * _EACH
         pixels, residuals, square = sums[place[at]], sums[place[at + 1]], sums[place[at + 2]]
@@ -174,18 +191,18 @@ def fill_in_halves(sums: Float, place: np.ndarray, squares: Float, n: int) -> No
         squares[n, k, 2], squares[n, k, 3] = sums[place[at + 3]], sums[place[at + 4]]
 
 
-_ASKED = (PLANE_MOMENTS, SILHOUETTE_MOMENTS, (moment(ONE), moment(GG), moment(HH)))
-# Each sum is taken once, and so are those down the columns that several go on from.
-_SUMS, _place = np.unique([m for asked in _ASKED for m in asked], axis=0, return_inverse=True)
-_DOWN_SUMS, _FROM = np.unique(_SUMS[:, :2], axis=0, return_inverse=True)
-_OF_PLANE, _OF_HALVES, _OF_SLOPES = np.split(_place, np.cumsum([len(a) for a in _ASKED[:-1]]))
-# Where sums of each product begin, and those of the rows of the next part.
+_MOMENTS = (PLANE_MOMENTS, SILHOUETTE_MOMENTS, (moment(ONE), moment(GG), moment(HH)))
+# Each moment, and each column sum behind several moments, is computed once.
+_SUMS, _place = np.unique([m for own in _MOMENTS for m in own], axis=0, return_inverse=True)
+_COLUMN_SUMS, _FROM = np.unique(_SUMS[:, :2], axis=0, return_inverse=True)
+_OF_PLANE, _OF_HALVES, _OF_SLOPES = np.split(_place, np.cumsum([len(m) for m in _MOMENTS[:-1]]))
+# Offsets of the column sums of each product, and of the next group of rows.
 _AT = tuple(np.uintp(k) * WIDE for k in range(N_PRODUCTS))
 _PART = np.uintp(N_PRODUCTS) * WIDE
-_INSIDE = FIELDS  # of a window's pixels, after its other fields: 1 in both pictures, else 0
+_INSIDE = FIELDS  # further field of a window's pixels: 1 inside both images, else 0
 
 
-def window_sums(
+def window_statistics(
     left: np.ndarray,
     right: np.ndarray,
     pixel: np.ndarray,
@@ -193,30 +210,32 @@ def window_sums(
     silhouette_half: int,
     plane_half: int,
 ) -> tuple[Float, Float]:
-    """What the two tests look at.
+    """Compute the statistics of both tests.
 
     Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-        pixel: (N, 2) int64 centres of the windows; what leaves an image is not looked at.
-        plane: (N, 3) from `fit_planes`.
+        left: shape (H, W) uint8.
+        right: shape (H, W) uint8.
+        pixel: centres of the windows, shape (N, 2) int64. Pixels outside an image are left out.
+        plane: planes from `fit_planes`, shape (N, 3).
         silhouette_half: half side of the window of the silhouette test, `MOST_HALF_PX` at most.
-        plane_half: half side of the window of the test for one plane, likewise.
+        plane_half: half side of the window of the plane test, likewise.
 
     Returns:
-        Of each half (left, right, upper, lower) of each window (N, 4, 4) the number of pixels, and
-        the sums of squared residuals without the window's offset in brightness, of squared slopes
-        of the grey levels along u and along v. Then (N, 3): the score of the test for one plane,
-        see there, and the mean squared slopes along u and along v.
+        Halves, shape (N, 4, 4): for the left, right, upper and lower half of each window the number
+        of pixels, the sum of squared residuals without the window's brightness offset, and the sums
+        of squared slopes of the grey levels along u and along v. Scores, shape (N, 3): the `score`
+        of the plane test, and the mean squared slopes along u and along v.
     """
     squares, scores = np.empty((len(pixel), 4, 4)), np.empty((len(pixel), 3))
     weight = column_weights(max(silhouette_half, plane_half))
-    _look_at_all(left, right, pixel, plane, silhouette_half, plane_half, weight, squares, scores)
+    _fill_statistics(
+        left, right, pixel, plane, silhouette_half, plane_half, weight, squares, scores
+    )
     return squares, scores
 
 
 @kernel
-def _look_at_all(
+def _fill_statistics(
     left: np.ndarray,
     right: np.ndarray,
     pixel: np.ndarray,
@@ -227,19 +246,20 @@ def _look_at_all(
     squares: Float,
     scores: Float,
 ) -> None:
+    """Fill in the halves and the scores of all windows; `weight` is from `column_weights`."""
     half = max(silhouette_half, plane_half)
     area = (2 * half + 1) ** 2
     window, share = np.empty((FIELDS + 1, area)), np.empty(area)
-    room, down = np.empty((ROOM, area), np.uint32), np.empty(3 * N_PRODUCTS * WIDE)
+    levels, down = np.empty((LEVEL_FIELDS, area), np.uint32), np.empty(3 * N_PRODUCTS * WIDE)
     column, sums = np.empty(2 * half + 1), np.empty(len(_SUMS))
     normal, moments = np.empty((COLUMNS, COLUMNS)), np.empty(COLUMNS)
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
         fill_left(left, u, v, half, window)
         fill_down(left, u, v, half, window)
-        fill_residuals(right, u, v, half, plane, n, window, room, share)
-        shade = float(left[v, u])  # grey levels are counted from it: small numbers lose less
-        # Mark which pixels of a window lie in both pictures, and let the others add nothing.
+        fill_residuals(right, u, v, half, plane, n, window, levels, share)
+        shade = float(left[v, u])  # origin of the grey levels, against cancellation
+        # Mark the pixels inside both images; set the fields of the other pixels to zero.
         top, bottom, left_end, right_end = parts_inside(right, u, v, half)
         d, a, b = plane[n, 0], plane[n, 1], plane[n, 2]
         for k in range(window.shape[1]):
@@ -261,8 +281,7 @@ def _look_at_all(
                     window[SLOPE, middle + x] = window[DOWN, middle + x] = 0.0
                     window[RESIDUAL, middle + x] = window[_INSIDE, middle + x] = 0.0
         for own in (plane_half, silhouette_half):
-            # Sums down the columns of a window that are up to `own` from its middle, as far up
-            # and down.
+            # Column sums of the window of half side `own`.
             for k in range(3 * N_PRODUCTS):
                 first = np.uintp(k) * WIDE
                 for i in range(2 * own + 1):
@@ -296,13 +315,12 @@ def _look_at_all(
                     down[m + _AT[18]] += h * h
                     down[m + _AT[19]] += r * r
                     down[m + _AT[20]] += window[_INSIDE, k]
-            # Fill in what is asked for from sums down the columns; `column` is room for those of
-            # a row.
+            # Moments from the column sums; `column` holds the sums of one product and row weight.
             last = -1
             for e in range(len(_SUMS)):
                 if _FROM[e] != last:
                     last = _FROM[e]
-                    product, t = np.uintp(_DOWN_SUMS[last, 0]), _DOWN_SUMS[last, 1]
+                    product, t = np.uintp(_COLUMN_SUMS[last, 0]), _COLUMN_SUMS[last, 1]
                     above, at, below = SIDES[t, 0], SIDES[t, 1], SIDES[t, 2]
                     m = product * WIDE
                     for i in range(2 * own + 1):

@@ -1,4 +1,4 @@
-"""Visual front end: stereo pairs in, landmark observations out."""
+"""Visual front end: landmark observations from stereo pairs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,24 +10,23 @@ from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import Observations
-from mapfusion.vision.features import Features, cut_patches
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.stereo import StereoParameters, Verdict, match
+from mapfusion.vision.stereo import MatchStatus, StereoParameters, match
 from mapfusion.vision.surf import USurfParameters, describe
-from mapfusion.vision.tracking import Tracker, TrackParameters, Tracks
+from mapfusion.vision.tracking import Features, Tracker, TrackParameters, Tracks, cut_patches
 
 
 @dataclass(frozen=True)
 class FrontEndParameters:
-    """All the front end's parameters.
+    """Parameters of the front end.
 
     Attributes:
-        harris, stereo, usurf, tracks: of the parts.
-        sigma_uv_px: standard deviation of the place of a track's point in an image, each axis.
-        max_depth_m: points farther away are tracked but not observed: about as far as a room is
-            long, since a robot that looks along it has nothing else to tell its heading by; what
-            is farther away makes maps less certain and hardly tells more,
-        max_sigma_depth_m: nor are points whose depth has a larger standard deviation.
+        harris, stereo, usurf, tracks: parameters of the parts.
+        sigma_uv_px: standard deviation of the position of a track's point along each image axis.
+        max_depth_m: largest depth of an observed point; farther points are tracked only. The
+            default is about the length of a room, so that a robot that looks along the room still
+            observes its heading. Farther points add uncertainty but little information.
+        max_sigma_depth_m: largest standard deviation of the depth of an observed point.
     """
 
     harris: HarrisParameters = field(default_factory=HarrisParameters)
@@ -44,13 +43,13 @@ class FrontEndParameters:
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """Features of single stereo pairs; stateless, so frames may be done in any order."""
+    """Feature extraction from single stereo pairs, without state: frames may come in any order."""
 
     camera: StereoCamera
     parameters: FrontEndParameters = field(default_factory=FrontEndParameters)
 
     def extract(self, left: np.ndarray, right: np.ndarray) -> Features:
-        """Corners of the left image that have a match in the right one, described.
+        """Detect corners of the left image, match them in the right image and describe them.
 
         Images are (H, W) uint8, rectified, of the camera's size.
 
@@ -63,7 +62,7 @@ class FrontEnd:
                 raise ValueError(f"{name}: is {image.dtype} {image.shape}, expected uint8 {size}")
         corners = detect(left, self.parameters.harris)
         matches = match(left, right, corners, self.camera, self.parameters.stereo)
-        matched = matches.verdict == Verdict.MATCHED
+        matched = matches.status == MatchStatus.MATCHED
         uv, disparity = corners[matched], matches.disparity_px[matched]
         depth = self.camera.focal_px * self.camera.baseline_m / disparity
         scale = self.parameters.usurf.scales_px(depth, self.camera.focal_px)
@@ -79,9 +78,17 @@ def observable(
     keep: np.ndarray,
     parameters: FrontEndParameters,
 ) -> np.ndarray:
-    """Rows of the disparities (N,) marked in `keep` (N,) bool that are near and certain enough.
+    """Select the points that are near and certain enough to be observed.
 
-    `sigma_px` (N,) are their standard deviations.
+    Args:
+        camera: the rectified pair.
+        disparity_px: disparities, shape (N,).
+        sigma_px: standard deviations of the disparities, shape (N,).
+        keep: mask of the points to select from, shape (N,) bool.
+        parameters: limits of depth and of its standard deviation.
+
+    Returns:
+        Indices of the selected points.
 
     Raises:
         ValueError: `keep` has another length than the disparities.
@@ -96,12 +103,12 @@ def observable(
 
 @dataclass(frozen=True)
 class ObservedFrame:
-    """What one frame adds to a log.
+    """Tracks and observations of one frame.
 
     Attributes:
-        tracks: of all its features.
-        rows: (N,) which of them are observed.
-        observations: N of them, with their tracks.
+        tracks: tracks of all features.
+        rows: indices of the observed features, shape (N,).
+        observations: N observations with their tracks.
     """
 
     tracks: Tracks
@@ -111,12 +118,12 @@ class ObservedFrame:
 
 @dataclass(frozen=True)
 class Observer:
-    """Follows features over frames, which come in their order, and tells what is observed.
+    """Tracker of features over consecutive frames that returns the observations of each frame.
 
     Attributes:
-        tracker: what has been followed so far.
+        tracker: tracker with the state of the last frame.
         camera: the rectified pair.
-        vision: depths and noise of observations.
+        vision: limits of depth and noise of the observations.
     """
 
     tracker: Tracker
@@ -125,13 +132,13 @@ class Observer:
 
     @classmethod
     def of(cls, camera: StereoCamera, vision: FrontEndParameters) -> "Observer":
-        """One that has seen nothing yet."""
+        """Make an observer before the first frame."""
         return cls(Tracker(vision.tracks, camera, vision.sigma_uv_px), camera, vision)
 
     def observe(
         self, found: Features, steps: float = 1.0, R_after_before: Float | None = None
     ) -> ObservedFrame:
-        """The next frame's observations; other arguments as `Tracker.update` has them."""
+        """Return the observations of the next frame; arguments as in `Tracker.update`."""
         tracks = self.tracker.update(found, steps, R_after_before)
         given = (tracks.disparity_px, found.sigma_disparity_px, self.tracker.landmarks(tracks))
         rows = observable(self.camera, *given, self.vision)
@@ -147,8 +154,8 @@ class Observer:
         return ObservedFrame(tracks, rows, observations)
 
 
-def joined(frames: Sequence[Observations]) -> tuple[np.ndarray, Observations]:
-    """Iterations (N,) and observations of a whole log from those of its frames."""
+def concatenate_observations(frames: Sequence[Observations]) -> tuple[np.ndarray, Observations]:
+    """Return iterations (N,) and observations of a log from the observations of its frames."""
     iteration = np.repeat(np.arange(len(frames)), [len(own) for own in frames])
     names = ("position_m", "covariance_m2", "descriptor", "uvd_px", "track")
     return iteration, Observations(

@@ -1,4 +1,4 @@
-"""Harris corners (Harris and Stephens 1988), the strongest of each part of the image."""
+"""Harris corner detector (Harris and Stephens 1988) with an even spread over the image."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -15,23 +15,22 @@ _SOBEL_GAIN = 2.0  # OpenCV divides its Sobel sum, 8 times the slope per pixel, 
 
 @dataclass(frozen=True)
 class HarrisParameters:
-    """Which corners to take.
+    """Parameters of the corner detector.
 
     Attributes:
-        max_corners: at most so many an image.
-        smoothing_px: standard deviation of the Gaussian that the image is smoothed with first;
-            noise and the staircase edges of unfiltered textures make corners of their own. Too much
-            pulls corners inwards by a share of the window, which is another point of the wall as
-            the robot draws near; too little loses corners.
-        min_distance_px: no two corners nearer than this, before the sub-pixel step.
-        cell_px: side of the squares of the grid that share `max_corners` evenly, so that one rich
-            poster does not take all.
+        max_corners: largest number of corners per image.
+        smoothing_px: standard deviation of the Gaussian that smooths the image first. Noise and
+            aliased edges cause false corners. Strong smoothing displaces corners inwards by a share
+            of the window, so the corner changes with the distance. Weak smoothing loses corners.
+        min_distance_px: smallest distance between two corners, before the sub-pixel step.
+        cell_px: side of the grid cells that share `max_corners` evenly. One rich texture then does
+            not take all corners.
         block_px: side of the square over which the structure tensor is averaged.
         k: Harris' constant, 0.04 to 0.06 by custom.
-        min_slope: grey levels per pixel; a corner whose brightness changes by this (RMS) in every
-            direction is the weakest that counts. The Sobel slope of white noise of n grey levels is
-            0.43 n, so the default stands clear of a noise of 2 levels.
-        border_px: margin in which no corners are taken; the stereo windows must fit.
+        min_slope: smallest RMS slope of the grey levels of a corner in every direction. The Sobel
+            slope of white noise of n grey levels is 0.43 n, so the default exceeds the slope of a
+            noise of 2 levels.
+        border_px: margin without corners; the stereo windows must fit.
     """
 
     max_corners: Annotated[int, Range(1, 5000, "corners")] = 110
@@ -57,7 +56,7 @@ class HarrisParameters:
 
 
 def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
-    """Corners (N, 2), u and v in pixels at sub-pixel precision, strongest first.
+    """Detect the corners (N, 2), u and v in pixels at sub-pixel precision, strongest first.
 
     Raises:
         ValueError: the image has another shape or type.
@@ -68,10 +67,23 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
         return np.zeros((0, 2))
     smooth = cv2.GaussianBlur(image, (0, 0), parameters.smoothing_px)
     response = harris_response(smooth, parameters)
-    pixels = _strongest(response, parameters)
+    pixels = strongest_maxima(response, parameters)
     if len(pixels) == 0:
         return np.zeros((0, 2))
-    return _peak(response, pixels)
+
+    # Sub-pixel maximum: vertex of the parabola through three pixels along each axis.
+    u, v = pixels.T
+    top = response[v, u].astype(np.float64)
+    offset = np.empty((len(pixels), 2))
+    for axis, (du, dv) in enumerate(((1, 0), (0, 1))):
+        before = response[v - dv, u - du].astype(np.float64)
+        after = response[v + dv, u + du].astype(np.float64)
+        curvature = before - 2 * top + after
+        # a maximum lies within half a pixel; a plateau stays where it is
+        offset[:, axis] = np.where(
+            curvature < 0, (before - after) / np.where(curvature < 0, 2 * curvature, 1), 0
+        )
+    return pixels + offset
 
 
 def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
@@ -79,24 +91,23 @@ def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarr
     return cv2.cornerHarris(image, parameters.block_px, _SOBEL_APERTURE_PX, parameters.k)
 
 
-def _strongest(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
-    """Pixels (N, 2) int64 of the corners to keep, strongest first."""
+def strongest_maxima(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
+    """Select local maxima of a response (H, W): pixels (N, 2) int64, strongest first."""
     maxima = local_maxima(response, parameters.border_px, parameters.min_response)
     u, v = maxima.T
     candidates = maxima[np.argsort(-response[v, u], kind="stable")]
     height, width = response.shape
     cells = -(-height // parameters.cell_px) * -(-width // parameters.cell_px)
-    share = -(-parameters.max_corners // cells)
-    return candidates[
-        spread(
-            candidates,
-            response.shape,
-            parameters.min_distance_px,
-            parameters.cell_px,
-            share,
-            parameters.max_corners,
-        )
-    ]
+    per_cell = -(-parameters.max_corners // cells)
+    is_selected = spread(
+        candidates,
+        response.shape,
+        parameters.min_distance_px,
+        parameters.cell_px,
+        per_cell,
+        parameters.max_corners,
+    )
+    return candidates[is_selected]
 
 
 def local_maxima(response: np.ndarray, border: int, least: float) -> np.ndarray:
@@ -119,22 +130,34 @@ def spread(
     per_cell: int,
     most: int,
 ) -> np.ndarray:
-    """Which candidates (N, 2) of an image, sorted by strength, a greedy choice keeps (N,) bool.
+    """Select candidates greedily, evenly spread over the image.
 
-    A first pass fills each cell up to its share, a second hands what poor cells left over to the
-    strongest remaining. No two are nearer than `min_distance`.
+    The first pass fills each cell up to its share. The second pass gives the share that poor cells
+    leave over to the strongest remaining candidates. No two selected candidates are nearer to each
+    other than `min_distance`.
+
+    Args:
+        candidates: pixels (u, v), shape (N, 2), strongest first.
+        size: height and width of the image.
+        min_distance: smallest distance between two selected candidates, pixels.
+        cell: side of a cell, pixels.
+        per_cell: share of each cell, candidates.
+        most: largest number of selected candidates.
+
+    Returns:
+        Shape (N,) bool, True for the selected candidates.
     """
-    taken, blocked = np.zeros(len(candidates), dtype=np.bool_), np.zeros(size, dtype=np.uint8)
+    selected, blocked = np.zeros(len(candidates), dtype=np.bool_), np.zeros(size, dtype=np.uint8)
     filled = np.zeros((size[0] // cell + 1, size[1] // cell + 1), dtype=np.int64)
-    _choose(candidates, min_distance, cell, per_cell, most, blocked, filled, taken)
-    return taken
+    _select(candidates, min_distance, cell, per_cell, most, blocked, filled, selected)
+    return selected
 
 
-# What kernels of this file need room for is made by their callers: that is not compiled.
+# The callers of kernels allocate the work arrays: allocations inside a kernel take long to compile.
 
 
 @kernel
-def _choose(
+def _select(
     candidates: np.ndarray,
     min_distance: int,
     cell: int,
@@ -142,36 +165,21 @@ def _choose(
     most: int,
     blocked: np.ndarray,
     filled: np.ndarray,
-    taken: np.ndarray,
+    selected: np.ndarray,
 ) -> None:
+    """Mark the `selected` candidates (N,); all arrays after `most` are zero at the start."""
     count, (height, width) = 0, blocked.shape
     for share in (per_cell, most):
         for n in range(len(candidates)):
             u, v = candidates[n, 0], candidates[n, 1]
             if count == most:
                 return
-            if taken[n] or blocked[v, u] or filled[v // cell, u // cell] >= share:
+            if selected[n] or blocked[v, u] or filled[v // cell, u // cell] >= share:
                 continue
-            taken[n] = True
+            selected[n] = True
             count += 1
             filled[v // cell, u // cell] += 1
             for y in range(max(v - min_distance + 1, 0), min(v + min_distance, height)):
                 for x in range(max(u - min_distance + 1, 0), min(u + min_distance, width)):
                     if (x - u) * (x - u) + (y - v) * (y - v) < min_distance * min_distance:
                         blocked[y, x] = 1
-
-
-def _peak(response: np.ndarray, pixels: np.ndarray) -> Float:
-    """Sub-pixel maxima (N, 2) of the response, from the parabola through three pixels each way."""
-    u, v = pixels.T
-    top = response[v, u].astype(np.float64)
-    offset = np.empty((len(pixels), 2))
-    for axis, (du, dv) in enumerate(((1, 0), (0, 1))):
-        before = response[v - dv, u - du].astype(np.float64)
-        after = response[v + dv, u + du].astype(np.float64)
-        curvature = before - 2 * top + after
-        # a maximum lies within half a pixel; a plateau stays where it is
-        offset[:, axis] = np.where(
-            curvature < 0, (before - after) / np.where(curvature < 0, 2 * curvature, 1), 0
-        )
-    return pixels + offset

@@ -1,10 +1,10 @@
-"""Sub-pixel disparity by least squares on grey levels, for windows that show part of a plane.
+"""Sub-pixel disparity of planar windows by a least-squares fit of grey levels.
 
 The disparity of a plane is linear in the image: d(x, y) = d + a x + b y around the window's centre.
 
-Between columns the right picture is the cubic of Catmull and Rom. Each loop does one thing: those
-that only look up and those that only reckon run in the processor's vectors, one that does both does
-not. And each goes over a whole window: handing over its arrays takes as long as a row takes.
+Grey levels of the right image between columns are interpolated by the cubic of Catmull and Rom.
+Memory access and arithmetic are in separate loops: only then does the compiler vectorise the
+arithmetic. Each loop covers a whole window, because passing arrays takes as long as a row.
 """
 
 import math
@@ -20,34 +20,36 @@ from mapfusion.geometry.numerics import (
     solve_upper,
 )
 
-# Of a window's pixels, row by row (4, S * S) with S = 2 half + 1: grey levels of the left picture,
-# their slopes along u and along v, and right - left under the plane.
+# Fields of a window's pixels, row by row, shape (4, S * S) with S = 2 half + 1: grey levels of the
+# left image, their slopes along u and along v, and right - left under the plane.
 LEVEL, SLOPE, DOWN, RESIDUAL = range(4)
 FIELDS = 4
-# On the way (2, S * S) uint32: column of the right picture before the one to the left of where a
-# pixel is read, and the grey levels of four columns from there on, the bytes of one number.
+# Work array of the interpolation, shape (2, S * S) uint32: the first of four columns of the right
+# image around a pixel's position, and the grey levels of the four columns, packed into one word.
 _COLUMN, _LEVELS = range(2)
-ROOM = 2
+LEVEL_FIELDS = 2
 MOST_HALF_PX = 100  # half side of the largest window
-# Sums of one product down the columns of a window have room for the widest, in whole vectors: so it
-# is known how far those of two products lie apart when loops over them are compiled, and that these
-# may run in the processor's vectors.
-_AT_ONCE = 8
-WIDE = np.uintp(-(-(2 * MOST_HALF_PX + 1) // _AT_ONCE) * _AT_ONCE)
-_ONE = np.uintp(1)  # indices without a sign, which a kernel need not wrap around
+# Length of the column sums of one product, in whole vectors and for the widest window. A constant
+# length lets the compiler vectorise loops over several products.
+_VECTOR_LENGTH = 8
+WIDE = np.uintp(-(-(2 * MOST_HALF_PX + 1) // _VECTOR_LENGTH) * _VECTOR_LENGTH)
+_ONE = np.uintp(1)  # unsigned indices need no wraparound check
 _BYTE, _LOW = np.uint32(8), np.uint32(0xFF)
 
 
 @kernel
 def parts_inside(image: np.ndarray, u: int, v: int, half: int) -> tuple[int, int, int, int]:
-    """First and last row and column, from (u, v), of a window's part with a column to spare."""
+    """Return the first and last row and column of a window inside the image, relative to (u, v).
+
+    A column to spare at both sides stays outside.
+    """
     height, width = image.shape
     return max(-half, -v), min(half, height - 1 - v), max(-half, 1 - u), min(half, width - 2 - u)
 
 
 @kernel
 def fill_left(left: np.ndarray, u: int, v: int, half: int, window: Float) -> None:
-    """Fill in the left picture's grey levels around (u, v), and their slopes along u."""
+    """Fill in the left image's grey levels around (u, v) and their slopes along u."""
     side = 2 * half + 1
     top, bottom, first, last = parts_inside(left, u, v, half)
     for y in range(top, bottom + 1):
@@ -61,7 +63,7 @@ def fill_left(left: np.ndarray, u: int, v: int, half: int, window: Float) -> Non
 
 @kernel
 def fill_down(left: np.ndarray, u: int, v: int, half: int, window: Float) -> None:
-    """Fill in the slopes along v; at the border that to the row inside."""
+    """Fill in the slopes along v; one-sided differences at the image border."""
     side = 2 * half + 1
     top, bottom, first, last = parts_inside(left, u, v, half)
     for y in range(top, bottom + 1):
@@ -83,23 +85,23 @@ def fill_residuals(
     plane: Float,
     n: int,
     window: Float,
-    room: np.ndarray,
+    levels: np.ndarray,
     share: Float,
 ) -> None:
-    """Fill in right - left, where `fill_left` has filled in.
+    """Fill in the residuals right - left of a window; `fill_left` comes first.
 
     Args:
-        right: (H, W) uint8.
-        u: centre of the window in the left picture.
-        v: likewise.
-        half: side of the window.
-        plane: (N, 3) of d, a, b.
-        n: which of them.
-        window: (FIELDS, S * S), its residuals are changed.
-        room: (ROOM, S * S) uint32, on the way.
-        share: (S * S,) likewise.
+        right: shape (H, W) uint8.
+        u: column of the window's centre in the left image.
+        v: row of the window's centre.
+        half: half side of the window.
+        plane: d, a, b of all windows, shape (N, 3).
+        n: index of the window's plane.
+        window: shape (FIELDS, S * S); RESIDUAL is filled in.
+        levels: work array, shape (LEVEL_FIELDS, S * S) uint32.
+        share: work array, shape (S * S,): fractional part of each pixel's column.
     """
-    # Where pixels are read; at the border what is beside the picture is left out by others.
+    # Columns in the right image; the caller leaves out pixels beyond the border.
     d = plane[n, 0]
     a = plane[n, 1]
     b = plane[n, 2]
@@ -110,34 +112,35 @@ def fill_residuals(
             x = float(i - half)
             place = start + x - a * x
             column = min(max(np.int32(place) - np.int32(1), np.int32(0)), highest)
-            room[_COLUMN, at + np.uintp(i)] = column
+            levels[_COLUMN, at + np.uintp(i)] = column
             share[at + np.uintp(i)] = place - float(column + np.int32(1))
-    side = 2 * half + 1
+    # Grey levels of the four columns around each position.
     for y in range(-half, half + 1):
         row, at = np.uintp(min(max(v + y, 0), len(right) - 1)), np.uintp((y + half) * side)
         for i in range(side):
             m = at + np.uintp(i)
-            k = np.uintp(room[_COLUMN, m])
-            levels = np.uint32(right[row, k])
-            levels |= np.uint32(right[row, k + _ONE]) << _BYTE
-            levels |= np.uint32(right[row, k + _ONE + _ONE]) << (_BYTE + _BYTE)
-            levels |= np.uint32(right[row, k + _ONE + _ONE + _ONE]) << (_BYTE + _BYTE + _BYTE)
-            room[_LEVELS, m] = levels
+            k = np.uintp(levels[_COLUMN, m])
+            four = np.uint32(right[row, k])
+            four |= np.uint32(right[row, k + _ONE]) << _BYTE
+            four |= np.uint32(right[row, k + _ONE + _ONE]) << (_BYTE + _BYTE)
+            four |= np.uint32(right[row, k + _ONE + _ONE + _ONE]) << (_BYTE + _BYTE + _BYTE)
+            levels[_LEVELS, m] = four
+    # Cubic interpolation.
     for i in range(len(share)):
-        levels, t = room[_LEVELS, i], share[i]
-        a, b = float(levels & _LOW), float((levels >> _BYTE) & _LOW)
-        c, d = float((levels >> (_BYTE + _BYTE)) & _LOW), float(levels >> (_BYTE + _BYTE + _BYTE))
+        four, t = levels[_LEVELS, i], share[i]
+        a, b = float(four & _LOW), float((four >> _BYTE) & _LOW)
+        c, d = float((four >> (_BYTE + _BYTE)) & _LOW), float(four >> (_BYTE + _BYTE + _BYTE))
         cubic = c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a))
         window[RESIDUAL, i] = b + 0.5 * t * cubic - window[LEVEL, i]
 
 
-_MAX_STEPS = 20  # a few on rich texture; where it is poor, slopes take long
-_CONVERGED_PX = 0.005  # anywhere in the window; far below what noise lets one measure
-# Noise adds half its variance to the mean square of slopes, which promise that much more than they
-# keep (errors in variables, Fuller 1987, section 1.1). So much of it is taken for texture at least.
+_MAX_STEPS = 20  # slopes converge slowly on poor texture
+_CONVERGED_PX = 0.005  # largest step anywhere in the window; far below the effect of noise
+# Noise adds half its variance to the mean square of slopes, so the normal matrix is too large
+# (errors in variables, Fuller 1987, section 1.1). The correction leaves at least this share.
 _LEAST_TEXTURE = 0.25
-_AT = tuple(np.uintp(k) * WIDE for k in range(4))  # sums down columns, see there
-_SINGULAR = 1e-9  # pivot, as a share of its diagonal element, that is rounding error
+_AT = tuple(np.uintp(k) * WIDE for k in range(4))  # offsets of the column sums
+_SINGULAR = 1e-9  # largest pivot by rounding errors, as a share of its diagonal entry
 
 
 def fit_planes(
@@ -149,41 +152,38 @@ def fit_planes(
     half: int,
     slope_sigma: float,
     noise: float,
-    alike_px: float,
+    correlation_px: float,
     row_sigma: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit disparity, slopes and an offset in brightness to each window.
+    """Fit disparity, its slopes and a brightness offset to each window.
 
     Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-        pixel: (N, 2) int64 centres (u, v) of the windows, which lie inside the left image with one
-            pixel to spare.
-        offset: (N, 2) from the centres to the points whose variance is wanted.
-        start: (N,) disparities right to a pixel or two.
+        left: shape (H, W) uint8.
+        right: shape (H, W) uint8.
+        pixel: centres (u, v) of the windows, shape (N, 2) int64. The windows lie inside the left
+            image with one pixel to spare.
+        offset: positions for the variance, relative to the centres, shape (N, 2).
+        start: initial disparities, correct to a pixel or two, shape (N,).
         half: half side of the window, `MOST_HALF_PX` at most.
         slope_sigma: standard deviation of the prior on a and b, around zero.
-        noise: standard deviation of one image's grey levels.
-        alike_px: what residuals hold beyond noise is alike over so many pixels each way.
-        row_sigma: standard deviation of the rows by which the images are off, pixels; one shift for
-            all of a window.
+        noise: standard deviation of the grey levels of one image.
+        correlation_px: correlation length of the residuals beyond noise.
+        row_sigma: standard deviation of the row error between the images, pixels; one error for a
+            whole window.
 
     Returns:
-        Planes (N, 3) of d, a, b, and the variances (N,) of d + a x + b y at the offsets; NaN where
-        the fit left the image or the texture is too poor.
+        Planes d, a, b, shape (N, 3), and the variances of d + a x + b y at the offsets, shape (N,).
+        Both are NaN where the fit leaves the image or the texture is too poor.
     """
     plane, variance = np.zeros((len(pixel), 3)), np.empty(len(pixel))
-    weight = np.empty((len(pixel), 4))
     plane[:, 0] = start
-    pictures, noises = (left, right, pixel, offset), (slope_sigma, noise, alike_px)
-    _fit_all(*pictures, half, *noises, plane, variance, weight)
-    if row_sigma > 0:
-        _add_rows(left, pixel, half, row_sigma, weight, variance)
+    noises = (slope_sigma, noise, correlation_px, row_sigma)
+    _fit_planes(left, right, pixel, offset, half, *noises, plane, variance)
     return plane, variance
 
 
 @kernel
-def _fit_all(
+def _fit_planes(
     left: np.ndarray,
     right: np.ndarray,
     pixel: np.ndarray,
@@ -191,131 +191,120 @@ def _fit_all(
     half: int,
     slope_sigma: float,
     noise: float,
-    alike_px: float,
+    correlation_px: float,
+    row_sigma: float,
     plane: Float,
     variance: Float,
-    weight: Float,
 ) -> None:
-    """Fit planes (N, 3), which hold the starts; fill in variances (N,) without that of rows.
+    """Fit planes (N, 3), which hold the initial disparities, and fill in the variances (N,).
 
-    And how each estimate follows from the moments J^T r: its `weight` (N, 4).
+    The estimate is w' J^T r with w = (N_0 + prior)^-1 row. N is the normal matrix of the observed
+    slopes, N_0 is N without the contribution of noise. The moments J^T r have the covariance
+    M = (N_0 + N) / 2: noise of the slopes times noise of the right image. The product with noise of
+    the left image cancels between neighbours. So the variance is w' (M + prior) w times the
+    variance of the grey levels; the prior accounts for the bias of the slopes.
     """
-    area = (2 * half + 1) ** 2
-    window, room, share = (
+    area, side = (2 * half + 1) ** 2, 2 * half + 1
+    window, levels, share = (
         np.empty((FIELDS, area)),
-        np.empty((ROOM, area), np.uint32),
+        np.empty((LEVEL_FIELDS, area), np.uint32),
         np.empty(area),
     )
+    normal, factor, weight = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
     for n in range(len(pixel)):
-        variance[n] = _fit_plane(
-            left,
-            right,
-            pixel[n, 0],
-            pixel[n, 1],
-            offset,
-            half,
-            slope_sigma,
-            noise,
-            alike_px,
-            window,
-            room,
-            share,
-            plane,
-            weight,
-            n,
+        u, v = pixel[n, 0], pixel[n, 1]
+        fill_left(left, u, v, half, window)
+
+        # Lower half of J^T J of the brightness offset, d, a and b. Slopes are multiples of a half,
+        # so the sums are exact in any order.
+        for i in range(4):
+            for j in range(i + 1):
+                normal[i, j] = 0.0
+        for y in range(-half, half + 1):
+            g0 = g1 = s0 = s1 = s2 = 0.0
+            middle = (y + half) * side + half
+            for x in range(-half, half + 1):
+                g = window[SLOPE, middle + x]
+                gx = g * x
+                g0, g1 = g0 + g, g1 + gx
+                s0, s1, s2 = s0 + g * g, s1 + g * gx, s2 + gx * gx
+            normal[0, 0] += side
+            normal[1, 0] += g0
+            normal[2, 0] += g1
+            normal[3, 0] += g0 * y
+            normal[1, 1] += s0
+            normal[2, 1] += s1
+            normal[2, 2] += s2
+            normal[3, 1] += s0 * y
+            normal[3, 2] += s1 * y
+            normal[3, 3] += s0 * y * y
+
+        variance_grey = _gauss_newton(
+            right, u, v, half, normal, slope_sigma, noise, window, levels, share, plane, n
         )
+        if math.isnan(variance_grey):
+            plane[n, 0] = plane[n, 1] = plane[n, 2] = variance[n] = np.nan
+            continue
+
+        # N_0 in `factor`, M in the diagonal of `normal`.
+        copy_lower(normal, factor)
+        added = noise**2 / 2 * side**2
+        for i in range(1, 4):
+            factor[i, i] -= min(added, (1 - _LEAST_TEXTURE) * normal[i, i])
+            added = noise**2 / 2 * side**2 * half * (half + 1) / 3  # mean of x^2
+        for i in range(1, 4):
+            normal[i, i] = (normal[i, i] + factor[i, i]) / 2
+        prior = variance_grey / slope_sigma**2
+        factor[2, 2] += prior
+        factor[3, 3] += prior
+        if not cholesky(factor, _SINGULAR):
+            plane[n, 0] = plane[n, 1] = plane[n, 2] = variance[n] = np.nan
+            continue
+        weight[0], weight[1], weight[2], weight[3] = 0.0, 1.0, offset[n, 0], offset[n, 1]
+        solve_lower(factor, weight)
+        solve_upper(factor, weight)
+
+        square = prior * (weight[2] ** 2 + weight[3] ** 2)
+        for i in range(4):
+            square += weight[i] ** 2 * normal[i, i]
+            for j in range(i):
+                square += 2 * weight[i] * weight[j] * normal[i, j]
+        # Noise is independent; the residuals beyond noise are correlated.
+        independent = min(variance_grey, 2 * noise**2)
+        correlated = correlation_px**2 * (variance_grey - independent)
+        variance[n] = (independent + correlated) * square
+
+        # A row error makes the residuals the slope along v times the error.
+        if row_sigma > 0:
+            change = 0.0
+            for y in range(v - half, v + half + 1):
+                # the window's own rows where the next one lies outside the image
+                above, below = max(y - 1, 0), min(y + 1, left.shape[0] - 1)
+                for x in range(-half, half + 1):
+                    slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
+                    down = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
+                    along = weight[1] + weight[2] * x + weight[3] * (y - v)
+                    change += (weight[0] + slope * along) * down
+            variance[n] += (row_sigma * change) ** 2
 
 
 @kernel
-def _fit_plane(
-    left: np.ndarray,
-    right: np.ndarray,
-    u: int,
-    v: int,
-    offset: np.ndarray,
-    half: int,
-    slope_sigma: float,
-    noise: float,
-    alike_px: float,
-    window: Float,
-    room: np.ndarray,
-    share: Float,
-    plane: np.ndarray,
-    weight: Float,
-    n: int,
-) -> float:
-    """Move row n of `plane` to the least squares and return the variance at the offset.
-
-    Gauss-Newton steps after Lucas and Kanade (1981). The derivatives are those of the left image,
-    so the normal matrix is built once (inverse composition, Baker and Matthews 2004). What noise
-    adds to it shortens the steps, most where texture is poor, and moves nothing of where they end.
-    """
-    seen, factor, step = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
-    fill_left(left, u, v, half, window)
-    # Add up the lower half of J^T J, of the offset in brightness, d, a and b.
-    # Slopes are multiples of a half, so that in whatever order the sums are exact.
-    for y in range(-half, half + 1):
-        g0 = g1 = s0 = s1 = s2 = 0.0
-        middle = (y + half) * (2 * half + 1) + half
-        for x in range(-half, half + 1):
-            g = window[SLOPE, middle + x]
-            gx = g * x
-            g0, g1 = g0 + g, g1 + gx
-            s0, s1, s2 = s0 + g * g, s1 + g * gx, s2 + gx * gx
-        seen[0, 0] += 2 * half + 1
-        seen[1, 0] += g0
-        seen[2, 0] += g1
-        seen[3, 0] += g0 * y
-        seen[1, 1] += s0
-        seen[2, 1] += s1
-        seen[2, 2] += s2
-        seen[3, 1] += s0 * y
-        seen[3, 2] += s1 * y
-        seen[3, 3] += s0 * y * y
-    variance_grey = _settle(
-        right, u, v, half, seen, slope_sigma, noise, window, room, share, plane, n
-    )
-    if math.isnan(variance_grey):
-        return np.nan
-    # J^T J (4, 4), its lower half, less what the noise of slopes has added to their squares.
-    copy_lower(seen, factor)
-    added = noise**2 / 2 * (2 * half + 1) ** 2
-    for i in range(1, 4):
-        factor[i, i] -= min(added, (1 - _LEAST_TEXTURE) * seen[i, i])
-        added = noise**2 / 2 * (2 * half + 1) ** 2 * half * (half + 1) / 3  # mean of x^2
-    for i in range(1, 4):  # the moments' covariance
-        seen[i, i] = (seen[i, i] + factor[i, i]) / 2
-    prior = variance_grey / slope_sigma**2
-    factor[2, 2] += prior
-    factor[3, 3] += prior
-    if not cholesky(factor, _SINGULAR):
-        _give_up(plane, n)
-        return np.nan
-    step[0], step[1], step[2], step[3] = 0.0, 1.0, offset[n, 0], offset[n, 1]
-    solve_lower(factor, step)
-    solve_upper(factor, step)
-    for i in range(4):
-        weight[n, i] = step[i]
-    return _counted(variance_grey, noise, alike_px) * _square(seen, prior, step)
-
-
-@kernel
-def _settle(
+def _gauss_newton(
     right: np.ndarray,
     u: int,
     v: int,
     half: int,
-    seen: np.ndarray,
+    normal: np.ndarray,
     slope_sigma: float,
     noise: float,
     window: Float,
-    room: np.ndarray,
+    levels: np.ndarray,
     share: Float,
     plane: np.ndarray,
     n: int,
 ) -> float:
-    """Take steps until plane moves nowhere in the window; the residuals' variance, or NaN."""
-    count = (2 * half + 1) ** 2
+    """Iterate plane n to convergence; return the variance of the residuals, or NaN."""
+    count, side = (2 * half + 1) ** 2, 2 * half + 1
     factor, step = np.empty((4, 4)), np.empty(4)
     down = np.empty(len(_AT) * WIDE)
     variance_grey = 2 * noise**2
@@ -324,12 +313,10 @@ def _settle(
         last = u + half - plane[n, 0] - plane[n, 1] * half
         lean = abs(plane[n, 2]) * half
         if not (first - lean >= 1 and last + lean < right.shape[1] - 2 and first < last):
-            _give_up(plane, n)
             return np.nan
-        fill_residuals(right, u, v, half, plane, n, window, room, share)
-        # Sum of the squared residuals; `moment` gets J^T r.
-        # Sums are taken down the columns first, into `down`: so loops run in vectors.
-        side = 2 * half + 1
+        fill_residuals(right, u, v, half, plane, n, window, levels, share)
+
+        # Sum of squared residuals and J^T r: first sums per column, in `down`, which vectorise.
         for i in range(side):
             m = np.uintp(i)
             down[m] = down[m + _AT[1]] = down[m + _AT[2]] = down[m + _AT[3]] = 0.0
@@ -350,14 +337,14 @@ def _settle(
             square, m0, m1 = square + down[m], m0 + down[m + _AT[1]], m1 + along
             m2, m3 = m2 + along * (i - half), m3 + down[m + _AT[3]]
         step[0], step[1], step[2], step[3] = m0, m1, m2, m3
+
         prior = variance_grey / slope_sigma**2
-        copy_lower(seen, factor)
+        copy_lower(normal, factor)
         factor[2, 2] += prior
         factor[3, 3] += prior
         step[2] -= prior * plane[n, 1]
         step[3] -= prior * plane[n, 2]
         if not cholesky(factor, _SINGULAR):
-            _give_up(plane, n)
             return np.nan
         solve_lower(factor, step)
         solve_upper(factor, step)
@@ -367,54 +354,3 @@ def _settle(
         if abs(step[1]) + half * (abs(step[2]) + abs(step[3])) < _CONVERGED_PX:
             break
     return variance_grey
-
-
-@kernel
-def _give_up(plane: np.ndarray, n: int) -> None:
-    for i in range(3):
-        plane[n, i] = np.nan
-
-
-@kernel
-def _square(moments: np.ndarray, prior: float, weight: np.ndarray) -> float:
-    """Of an estimate w' J^T r: w' (M + prior) w, in variances of the grey levels.
-
-    With N the matrix that is seen and N_0 the same less what noise adds, w = (N_0 + prior)^-1 row.
-    The moments J^T r have the covariance M = (N_0 + N) / 2: noise of slopes times that of the right
-    picture; times that of the left one, which it is itself, neighbours cancel. Slopes that the
-    prior holds back are off by what it says.
-    """
-    square = prior * (weight[2] ** 2 + weight[3] ** 2)
-    for i in range(4):
-        square += weight[i] ** 2 * moments[i, i]
-        for j in range(i):
-            square += 2 * weight[i] * weight[j] * moments[i, j]
-    return square
-
-
-@kernel
-def _add_rows(
-    left: np.ndarray, pixel: np.ndarray, half: int, row_sigma: float, weight: Float, variance: Float
-) -> None:
-    """Add to variances (N,) what estimates change by when the right windows' rows are off.
-
-    That makes residuals the slope along v, and of these follows, by `weight`, the change.
-    """
-    for n in range(len(pixel)):
-        u, v, change = pixel[n, 0], pixel[n, 1], 0.0
-        for y in range(v - half, v + half + 1):
-            # the window's own rows where the next one lies outside the image
-            above, below = max(y - 1, 0), min(y + 1, left.shape[0] - 1)
-            for x in range(-half, half + 1):
-                slope = 0.5 * (float(left[y, u + x + 1]) - float(left[y, u + x - 1]))
-                down = (float(left[below, u + x]) - float(left[above, u + x])) / (below - above)
-                along = weight[n, 1] + weight[n, 2] * x + weight[n, 3] * (y - v)
-                change += (weight[n, 0] + slope * along) * down
-        variance[n] += (row_sigma * change) ** 2
-
-
-@kernel
-def _counted(variance_grey: float, noise: float, alike_px: float) -> float:
-    """Variance of residuals as if all were independent: noise is, what exceeds it is not."""
-    independent = min(variance_grey, 2 * noise**2)
-    return independent + alike_px**2 * (variance_grey - independent)

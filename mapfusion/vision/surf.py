@@ -5,10 +5,10 @@ wavelets of side 2 s respond to the change of brightness in u and v, weighted by
 around the keypoint. Each of 4x4 cells (5x5 samples) gives (sum dx, sum dy, sum |dx|, sum |dy|); the
 64 numbers are scaled to unit length.
 
-Wavelet corners lie on one 22x22 grid, s apart, so neighbours share them: each node is read once
-from the integral image, bilinearly. That is the exact integral of the image taken as squares of
-constant brightness, for any fractional position and scale. Beyond the border the interpolation goes
-on as extrapolation, which is the exact integral of an image whose border pixels repeat for ever.
+Wavelet corners lie on one 22x22 grid, s apart, and neighbours share them. Each node is interpolated
+bilinearly in the integral image once. The interpolation is exact for pixels of constant brightness,
+at any fractional position and scale. Beyond the border it becomes an extrapolation, which is exact
+for an image with repeated border pixels.
 """
 
 from dataclasses import dataclass
@@ -32,22 +32,21 @@ SAMPLES = CELLS * SAMPLES_PER_CELL  # per side; also the side of the window in u
 NODES = SAMPLES + 2  # a wavelet spans two intervals
 GAUSSIAN_SIGMA = 3.3  # in units of the scale
 LENGTH = 4 * CELLS * CELLS
-# A window with a smaller norm (grey levels, mean over half a wavelet) is flat: its direction would
-# be rounding error, which is below 1e-9. One grey level at one pixel amid a 40 px window gives 0.1.
+# A window with a smaller norm (grey levels, mean over half a wavelet) is flat. Rounding errors are
+# below 1e-9; one grey level at one pixel in the middle of a 40 px window gives 0.1.
 FLAT_NORM = 1e-4
 
 
 @dataclass(frozen=True)
 class USurfParameters:
-    """Size of the described window.
+    """Parameters of the descriptor's window.
 
     Attributes:
-        window: "pixels" for one scale everywhere; "metric" for a window that covers the same patch
-            of a wall from any distance, which needs the depth.
+        window: "pixels" for the same scale at all keypoints; "metric" for a window that covers the
+            same area of a wall at any distance, which needs the depth.
         scale_px: scale s of "pixels".
         side_m: side of the window of "metric" at the keypoint's depth Z; s = f side_m / (20 Z).
-            Rendered walls from two distances or angles matched best at 0.5 to 0.8 m.
-        min_scale_px: lower bound of "metric"; below one pixel there is nothing left to average.
+        min_scale_px: lower bound of "metric"; below one pixel no pixels are averaged.
         max_scale_px: upper bound of "metric"; a window near the image's size is mostly border.
     """
 
@@ -64,7 +63,7 @@ class USurfParameters:
         require_at_least(self.min_scale_px, self, "max_scale_px")
 
     def scales_px(self, depth_m: Float, focal_px: float) -> Float:
-        """Scales (N,) for keypoints at depths (N,)."""
+        """Return the scales (N,) of keypoints at depths (N,)."""
         if self.window == "pixels":
             return np.full(len(depth_m), self.scale_px)
         metric = focal_px * self.side_m / (SAMPLES * np.asarray(depth_m))
@@ -72,7 +71,7 @@ class USurfParameters:
 
 
 def gaussian_weights() -> np.ndarray:
-    """(20, 20) float64 weights of the samples; the factor in front cancels in the normalisation."""
+    """Return the weights of the samples, shape (20, 20); the scaling cancels in normalisation."""
     offset = np.arange(SAMPLES) - (SAMPLES - 1) / 2
     falloff = np.exp(-(offset**2) / (2 * GAUSSIAN_SIGMA**2))
     return np.outer(falloff, falloff)
@@ -82,16 +81,16 @@ _WEIGHTS = gaussian_weights()
 
 
 def describe(image: np.ndarray, uv_px: Float, scale_px: Float) -> np.ndarray:
-    """Descriptors of keypoints.
+    """Compute the descriptors of keypoints.
 
     Args:
-        image: (H, W) uint8.
-        uv_px: (N, 2) keypoints, fractional, centre of the top left pixel (0, 0).
-        scale_px: (N,) scale s of each; the window's side is 20 s.
+        image: shape (H, W) uint8.
+        uv_px: fractional keypoints, shape (N, 2); the centre of the top left pixel is (0, 0).
+        scale_px: scale s of each keypoint, shape (N,); the window's side is 20 s.
 
     Returns:
-        (N, 64) float32 of unit length; zero where the window is flat. A window that leaves the
-        image sees its border pixels repeated.
+        Descriptors of unit length, shape (N, 64) float32; zero where the window is flat. A window
+        that leaves the image sees the border pixels repeated.
 
     Raises:
         ValueError: wrong shape, type or value; names the argument.
@@ -116,12 +115,13 @@ def describe(image: np.ndarray, uv_px: Float, scale_px: Float) -> np.ndarray:
 def _describe(
     integral: np.ndarray, uv: np.ndarray, scale: np.ndarray, weights: np.ndarray, out: np.ndarray
 ) -> None:
+    """Fill `out` (N, 64) with descriptors, by the integral image (H + 1, W + 1)."""
     node = np.empty((NODES, NODES))
     column = np.empty(NODES, dtype=np.int64)
     fraction = np.empty(NODES)
     sums = np.empty((4, SAMPLES))
     for n in range(len(uv)):
-        # Fill `node` (22, 22) with the integral image at the wavelets' corners.
+        # Interpolate the integral image at the wavelets' corners.
         u = uv[n, 0]
         v = uv[n, 1]
         own_scale = scale[n]
@@ -145,8 +145,7 @@ def _describe(
                 node[i, j] = top + below * (low - top)
         norm_squared = 0.0
         for cell_row in range(CELLS):
-            # Column sums (4, 20) of weighted dx, dy, |dx|, |dy| over the five rows of one row of
-            # cells.
+            # Column sums of weighted dx, dy, |dx|, |dy| over the sample rows of a row of cells.
             first_row = cell_row * SAMPLES_PER_CELL
             sums[:] = 0.0
             for i in range(first_row, first_row + SAMPLES_PER_CELL):

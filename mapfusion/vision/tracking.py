@@ -1,7 +1,7 @@
 """Tracking of features over consecutive frames.
 
-Features are linked by their descriptors. What is followed is the point of the wall that the track
-began with: a corner detector finds another one as the robot draws near.
+Features of consecutive frames are linked by their descriptors. A track keeps the point of the wall
+at its first corner: a corner detector finds another point when the robot comes nearer.
 """
 
 from dataclasses import dataclass, replace
@@ -11,35 +11,82 @@ import numpy as np
 
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.parameters import Probability, Range, require_in_range
-from mapfusion.vision.features import Features
+from mapfusion.parameters import (
+    Probability,
+    Range,
+    require_finite,
+    require_in_range,
+    require_shape,
+)
+from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.patch_alignment import Templates, fit_patches
-from mapfusion.vision.visual_odometry import RigidMotion, rigid_links
+from mapfusion.vision.visual_odometry import RigidMotion, estimate_rigid_motion
+
+_PATCH_HALF_PX = 17  # holds a template's window after a magnification of 1.5
+PATCH_SIDE_PX = 2 * _PATCH_HALF_PX + 1
+
+
+def cut_patches(image: np.ndarray, uv_px: Float) -> np.ndarray:
+    """Cut patches (N, P, P) around the pixels nearest to points (N, 2); border pixels repeat."""
+    middle, around = np.rint(uv_px).astype(np.int64), np.arange(PATCH_SIDE_PX) - _PATCH_HALF_PX
+    u, v = (middle[:, axis, None] + around for axis in (0, 1))
+    rows, columns = (np.clip(at, 0, n - 1) for at, n in zip((v, u), image.shape, strict=True))
+    return image[rows[:, :, None], columns[:, None, :]]
 
 
 @dataclass(frozen=True)
-class Likeness:
-    """How a point's surroundings may differ from view to view, see `Templates.of`."""
-
-    noise_grey: float
-    max_misfit_px: float
-
-    def fill(self, templates: Templates, rows: np.ndarray, patch: np.ndarray, point: Float) -> None:
-        """Put how points (N, 2) in patches (N, P, P) look into rows (N,) of templates."""
-        templates.fill(rows, patch, point, self.noise_grey, self.max_misfit_px)
-
-
-@dataclass(frozen=True)
-class Followed:
-    """Of each feature of one frame the point that it stands for, and how that looked at first.
+class Features:
+    """Matched and described corners of one frame, the strongest corner first.
 
     Attributes:
-        uv_px: (N, 2) where the point lies, beside the feature's own corner.
-        disparity_px: (N,) there.
-        warp: (N, 2, 2) from how it looked at first to this frame's picture, at the point.
-        first_px: (N, 3) its disparity at first, and the slopes of that along u and v.
-        templates: how points looked, those of this frame and of no other.
-        template: (N,) which of them is a point's; -1 before `begin` says how it looks, and without
+        uv_px: position in the left image, shape (N, 2).
+        disparity_px: positive disparity, shape (N,).
+        sigma_disparity_px: standard deviation of the disparity, shape (N,).
+        descriptor: descriptors of unit length, shape (N, 64) float32.
+        slope: change of the disparity along u and v on the corner's surface, shape (N, 2); None if
+            unknown.
+        patch: patches of the left image from `cut_patches`, shape (N, P, P) uint8. Without patches
+            the tracked points are the corners themselves.
+    """
+
+    uv_px: Float
+    disparity_px: Float
+    sigma_disparity_px: Float
+    descriptor: np.ndarray
+    slope: Float | None = None
+    patch: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.uv_px)
+        require_shape("uv_px", self.uv_px, (n, 2))
+        require_shape("disparity_px", self.disparity_px, (n,))
+        require_shape("sigma_disparity_px", self.sigma_disparity_px, (n,))
+        require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
+        if self.slope is not None:
+            require_shape("slope", self.slope, (n, 2))
+            require_finite("slope", self.slope)
+        if self.patch is not None:
+            require_shape("patch", self.patch, (n, PATCH_SIDE_PX, PATCH_SIDE_PX))
+        for name in ("uv_px", "disparity_px", "sigma_disparity_px", "descriptor"):
+            require_finite(name, getattr(self, name))
+        if np.any(self.disparity_px <= 0):
+            raise ValueError("disparity_px: must be positive")
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+
+@dataclass(frozen=True)
+class TrackedPoints:
+    """Point of the world that each feature of a frame stands for, and its first appearance.
+
+    Attributes:
+        uv_px: position of the point, which may differ from the feature's corner, shape (N, 2).
+        disparity_px: disparity at the point, shape (N,).
+        warp: linear map from the first image to this frame's image at the point, shape (N, 2, 2).
+        first_px: disparity in the first image and its slopes along u and v, shape (N, 3).
+        templates: windows of the first images of the points of this frame.
+        template: row of each point in `templates`, shape (N,); -1 before `start` and without
             patches.
     """
 
@@ -51,66 +98,75 @@ class Followed:
     template: np.ndarray
 
     @classmethod
-    def unseen(cls, features: Features, templates: Templates) -> "Followed":
-        """Points at the corners themselves, before `begin` says how they look.
+    def at_corners(cls, features: Features, templates: Templates) -> "TrackedPoints":
+        """Make points at the corners of a frame, still without templates.
 
-        `templates` are those of the frame before, which go on into this one.
+        `templates` are those of the frame before; they serve this frame, too.
         """
         uv, disparity = features.uv_px.copy(), features.disparity_px.copy()
-        first, none = _plane(features, slice(None), disparity), np.full(len(uv), -1)
-        return cls(uv, disparity, _upright(len(uv)), first, templates, none)
+        first, none = _disparity_planes(features, slice(None), disparity), np.full(len(uv), -1)
+        return cls(uv, disparity, _identities(len(uv)), first, templates, none)
 
-    def begin(self, features: Features, rows: np.ndarray, likeness: Likeness) -> None:
-        """Let the corners of some features be points that are seen for the first time."""
+    def start(self, features: Features, rows: np.ndarray) -> None:
+        """Start tracks at the corners of the features `rows`."""
         uv, disparity = features.uv_px[rows], features.disparity_px[rows]
         self.uv_px[rows], self.disparity_px[rows] = uv, disparity
-        self.warp[rows] = _upright(len(rows))
-        self.first_px[rows] = _plane(features, rows, disparity)
+        self.warp[rows] = _identities(len(rows))
+        self.first_px[rows] = _disparity_planes(features, rows, disparity)
         self.template[rows] = -1
         if features.patch is not None:
             used = self.template[self.template >= 0]
-            self.template[rows] = fresh = self.templates.unused(used, len(rows))
-            likeness.fill(self.templates, fresh, features.patch[rows], uv - np.rint(uv))
+            self.template[rows] = unused = self.templates.unused(used, len(rows))
+            self.templates.fill(unused, features.patch[rows], uv - np.rint(uv))
 
 
-def followed(
-    points: Followed, before: Features, after: Features, source: np.ndarray, likeness: Likeness
-) -> tuple[Followed, np.ndarray]:
-    """The points of the next frame, and which of its features are (N,) of points seen before.
+def follow_points(
+    points: TrackedPoints, before: Features, after: Features, source: np.ndarray
+) -> tuple[TrackedPoints, np.ndarray]:
+    """Find the points of a frame in the next frame.
 
-    A point is fitted to the picture that its track began with; where that fails, as it does when
-    the robot has come too near, to the picture before. The others are `unseen`. Of what `points`
-    holds the templates go on, those of the frame before are lost.
+    A point is fitted to the first image of its track. If that fails, for example because the robot
+    has come too near, the point is fitted to the image before. The templates of `points` serve the
+    new points, so `points` is not valid afterwards.
 
     Args:
-        points: of the frame before.
-        before: that frame's features.
-        after: the next frame's.
-        source: (N,) row of `before` that each feature of `after` is linked to, or -1.
-        likeness: beyond which two views show different points.
+        points: points of the frame before.
+        before: features of the frame before.
+        after: features of the next frame.
+        source: row of `before` that each feature of `after` is linked to, or -1, shape (N,).
+
+    Returns:
+        Points of the next frame, at the corners where no point was found, and the mask of the found
+        points, shape (N,) bool.
     """
-    new, rows = Followed.unseen(after, points.templates), np.flatnonzero(source >= 0)
+    new, rows = TrackedPoints.at_corners(after, points.templates), np.flatnonzero(source >= 0)
     if before.patch is None or after.patch is None:
         return new, source >= 0
+
+    # Fit to the first image.
     old = source[rows]
     corner, template = after.uv_px[rows], points.template[old]
     middle = np.rint(corner)
     start = corner + points.uv_px[old] - before.uv_px[old] - middle
-    shown, warp = after.patch[rows], _with_place(points.warp[old], start)
-    now, first = after.disparity_px[rows], points.first_px[old]
-    fits = fit_patches(points.templates, template, shown, warp, bend_of(first, now))
+    patch, warp = after.patch[rows], _affine_maps(points.warp[old], start)
+    disparity, first = after.disparity_px[rows], points.first_px[old]
+    bend = projective_terms(first, disparity)
+    fits = fit_patches(points.templates, template, patch, warp, bend)
+
+    # Fit the others to the image before, which replaces the first image of their tracks.
     again = np.flatnonzero(~fits)
-    if len(again):  # what a track began with has no use any more, whether this fits or not
+    if len(again):
         last = old[again]
         beside = points.uv_px[last] - np.rint(before.uv_px[last])
-        likeness.fill(points.templates, template[again], before.patch[last], beside)
-        nearer = _with_place(_upright(len(again)), start[again])
-        first[again] = _plane(before, last, points.disparity_px[last])
-        bend = bend_of(first[again], now[again])
-        fits[again] = fit_patches(points.templates, template[again], shown[again], nearer, bend)
+        points.templates.fill(template[again], before.patch[last], beside)
+        nearer = _affine_maps(_identities(len(again)), start[again])
+        first[again] = _disparity_planes(before, last, points.disparity_px[last])
+        bend = projective_terms(first[again], disparity[again])
+        fits[again] = fit_patches(points.templates, template[again], patch[again], nearer, bend)
         warp[again] = nearer
 
-    uv, disparity = middle + warp[:, :, 2], now
+    # The disparity at the point differs from that at the corner by the slope of the surface.
+    uv = middle + warp[:, :, 2]
     if after.slope is not None:
         disparity = disparity + np.sum(after.slope[rows] * (uv - corner), axis=1)
     fits &= disparity > 0
@@ -123,24 +179,27 @@ def followed(
     return new, found
 
 
-def bend_of(first_px: Float, disparity_px: Float) -> Float:
-    """(N, 2) h of `patch_fit.py`, per pixel: how the homography of a plane bends a window.
+def projective_terms(first_px: Float, disparity_px: Float) -> Float:
+    """Compute h of `patch_alignment.py`, the projective terms of a plane's homography.
 
-    A point of disparity d has depth f B / d, and by t nearer, d / d' = 1 - t d / (f B) of it. In
-    the picture it is divided by that, which is linear in the image as d is, so that over its value
-    at the point it is 1 + h'x with h = -(d' / d - 1) grad d / d. What turning bends, at most its
-    angle over the focal length, is left out: no rotation is known yet, and it is far less.
+    A point of disparity d has depth f B / d. A camera that is nearer by t sees the depth times
+    d / d' = 1 - t d / (f B). The homography divides by this factor, which is linear in the image as
+    d is. Relative to its value at the point it is 1 + h'x with h = -(d' / d - 1) grad d / d. The
+    effect of rotations is at most the angle over the focal length and is neglected.
 
     Args:
-        first_px: (N, 3) disparity d and its slopes in the earlier picture.
-        disparity_px: (N,) d' in the later one.
+        first_px: disparity d and its slopes in the earlier image, shape (N, 3).
+        disparity_px: disparity d' in the later image, shape (N,).
+
+    Returns:
+        h per pixel, shape (N, 2).
     """
     d, slope = first_px[:, 0], first_px[:, 1:]
     return -((disparity_px / d - 1) / d)[:, None] * slope
 
 
-def _plane(features: Features, rows: np.ndarray | slice, disparity_px: Float) -> Float:
-    """(N, 3) disparities of some features' points, and the slopes of their surfaces."""
+def _disparity_planes(features: Features, rows: np.ndarray | slice, disparity_px: Float) -> Float:
+    """Return disparities (N,) and the slopes of their surfaces, zero if unknown, as (N, 3)."""
     plane = np.zeros((len(disparity_px), 3))
     plane[:, 0] = disparity_px
     if features.slope is not None:
@@ -148,40 +207,40 @@ def _plane(features: Features, rows: np.ndarray | slice, disparity_px: Float) ->
     return plane
 
 
-def _upright(n: int) -> Float:
+def _identities(n: int) -> Float:
+    """Return n identity matrices, shape (n, 2, 2)."""
     maps = np.zeros((n, 2, 2))
     maps[:, 0, 0] = maps[:, 1, 1] = 1.0
     return maps
 
 
-def _with_place(linear: Float, place: Float) -> Float:
-    """Affine maps (N, 2, 3) of linear maps (N, 2, 2) and where the point lies (N, 2)."""
-    return np.concatenate([linear, place[:, :, None]], axis=2)
+def _affine_maps(linear: Float, translation: Float) -> Float:
+    """Return affine maps (N, 2, 3) of linear maps (N, 2, 2) and translations (N, 2)."""
+    return np.concatenate([linear, translation[:, :, None]], axis=2)
 
 
 _NO_MATCH = -1
-_LONGEST_PAUSE = 50.0  # steps: after these no limit on shift or disparity is left
+_LONGEST_PAUSE = 50.0  # steps; after a longer pause the limits exclude nothing
 
 
 @dataclass(frozen=True)
 class TrackParameters:
-    """How features of consecutive frames are linked.
+    """Parameters of tracking.
 
     Attributes:
-        min_length: p, the frames in a row after which a track counts as a landmark.
-        max_shift_u_px: largest motion along a row between two frames; turning moves all points:
-            0.11 rad a frame by 63 px in the middle of the image and 83 px at its edge. Frames
-            without tracks leave the heading to the odometry, so there is room above that.
-        max_shift_v_px: across rows; driving moves near points outwards.
-        max_disparity_ratio: largest change of disparity, as a factor: the robot's step against the
-            nearest depth, and noise at the farthest.
-        max_descriptor_distance: between unit vectors.
-        noise_grey: noise of one image, grey levels; what residuals of a followed point's
-            surroundings are held against.
-        max_misfit_px: these may differ by noise and by what this error of the point's place would
-            explain; what differs more begins a new track.
-        rigid_probability: share of true links that agree with the robot's motion as far as noise
-            lets them (chi-square); what agrees less is cut.
+        min_length: p, number of consecutive frames after which a track is a landmark.
+        max_shift_u_px: largest motion along a row between two frames. A rotation moves all points:
+            0.11 rad moves them by 63 px in the middle of the image and by 83 px at its edge. The
+            default leaves a margin, because a frame without tracks has no visual odometry.
+        max_shift_v_px: largest motion across rows; driving moves near points outwards.
+        max_disparity_ratio: largest ratio of two disparities, by the robot's step at the smallest
+            depth and by noise at the largest.
+        max_descriptor_distance: largest distance of two descriptors of unit length.
+        noise_grey: standard deviation of the noise of one image, grey levels.
+        max_misfit_px: error of the point's position that the fit of its patch tolerates besides
+            noise. A larger difference of the patches ends the track.
+        rigid_probability: share of the correct links that pass the chi-square test against the
+            robot's motion.
     """
 
     min_length: Annotated[int, Range(1, 1000, "frames")] = 3
@@ -199,15 +258,14 @@ class TrackParameters:
 
 @dataclass(frozen=True)
 class Tracks:
-    """The tracks that a frame's features belong to.
+    """Tracks of the features of one frame.
 
     Attributes:
-        track_id: (N,) int64, never used twice by one tracker.
-        length: (N,) int64 frames in a row up to this one, 1 for a new track.
-        uv_px: (N, 2) where the point lies that the track began with.
-        disparity_px: (N,) there.
-        motion: from the frame before, as the links tell it, in the axes of the robot; None where
-            too few do.
+        track_id: unique number of each track, shape (N,) int64.
+        length: number of consecutive frames up to this one, 1 for a new track, shape (N,) int64.
+        uv_px: position of the track's point, shape (N, 2).
+        disparity_px: disparity at the point, shape (N,).
+        motion: motion since the frame before, in the axes of the robot; None for too few links.
     """
 
     track_id: np.ndarray
@@ -218,9 +276,12 @@ class Tracks:
 
 
 class Tracker:
-    """Links each frame's features to those of the frame before; frames come in their order.
+    """Tracker of features over consecutive frames.
 
-    `sigma_uv_px` is the standard deviation of a feature's place in the image.
+    Args:
+        parameters: limits of the links.
+        camera: the rectified pair.
+        sigma_uv_px: standard deviation of a feature's position in the image.
     """
 
     def __init__(
@@ -229,82 +290,79 @@ class Tracker:
         self.parameters = parameters
         self._camera = camera
         self._sigma_uv_px = sigma_uv_px
-        self._likeness = Likeness(parameters.noise_grey, parameters.max_misfit_px)
-        self._previous: tuple[Features, Followed, Tracks] | None = None
+        self._previous: tuple[Features, TrackedPoints, Tracks] | None = None
         self._points_m = np.empty((0, 3)), np.empty((0, 3, 3))
         self._next_id = 0
+
+    @property
+    def points_m(self) -> tuple[Float, Float]:
+        """Points of the last frame in the robot frame (N, 3), and their covariances (N, 3, 3)."""
+        return self._points_m
 
     def update(
         self, features: Features, steps: float = 1.0, R_after_before: Float | None = None
     ) -> Tracks:
-        """Tracks of this frame's features.
+        """Track the features of the next frame.
 
-        `steps` is how many usual steps of time have passed since the frame before: after a pause
-        the limits on shift and disparity allow as much more. `R_after_before` (3, 3) is by how much
-        the robot is known to have tilted since, in its axes: limits on shifts count from there.
+        Args:
+            features: features of the frame.
+            steps: time since the frame before, in usual frame intervals. The limits on shift and
+                disparity grow with the time.
+            R_after_before: known rotation of the robot since the frame before, in its axes, shape
+                (3, 3). The limits on shifts are relative to the rotated points.
         """
         n = len(features)
-        source, track_id, length = (
-            np.full(n, _NO_MATCH),
-            np.empty(n, np.int64),
-            np.ones(n, np.int64),
-        )
+        source = np.full(n, _NO_MATCH)
+        track_id, length = np.empty(n, np.int64), np.ones(n, np.int64)
         if self._previous is None:
-            points, motion = Followed.unseen(features, Templates.room(n)), None
-            self._points_m = self._triangulated(points, features, slice(None))
+            templates = Templates.allocate(
+                n, self.parameters.noise_grey, self.parameters.max_misfit_px
+            )
+            points, motion = TrackedPoints.at_corners(features, templates), None
+            self._points_m = self._triangulate(points, features, slice(None))
         else:
             before, points_before, tracks = self._previous
             expected = before
             if R_after_before is not None:
-                turned = self._camera.turned(before.uv_px, R_after_before)
+                turned = self._camera.rotate_pixels(before.uv_px, R_after_before)
                 expected = replace(before, uv_px=turned)
             source = link(expected, features, self.parameters, steps)
-            points, found = followed(points_before, before, features, source, self._likeness)
+            points, found = follow_points(points_before, before, features, source)
             source[~found] = _NO_MATCH
-            motion = self._keep_rigid(points, features, source)
+
+            # Remove links that contradict the rigid motion; their features stand for the corners.
+            rows = np.flatnonzero(source != _NO_MATCH)
+            p_before, covariance_before = (values[source[rows]] for values in self._points_m)
+            p, covariance = self._triangulate(points, features, slice(None))
+            agree, motion = estimate_rigid_motion(
+                p_before,
+                covariance_before,
+                p[rows],
+                covariance[rows],
+                self.parameters.rigid_probability,
+            )
+            removed = rows[~agree]
+            source[removed] = _NO_MATCH
+            if len(removed):
+                p[removed], covariance[removed] = self._triangulate(features, features, removed)
+            self._points_m = p, covariance
             linked = source != _NO_MATCH
             track_id[linked] = tracks.track_id[source[linked]]
             length[linked] += tracks.length[source[linked]]
+
+        # Features without a link start new tracks.
         born = np.flatnonzero(source == _NO_MATCH)
-        points.begin(features, born, self._likeness)
+        points.start(features, born)
         track_id[born] = np.arange(self._next_id, self._next_id + len(born))
         self._next_id += len(born)
-        made = Tracks(track_id, length, points.uv_px, points.disparity_px, motion)
-        self._previous = features, points, made
-        return made
+        tracks = Tracks(track_id, length, points.uv_px, points.disparity_px, motion)
+        self._previous = features, points, tracks
+        return tracks
 
-    @property
-    def points_m(self) -> tuple[Float, Float]:
-        """Where the last frame's points lie in the robot frame (N, 3), and covariances."""
-        return self._points_m
-
-    def _keep_rigid(
-        self, points: Followed, features: Features, source: np.ndarray
-    ) -> RigidMotion | None:
-        """Cut the links that the motion which explains most does not, and tell that motion.
-
-        What was linked to nothing, or is no more, stands for its own corner.
-        """
-        rows = np.flatnonzero(source != _NO_MATCH)
-        position_before, covariance_before = (values[source[rows]] for values in self._points_m)
-        position, covariance = self._triangulated(points, features, slice(None))
-        agree, motion = rigid_links(
-            position_before,
-            covariance_before,
-            position[rows],
-            covariance[rows],
-            self.parameters.rigid_probability,
-        )
-        cut = rows[~agree]
-        source[cut] = _NO_MATCH
-        if len(cut):
-            position[cut], covariance[cut] = self._triangulated(features, features, cut)
-        self._points_m = position, covariance
-        return motion
-
-    def _triangulated(
-        self, points: Followed | Features, features: Features, rows: np.ndarray | slice
+    def _triangulate(
+        self, points: TrackedPoints | Features, features: Features, rows: np.ndarray | slice
     ) -> tuple[Float, Float]:
+        """Return positions (N, 3) and covariances (N, 3, 3) of points in the robot frame."""
         return self._camera.triangulate(
             points.uv_px[rows],
             points.disparity_px[rows],
@@ -313,21 +371,30 @@ class Tracker:
         )
 
     def landmarks(self, tracks: Tracks) -> np.ndarray:
-        """(N,) bool: features whose track has lasted `min_length` frames."""
+        """Return the mask (N,) of the features whose track has lasted `min_length` frames."""
         return tracks.length >= self.parameters.min_length
 
 
 def link(
     previous: Features, current: Features, parameters: TrackParameters, steps: float = 1.0
 ) -> np.ndarray:
-    """For each feature of `current` (N,) its row in `previous`, or -1.
+    """Link the features of two frames.
 
-    Two features are linked when each is the other's nearest descriptor among those that the limits
-    on shift and disparity allow over so many steps, and the distance is within its limit.
+    Two features are linked when each is the other's nearest descriptor within the limits on shift
+    and disparity, and the distance of the descriptors is within its limit.
+
+    Args:
+        previous: features of the frame before.
+        current: features of this frame.
+        parameters: limits.
+        steps: time between the frames, in usual frame intervals.
+
+    Returns:
+        Row in `previous` of each feature of `current`, or -1, shape (N,).
     """
     steps = min(steps, _LONGEST_PAUSE)
     forward, backward = np.full(len(previous), _NO_MATCH), np.full(len(current), _NO_MATCH)
-    _link(
+    _link_mutually(
         previous.uv_px,
         previous.disparity_px,
         previous.descriptor,
@@ -347,7 +414,7 @@ def link(
 
 
 @kernel
-def _link(
+def _link_mutually(
     previous_uv: np.ndarray,
     previous_disparity: np.ndarray,
     previous_descriptor: np.ndarray,
@@ -363,7 +430,7 @@ def _link(
     backward: np.ndarray,
     backward_squared: Float,
 ) -> None:
-    """Fill in the links of both frames' features, which are none yet, and squared distances."""
+    """Fill in the nearest features and squared distances of both frames; keep mutual links."""
     n = len(uv)
     for i in range(n):
         for j in range(len(previous_uv)):

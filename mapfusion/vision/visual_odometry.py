@@ -1,9 +1,10 @@
-"""Visual odometry: the rigid camera motion that explains tracks between two frames.
+"""Visual odometry: robust rigid motion of a stereo camera between two frames.
 
-A corner may jump along an edge, sit where one wall ends before another, or belong to something that
-moves. Such links look like the others, descriptor by descriptor, and err by several pixels where
-the rest errs by a tenth; one in twenty is enough to turn a map. The world stands still, so all true
-links agree on one motion in space: what it is, with its covariance, is visual odometry.
+Some links between frames are false: a corner may jump along an edge, lie on an occlusion boundary,
+or belong to a moving object. Their descriptors are as similar as those of correct links, but their
+errors are much larger, and few of them are enough to rotate a map. In a static world all correct
+links agree on one rigid motion. This module estimates the motion and its covariance, and rejects
+the links that contradict it.
 """
 
 import math
@@ -27,81 +28,90 @@ from mapfusion.geometry.numerics import (
 )
 from mapfusion.geometry.se3 import inverse
 
-MIN_LINKS = 4  # three links determine a motion; one slip among four is the first that shows
-# Added to the noise: from a tolerance beside which all points are equally certain to none.
+MIN_LINKS = 4  # three links determine a motion; a false link shows among four at the earliest
+# Tolerances added to the noise of the points, from far above the noise to zero.
 _TOLERANCES_M = (1.0, 0.25, 0.06, 0.015, 0.004, 0.001, 0.0)
-_ALL_AFTER = 3  # place in it after which all links are used, whatever the start left out
-_STEPS = 2  # of Gauss-Newton at each tolerance; the answer of the one before is near
-_PARTS = 3  # near, middle and far links; each start but one leaves one of them out
-_SIZE = 6  # of a motion's change: shift along the axes before, and turn about them
-# Added to a normal matrix, as a share of its diagonal: what the links leave open (a turn about the
-# line that all lie on) stays as it is. Rounding is far below, what they do tell far above.
-_OPEN = 1e-10
-# Residuals of true links, in standard deviations: half of them lie below this squared distance.
+_ALL_AFTER = 3  # index of the tolerance from which each start uses all links
+_STEPS = 2  # Gauss-Newton steps per tolerance; the estimate of the tolerance before is near
+_PARTS = 3  # near, middle and far links; three of the four starts leave one part out
+_SIZE = 6  # degrees of freedom: translation and rotation
+# Damping, as a share of the diagonal of the normal matrix: unobservable directions (a rotation
+# about the line through all points) keep their value. Rounding errors are far below this share.
+_DAMPING = 1e-10
+# Median of the squared Mahalanobis distances of correct links.
 _MEDIAN_SQUARE = chi_square_bound(0.5, 3)
 
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """How the camera moved from one frame to the next, by what it sees.
+    """Rigid motion of a camera or body between two frames.
 
     Attributes:
-        T_before_after: (4, 4).
-        covariance: (6, 6) of its error: a shift along the axes of the frame before, and a turn
-            about them through its origin, in that order. As large as the residuals say, where these
-            exceed what is stated of the points.
-        n_links: how many links agree with it.
+        T_before_after: shape (4, 4).
+        covariance: covariance of the error, shape (6, 6): translation along the axes of the frame
+            before, then rotation about these axes through the origin. Scaled up if the residuals
+            exceed the covariances of the points.
+        n_links: number of links that agree with the motion.
     """
 
     T_before_after: Float
     covariance: Float
     n_links: int
 
-    def of(self, T_body_camera: Float) -> "RigidMotion":
-        """The motion of a body that the camera is fixed to, at (4, 4)."""
+    def of_body(self, T_body_camera: Float) -> "RigidMotion":
+        """Return the motion of a body that the camera is fixed to at `T_body_camera` (4, 4)."""
         T = T_body_camera @ self.T_before_after @ inverse(T_body_camera)
-        turn, arm = T_body_camera[:3, :3], T[:3, :3] @ T_body_camera[:3, 3]
-        # T = (R, turn t + p - R p): a turn w of the camera's R shifts the body by (R p) x w
+        R, arm = T_body_camera[:3, :3], T[:3, :3] @ T_body_camera[:3, 3]
+        # a rotation error w of the camera moves the body by arm x w
         jacobian = np.zeros((6, 6))
-        jacobian[:3, :3] = jacobian[3:, 3:] = turn
-        jacobian[:3, 3:] = np.cross(arm, np.eye(3)).T @ turn
+        jacobian[:3, :3] = jacobian[3:, 3:] = R
+        jacobian[:3, 3:] = np.cross(arm, np.eye(3)).T @ R
         return RigidMotion(T, jacobian @ self.covariance @ jacobian.T, self.n_links)
 
 
-def rigid_links(
+def estimate_rigid_motion(
     p_before_m: Float,
     covariance_before_m2: Float,
     p_after_m: Float,
     covariance_after_m2: Float,
     probability: float,
 ) -> tuple[np.ndarray, RigidMotion | None]:
-    """Links (N,) bool that agree with the motion on which most agree, and that motion.
+    """Estimate the rigid motion on which most links agree.
 
-    Least squares over the links inside the gate, again and again, while a tolerance that is added
-    to all covariances falls from far above the noise to nothing. At first every link has one vote;
-    at last each counts by its own precision. That finds the motion in spite of slips anywhere, but
-    not always of another robot nearby: some points known to a millimetre pull at one end, where a
-    wall at one distance leaves open whether the robot turned or slid. So there are four starts, of
-    all links and without the near, the middle and the far third; that with most links wins.
-    Points (N, 3) are in the robot frame of either frame. Fewer than four links leave nothing to
-    compare: all True then, and no motion; none either where fewer than four agree.
+    Iterated least squares over the links inside the gate (graduated non-convexity). A tolerance
+    added to all covariances falls from far above the noise to zero. At first all links have equal
+    weights, at last each link has the weight of its own covariance. A single start may fail beside
+    a moving object: a few very precise near points dominate where a distant wall does not
+    distinguish rotation from translation. So there are four starts, with all links and without the
+    near, the middle and the far third. The result with most links is returned.
+
+    Args:
+        p_before_m: points in the robot frame before, shape (N, 3).
+        covariance_before_m2: their covariances, shape (N, 3, 3).
+        p_after_m: the same points in the robot frame after, shape (N, 3).
+        covariance_after_m2: their covariances, shape (N, 3, 3).
+        probability: share of the correct links inside the gate.
+
+    Returns:
+        Mask of the links that agree with the motion, shape (N,) bool, and the motion. The motion is
+        None for fewer than four links, with all True, and if fewer than four links agree.
     """
     n = len(p_before_m)
     if n < MIN_LINKS:
         return np.ones(n, dtype=bool), None
     gate = chi_square_bound(probability, 3)
-    start = starts(p_before_m)
+    start = initial_subsets(p_before_m)
     agree, T = start.copy(), np.zeros((len(start), 4, 4))
     T[:, range(4), range(4)] = 1.0
     square, normal = np.empty((len(start), n)), np.empty((len(start), _SIZE, _SIZE))
     points = (p_before_m, covariance_before_m2, p_after_m, covariance_after_m2)
-    _narrow(start, agree, *points, gate, T, square, normal)
+    _fit_motions(start, agree, *points, gate, T, square, normal)
     best = int(np.argmax(agree.sum(axis=1)))
     own = agree[best]
     n_links = int(own.sum())
     if n_links < MIN_LINKS:
         return own, None
-    # The median of what has passed the gate lies a little low, by less than a part in a hundred.
+    # The gate lowers the median of the squared distances by less than one percent.
     ranked = np.sort(square[best][own])
     median = (ranked[(n_links - 1) // 2] + ranked[n_links // 2]) / 2
     excess = max(median / _MEDIAN_SQUARE, 1.0)
@@ -109,8 +119,8 @@ def rigid_links(
     return own, RigidMotion(T[best], (covariance + covariance.T) / 2, n_links)
 
 
-def starts(p_before_m: Float) -> np.ndarray:
-    """Links (4, N) bool that each start uses: all, and without a third by distance."""
+def initial_subsets(p_before_m: Float) -> np.ndarray:
+    """Return the links of each start, shape (4, N) bool: all, and without a third by distance."""
     n = len(p_before_m)
     by_distance = np.argsort(np.linalg.norm(p_before_m, axis=1), kind="stable")
     part = np.empty(n, dtype=np.int64)
@@ -119,7 +129,7 @@ def starts(p_before_m: Float) -> np.ndarray:
 
 
 @kernel(error_model="numpy")
-def _narrow(
+def _fit_motions(
     start: np.ndarray,
     agree: np.ndarray,
     p_before: Float,
@@ -131,10 +141,19 @@ def _narrow(
     square: Float,
     normal: Float,
 ) -> None:
-    """Fill in what agrees in the end (B, N), from the links of the starts (B, N).
+    """Fit a motion to the links of each start.
 
-    And of each start the motion (B, 4, 4), the squared distances (B, N), the normal matrix
-    (B, 6, 6), damped.
+    Args:
+        start: links of each start, shape (B, N) bool.
+        agree: links that agree with the motion, shape (B, N) bool; `start` at first.
+        p_before: points, shape (N, 3).
+        S_before: covariances, shape (N, 3, 3).
+        p_after: points, shape (N, 3).
+        S_after: covariances, shape (N, 3, 3).
+        gate: largest squared Mahalanobis distance of a link that agrees.
+        T: motions, shape (B, 4, 4), the identity at first.
+        square: squared Mahalanobis distances, shape (B, N); filled in.
+        normal: damped normal matrices, shape (B, 6, 6); filled in.
     """
     n = start.shape[1]
     lever, residual, information = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 6))
@@ -143,17 +162,15 @@ def _narrow(
         for i in range(len(_TOLERANCES_M)):
             variance = _TOLERANCES_M[i] ** 2
             for _ in range(_STEPS):
-                # Before minus after (N, 3) under a motion, and the turned points (N, 3), which
-                # are levers.
+                # Rotated points (N, 3), the lever arms, and residuals (N, 3).
                 own_T = T[b]
                 for j in range(len(residual)):
                     x, y, z = p_after[j, 0], p_after[j, 1], p_after[j, 2]
                     for k in range(3):
                         lever[j, k] = own_T[k, 0] * x + own_T[k, 1] * y + own_T[k, 2] * z
                         residual[j, k] = p_before[j, k] - lever[j, k] - own_T[k, 3]
-                _information(T[b], variance, S_before, S_after, information)
-                # Sums of J^T I J (6, 6) and J^T I r (6,) over the links in use, J = (1,
-                # -[lever]x).
+                _information_matrices(T[b], variance, S_before, S_after, information)
+                # J^T I J (6, 6) and J^T I r (6,) over the links in use, J = (1, -[lever]x).
                 used = agree[b]
                 own_normal = normal[b]
                 own_normal[:], step[:] = 0.0, 0.0
@@ -163,7 +180,7 @@ def _narrow(
                     xx, xy, xz = information[j, 0], information[j, 1], information[j, 2]
                     yy, yz, zz = information[j, 3], information[j, 4], information[j, 5]
                     x, y, z = lever[j, 0], lever[j, 1], lever[j, 2]
-                    # I J of the turn, column by column: about x, y and z
+                    # I J of the rotation, column by column: about x, y and z
                     u0, u1, u2 = xz * y - xy * z, yz * y - yy * z, zz * y - yz * z
                     v0, v1, v2 = xx * z - xz * x, xy * z - yz * x, xz * z - zz * x
                     w0, w1, w2 = xy * x - xx * y, yy * x - xy * y, yz * x - xz * y
@@ -198,24 +215,35 @@ def _narrow(
                 for r in range(_SIZE):
                     for c in range(r):
                         own_normal[c, r] = own_normal[r, c]
-                    own_normal[r, r] *= 1 + _OPEN
+                    own_normal[r, r] *= 1 + _DAMPING
                 copy_lower(normal[b], factor)
                 if cholesky(factor, 0.0):
                     solve_lower(factor, step)
                     solve_upper(factor, step)
                 else:  # no link is in use
                     step[:] = 0.0
-                _move(T[b], step)
+                _apply_step(T[b], step)
+            # Squared Mahalanobis distances after the step.
             for j in range(n):
-                square[b, j] = _square(lever[j], residual[j], information[j], step)
+                xx, xy, xz = information[j, 0], information[j, 1], information[j, 2]
+                yy, yz, zz = information[j, 3], information[j, 4], information[j, 5]
+                x = residual[j, 0] - step[0] - (step[4] * lever[j, 2] - step[5] * lever[j, 1])
+                y = residual[j, 1] - step[1] - (step[5] * lever[j, 0] - step[3] * lever[j, 2])
+                z = residual[j, 2] - step[2] - (step[3] * lever[j, 1] - step[4] * lever[j, 0])
+                square[b, j] = (
+                    xx * x * x
+                    + yy * y * y
+                    + zz * z * z
+                    + 2 * (xy * x * y + xz * x * z + yz * y * z)
+                )
                 agree[b, j] = square[b, j] <= gate and (i >= _ALL_AFTER or start[b, j])
 
 
 @kernel(error_model="numpy")
-def _information(
+def _information_matrices(
     T: Float, variance: float, S_before: Float, S_after: Float, information: Float
 ) -> None:
-    """Of the differences: the inverse covariances' upper entries (N, 6) under a motion."""
+    """Fill in the upper entries (N, 6) of the residuals' information matrices under a motion."""
     a, b, c = T[0, 0], T[0, 1], T[0, 2]
     d, e, f = T[1, 0], T[1, 1], T[1, 2]
     g, h, i = T[2, 0], T[2, 1], T[2, 2]
@@ -241,8 +269,8 @@ def _information(
 
 
 @kernel(error_model="numpy")
-def _move(T: Float, step: Float) -> None:
-    """Shift, and turn about the origin's axes by the step's rotation vector (Rodrigues)."""
+def _apply_step(T: Float, step: Float) -> None:
+    """Translate and rotate a motion by a step: translation and rotation vector (Rodrigues)."""
     x, y, z = step[3], step[4], step[5]
     angle = math.sqrt(x * x + y * y + z * z)
     # sin(a) / a and (1 - cos(a)) / a^2, exact through zero
@@ -270,21 +298,21 @@ def _square(lever: Float, residual: Float, information: Float, step: Float) -> f
     return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
 
 
-_PLANE = [0, 1, 5]  # x, y and the turn about z, of shifts and turns in space
-# A motion that no links told is one that went on as before, or stopped, or turned: it errs by as
-# much as the motion itself and the largest step that was told so far, together. A robot begins with
-# what one of the simulated kind does from frame to frame at most, m and rad.
+_PLANE = [0, 1, 5]  # indices of x, y and the rotation about z
+# Without links the motion is predicted by the last speed. The robot may have stopped or turned, so
+# the standard deviation of the prediction is the motion itself plus the largest observed step. The
+# initial value of the largest step is that of the simulated robot between two frames, m and rad.
 _FIRST_STEP = np.array([0.1, 0.1, 0.1])
 
 
 @dataclass(frozen=True)
 class VisualOdometry:
-    """Motion since the frame before.
+    """Planar motions since the frame before, for T frames.
 
     Attributes:
-        increments: (T, 3) in the plane, in the robot frame of the frame before; the first is zero.
-        covariance: (T, 3, 3) of their errors; the first is zero.
-        guessed: (T,) bool, motions that too few links told: the robot is taken to go on as before.
+        increments: motions in the robot frame of the frame before, shape (T, 3); the first is zero.
+        covariance: covariances of the increments, shape (T, 3, 3); the first is zero.
+        guessed: motions predicted by the last speed for lack of links, shape (T,) bool.
     """
 
     increments: Float
@@ -299,21 +327,21 @@ def visual_odometry(
     T_robot_camera: Float,
     attitude: Attitude | None = None,
 ) -> VisualOdometry:
-    """What the links of a log's frames say of the robot's way.
+    """Compute the odometry of a log from the motions of its camera.
 
     Args:
-        motions: T of them, as `Tracks.motion` has them, of a camera that was taken for level.
-        steps: (T,) usual steps of time since the frame before.
-        camera: the pair, with the mount that it was taken to have.
-        T_robot_camera: (4, 4) the mount that it has; axes x ahead, y left, z up.
-        attitude: of the T frames; None: the body is level.
+        motions: `Tracks.motion` of T frames, of a camera that was assumed level.
+        steps: time since the frame before, in usual frame intervals, shape (T,).
+        camera: the pair, with its assumed mount.
+        T_robot_camera: actual mount, shape (4, 4); axes x ahead, y left, z up.
+        attitude: attitudes of the T frames; None for a level body.
     """
     n = len(motions)
     increments, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
     guessed = np.array([motion is None for motion in motions])
     guessed[0] = False
     by_robot = robot_motions(motions, camera, T_robot_camera)
-    speed, widest = np.zeros(3), _FIRST_STEP  # a step
+    speed, widest = np.zeros(3), _FIRST_STEP  # per usual frame interval
     for k in range(1, n):
         own = by_robot[k]
         if own is None:
@@ -332,7 +360,10 @@ def visual_odometry(
 def robot_motions(
     motions: Sequence[RigidMotion | None], camera: StereoCamera, T_robot_camera: Float
 ) -> list[RigidMotion | None]:
-    """Motions of the robot's body by those of a camera that was taken for level, see above."""
-    taken = se3.pose(np.eye(3), camera.p_robot_left)
-    T_robot_taken = T_robot_camera @ se3.inverse(taken)
-    return [None if motion is None else motion.of(T_robot_taken) for motion in motions]
+    """Convert motions of a camera that was assumed level to motions of the robot.
+
+    Arguments as in `visual_odometry`.
+    """
+    T_level_camera = se3.pose(np.eye(3), camera.p_robot_left)
+    T_robot_level = T_robot_camera @ se3.inverse(T_level_camera)
+    return [None if motion is None else motion.of_body(T_robot_level) for motion in motions]

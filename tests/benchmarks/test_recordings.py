@@ -34,8 +34,10 @@ def test_front_end(benchmark, work: StereoImport) -> None:
 
 def test_links_in_space(benchmark, work: StereoImport, monkeypatch: pytest.MonkeyPatch) -> None:
     given = []
-    links = tracking.rigid_links
-    monkeypatch.setattr(tracking, "rigid_links", lambda *own: given.append(own) or links(*own))
+    links = tracking.estimate_rigid_motion
+    monkeypatch.setattr(
+        tracking, "estimate_rigid_motion", lambda *own: given.append(own) or links(*own)
+    )
     front_end, observer = FrontEnd(work.camera, work.vision), Observer.of(work.camera, work.vision)
     for k in (10, 11):
         observer.observe(front_end.extract(*work.rectified(k)))

@@ -14,10 +14,10 @@ from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se3 import in_space
 from mapfusion.registration import Registration
 from mapfusion.smoother.smooth import condensed_points
-from mapfusion.vision.disparity_tests import window_sums
+from mapfusion.vision.disparity_tests import window_statistics
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
 from mapfusion.vision.harris import HarrisParameters
-from mapfusion.vision.stereo_noise import measured_noise
+from mapfusion.vision.stereo_noise import estimate_noise
 from mapfusion.vision.tracking import Tracker, TrackParameters
 from sim.floorplan import FloorPlan, Wall
 from sim.raycast.caster import RayCaster
@@ -126,9 +126,9 @@ def front_end() -> None:
     for t in range(3):
         left, right, _ = render(room, camera, (0.02 * t, 0.0, 0.0), 1.0, rng)
         tracker.update(FrontEnd(camera, off_rows).extract(left, right))
-        measured_noise([(left, right)], camera, few.harris, few.stereo)
+        estimate_noise([(left, right)], camera, few.harris, few.stereo)
         ends = np.array([[0, 0], [79, 0], [0, 59], [79, 59]])
-        window_sums(left, right, ends, np.tile([2.5, 0.1, -0.1], (4, 1)), 8, 6)
+        window_statistics(left, right, ends, np.tile([2.5, 0.1, -0.1], (4, 1)), 8, 6)
 
 
 def call_all() -> None:

@@ -34,8 +34,8 @@ from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import with_rows
 from mapfusion.tables import DESCRIPTOR_LENGTH
-from mapfusion.vision.features import PATCH_SIDE_PX, Features
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
+from mapfusion.vision.tracking import PATCH_SIDE_PX, Features
 from sim.recorder import FrameSource, truth_behind
 from sim.renderer import Renderer
 from sim.stereo_head import RadiometricNoise, StereoFrame

@@ -14,8 +14,8 @@ from mapfusion.attitude import write_attitude
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import write_observations, write_truth_points
-from mapfusion.vision.attitude_filter import Levelling, Measured
-from mapfusion.vision.front_end import FrontEndParameters, Observer, joined
+from mapfusion.vision.attitude_filter import AttitudeEstimator, AttitudeMeasurement
+from mapfusion.vision.front_end import FrontEndParameters, Observer, concatenate_observations
 from sim.sway import AttitudeNoise
 from sim.trajectory import Trajectory, read_trajectory
 
@@ -45,7 +45,7 @@ def run(settings: ObservedSettings, job: Job) -> None:
     """
     observer = Observer.of(settings.camera, settings.vision)
     told = told_tilt(settings, read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE))
-    levelling = None if told is None else Levelling()
+    levelling = None if told is None else AttitudeEstimator()
     # robots drive on one level floor, so their heights are known
     sigma = np.array([settings.attitude.sigma_rad, settings.attitude.sigma_rad, 0.0])
     observed, truth, tracks = [], [], []
@@ -56,18 +56,18 @@ def run(settings: ObservedSettings, job: Job) -> None:
             frame = observer.observe(found)
             observed.append(frame.observations)
         else:
-            measured = Measured(np.array([*told[iteration], 0.0]), sigma)
+            measured = AttitudeMeasurement(np.array([*told[iteration], 0.0]), sigma)
             turn = levelling.expected_turn(measured)
             frame = observer.observe(found, R_after_before=turn)
             levelling.add(frame.tracks.motion, measured)
-            observed.append(levelling.applied(frame.observations))
+            observed.append(levelling.to_level_frame(frame.observations))
         state = frame.tracks
         truth.append(points.at(state.uv_px - found.uv_px)[frame.rows])
         if iteration in kept:
             seen = pd.DataFrame(state.uv_px, columns=pd.Index(["u_px", "v_px"]))
             seen = seen.assign(robot=settings.robot, iteration=iteration)
             tracks.append(seen.assign(track=state.track_id, length=state.length))
-    write_observations(job.output, *joined(observed))
+    write_observations(job.output, *concatenate_observations(observed))
     write_truth_points(job.output, np.concatenate(truth))
     write_attitude(job.output, None if levelling is None else levelling.attitude)
     write_rows(job.output / "tracks.parquet", TRACKS, pd.concat(tracks) if tracks else [])

@@ -12,7 +12,7 @@ from mapfusion.datasets.imu import SHARED_RAD, Inertial
 from mapfusion.datasets.stereo_import import Cut, StereoImport
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
-from mapfusion.vision.attitude_filter import Levelling, Measured
+from mapfusion.vision.attitude_filter import AttitudeEstimator, AttitudeMeasurement
 from tests.mapfusion.datasets.written_layouts import START_NS, TIMES_S, drive, read_yaml
 from tests.mapfusion.datasets.written_layouts import write_euroc as write_pictures
 from tests.mapfusion.vision.test_attitude_filter import measured_motion
@@ -76,10 +76,12 @@ def swayed(rng: np.random.Generator, n_frames: int) -> tuple[np.ndarray, np.ndar
     measured, sigma = Inertial(sample_ns, felt).tilts(sample_ns[at])
     way = np.stack([0.05 * np.arange(n_frames), np.zeros(n_frames), 0.03 * np.arange(n_frames)], -1)
     bodies = se3.in_space(way, true[at])
-    levelling = Levelling(shared_rad=SHARED_RAD)
+    levelling = AttitudeEstimator(shared_rad=SHARED_RAD)
     for k in range(n_frames):
         motion = measured_motion(rng, bodies[k - 1], bodies[k]) if k else None
-        levelling.add(motion, Measured(np.array([*measured[k], 0.0]), np.array([*sigma, 0.0])))
+        levelling.add(
+            motion, AttitudeMeasurement(np.array([*measured[k], 0.0]), np.array([*sigma, 0.0]))
+        )
     made = levelling.attitude
     return made.value[:, :2] - true[at], made.sigma[:, :2], measured - true[at]
 
@@ -131,7 +133,7 @@ def test_gyroscopes_hold_a_tilt_where_pictures_show_nothing() -> None:
         true = correlated(rng, n, 0.05, 5)
         way = np.stack([0.05 * np.arange(n), np.zeros(n), 0.03 * np.arange(n)], -1)
         bodies = se3.in_space(way, true)
-        levelling = Levelling()
+        levelling = AttitudeEstimator()
         for k in range(n):
             motion, counted = None, None
             if k:
@@ -140,7 +142,7 @@ def test_gyroscopes_hold_a_tilt_where_pictures_show_nothing() -> None:
                 if k < 60:
                     motion = measured_motion(rng, bodies[k - 1], bodies[k])
             told = true[k] + rng.normal(0, 0.05, 2)
-            measured = Measured(np.array([*told, 0.0]), np.array([0.05, 0.05, 0.0]))
+            measured = AttitudeMeasurement(np.array([*told, 0.0]), np.array([0.05, 0.05, 0.0]))
             levelling.add(motion, measured, counted)
         made = levelling.attitude
         off.append(made.value[60:, :2] - true[60:])

@@ -17,8 +17,8 @@ from mapfusion.errors import InputError
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations
-from mapfusion.vision.features import Features
 from mapfusion.vision.front_end import FrontEndParameters
+from mapfusion.vision.tracking import Features
 from tests.mapfusion.datasets.written_layouts import POSES, drive, write_kitti
 
 HEIGHT_M = 1.65

@@ -133,13 +133,13 @@ def test_kitti_s_right_links_are_kept(
 ) -> None:
     """Links that lie within 1.5 px, 1 px in disparity, of where the true motion takes them."""
     calls = []
-    found_by = tracking.rigid_links
+    found_by = tracking.estimate_rigid_motion
 
     def seen(*given):
         calls.append((given, found_by(*given)))
         return calls[-1][1]
 
-    monkeypatch.setattr(tracking, "rigid_links", seen)
+    monkeypatch.setattr(tracking, "estimate_rigid_motion", seen)
     front_end, observer = FrontEnd(work.camera, work.vision), Observer.of(work.camera, work.vision)
     for k in range(len(kitti)):
         observer.observe(front_end.extract(*work.rectified(k)))

@@ -15,7 +15,12 @@ from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2, se3
 from mapfusion.geometry.camera import StereoCamera
-from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, Observer, joined
+from mapfusion.vision.front_end import (
+    FrontEnd,
+    FrontEndParameters,
+    Observer,
+    concatenate_observations,
+)
 from tests.mapfusion.datasets.written_layouts import drive, read_yaml
 
 CAMERA = StereoCamera(width_px=240, height_px=180, focal_px=216.0)  # ahead of the axles
@@ -98,7 +103,7 @@ def test_observations_are_those_of_the_pictures_themselves(
     vision = every_frame(FrontEndParameters())
     observer, front_end = Observer.of(CAMERA, vision), FrontEnd(CAMERA, vision)
     frames = [observer.observe(front_end.extract(*written.pair(k))) for k in range(3)]
-    iteration, wanted = joined([frame.observations for frame in frames])
+    iteration, wanted = concatenate_observations([frame.observations for frame in frames])
     np.testing.assert_array_equal(log.iteration, iteration)
     assert len(wanted) > 50
     for field in ("position_m", "covariance_m2"):

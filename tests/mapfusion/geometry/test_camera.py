@@ -17,7 +17,7 @@ from mapfusion.geometry.camera import (
     CalibrationError,
     StereoCamera,
     calibration_from,
-    usual_calibration,
+    default_calibration_error,
 )
 from mapfusion.landmark_map import read_map, write_map
 from mapfusion.robot_log import Observations, RobotLog, read_log, write_log
@@ -62,7 +62,7 @@ def test_what_is_no_deviation_is_one_line(text: str) -> None:
 
 
 def test_a_pixel_is_less_in_a_longer_lens() -> None:
-    short, long = (usual_calibration(StereoCamera(focal_px=f)) for f in (300.0, 3000.0))
+    short, long = (default_calibration_error(StereoCamera(focal_px=f)) for f in (300.0, 3000.0))
     assert short.heading_rad > long.heading_rad > 0.002
     assert short.scale == long.scale
 
@@ -147,6 +147,6 @@ def test_far_points_are_seen_where_a_turn_of_the_robot_leaves_them():
     rng = np.random.default_rng(3)
     far = 1e7 * np.column_stack([np.ones(20), rng.uniform(-0.4, 0.4, (20, 2))])
     R_robot_before = Rotation.from_euler("ZYX", [0.1, -0.06, 0.03]).as_matrix()
-    found = CAMERA.turned(CAMERA.project(far)[:, :2], R_robot_before)
+    found = CAMERA.rotate_pixels(CAMERA.project(far)[:, :2], R_robot_before)
     expected = CAMERA.project(np.array([R_robot_before @ p for p in far]))[:, :2]
     np.testing.assert_allclose(found, expected, atol=1e-4)

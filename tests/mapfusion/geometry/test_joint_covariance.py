@@ -8,7 +8,7 @@ from mapfusion.geometry.joint_covariance import (
     JointCovariance,
     KnownErrors,
     StackedErrors,
-    condensed,
+    reduce_rank,
 )
 
 
@@ -31,7 +31,7 @@ def _dense(own_m2: np.ndarray, common: np.ndarray) -> np.ndarray:
 
 def test_all_directions_kept_are_the_dense_covariance() -> None:
     own, common = _parts(np.random.default_rng(0), 7, np.geomspace(1, 1e-3, 12))
-    joint = condensed(own, common, rank=12)
+    joint = reduce_rank(own, common, rank=12)
     np.testing.assert_allclose(joint.dense_m2(), _dense(own, common), rtol=0, atol=1e-12)
 
 
@@ -43,7 +43,7 @@ def test_what_is_left_out_is_the_smallest_and_goes_to_the_landmarks_own(
     monkeypatch.setattr(joint_covariance, "_FEW", few)
     variances = np.geomspace(1, 1e-6, 60)
     own, common = _parts(np.random.default_rng(1), 40, variances)
-    joint, whole = condensed(own, common, rank), _dense(own, common)
+    joint, whole = reduce_rank(own, common, rank), _dense(own, common)
     assert joint.rank == rank
     blocks = whole.reshape(40, 3, 40, 3)[np.arange(40), :, np.arange(40)]
     np.testing.assert_allclose(joint.marginal_m2, blocks, rtol=0, atol=1e-12)
@@ -67,7 +67,7 @@ def test_columns_become_orthonormal_however_near_to_each_other(near: float) -> N
 
 def test_rows_are_those_of_the_dense_covariance() -> None:
     own, common = _parts(np.random.default_rng(2), 6, np.ones(4))
-    joint, rows = condensed(own, common), np.array([4, 1])
+    joint, rows = reduce_rank(own, common), np.array([4, 1])
     of = (3 * rows[:, None] + np.arange(3)).ravel()
     np.testing.assert_allclose(joint[rows].dense_m2(), _dense(own, common)[np.ix_(of, of)])
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from mapfusion.geometry.joint_covariance import KnownErrors, condensed
+from mapfusion.geometry.joint_covariance import KnownErrors, reduce_rank
 from mapfusion.geometry.numerics import Float, inverses
 from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.robot_log import RobotLog
@@ -185,7 +185,7 @@ def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks
     np.testing.assert_allclose(errors.rows_by_all(rows), gram[:, rows], atol=1e-5 * scale)
     squares = KnownErrors(Y).squares()
     np.testing.assert_allclose(errors.squares(), squares, rtol=0, atol=1e-9 * squares.max())
-    by_both = [condensed(solution.own_m2, known, rank=6) for known in (errors, KnownErrors(Y))]
+    by_both = [reduce_rank(solution.own_m2, known, rank=6) for known in (errors, KnownErrors(Y))]
     for one, other in zip(*((each.own_m2, each.marginal_m2) for each in by_both), strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-6 * squares.max())
 

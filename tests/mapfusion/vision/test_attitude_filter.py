@@ -9,7 +9,13 @@ from scipy.spatial.transform import Rotation
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations
-from mapfusion.vision.attitude_filter import LOST_M, AttitudeFilter, Gyroscope, Levelling, Measured
+from mapfusion.vision.attitude_filter import (
+    LOST_M,
+    AttitudeEstimator,
+    AttitudeFilter,
+    AttitudeMeasurement,
+    Gyroscope,
+)
 from mapfusion.vision.visual_odometry import RigidMotion
 
 STEP_S = 0.05
@@ -30,7 +36,7 @@ def test_it_is_the_sum_of_what_both_know() -> None:
     more = np.array([2e-4, -1e-4, 3e-4])
     turned = (Rotation.from_rotvec(more) * Rotation.from_matrix(T[:3, :3])).as_rotvec()
     own = (2e-4**2 * STEP_S + 1e-6) * STEP_S**2 * np.eye(3) + NOISE_RAD**2 * np.eye(3)
-    found = gyroscope.joined(turned, STEP_S, motion_of(T, C))
+    found = gyroscope.fuse(turned, STEP_S, motion_of(T, C))
     precision = np.linalg.inv(C)
     precision[3:, 3:] += np.linalg.inv(own)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(precision), rtol=1e-3, atol=1e-15)
@@ -52,7 +58,7 @@ def driven(seed: int, n: int, lost: slice) -> tuple[Gyroscope, np.ndarray, np.nd
         seen = Rotation.from_rotvec(rng.normal(0, 5e-4, 3)) * true
         motion = motion_of(se3.pose(seen.as_matrix(), rng.normal(0, 1e-3, 3)), C)
         blind = k in range(*lost.indices(n))
-        found = gyroscope.joined(counted, STEP_S, None if blind else motion)
+        found = gyroscope.fuse(counted, STEP_S, None if blind else motion)
         made = Rotation.from_matrix(found.T_before_after[:3, :3])
         errors[k] = (made * true.inv()).as_rotvec()
         sigmas[k] = np.sqrt(np.diag(found.covariance)[3:])
@@ -101,7 +107,7 @@ def test_exact_turns_carry_an_exact_attitude() -> None:
     bodies[:, 2, 3] = np.linspace(0, 1, 30)
     kept = AttitudeFilter()
     first = np.array([*se3.roll_pitch(bodies[0, :3, :3]), 0.0])
-    kept.measure(Measured(first, np.zeros(3)))
+    kept.measure(AttitudeMeasurement(first, np.zeros(3)))
     for before, after in itertools.pairwise(bodies):
         kept.move(RigidMotion(se3.between(before, after), np.zeros((6, 6)), 9))
         expected = [*se3.roll_pitch(after[:3, :3]), after[2, 3]]
@@ -112,7 +118,7 @@ def test_exact_turns_carry_an_exact_attitude() -> None:
 def test_errors_stay_in_the_world_when_the_body_turns() -> None:
     """Uncertain in roll, and turned by a quarter: uncertain in pitch."""
     kept = AttitudeFilter()
-    kept.measure(Measured(np.zeros(3), np.array([0.01, 0.001, 0.0])))
+    kept.measure(AttitudeMeasurement(np.zeros(3), np.array([0.01, 0.001, 0.0])))
     quarter = se3.from_planar(np.array([0.0, 0.0, np.pi / 2]))
     kept.move(RigidMotion(quarter, np.zeros((6, 6)), 9))
     np.testing.assert_allclose(kept.sigma, [0.001, 0.01, 0.0], rtol=1e-3, atol=1e-12)
@@ -124,9 +130,9 @@ def test_errors_stay_in_the_world_when_the_body_turns() -> None:
 def test_what_a_tilt_moves_is_expected_there() -> None:
     rng = np.random.default_rng(5)
     before, after = rng.normal(0, 0.05, (2, 2))
-    levelling = Levelling()
-    levelling.add(None, Measured(np.array([*before, 0.0]), np.full(3, 1e-9)))
-    turn = levelling.expected_turn(Measured(np.array([*after, 0.0]), INCLINOMETER))
+    levelling = AttitudeEstimator()
+    levelling.add(None, AttitudeMeasurement(np.array([*before, 0.0]), np.full(3, 1e-9)))
+    turn = levelling.expected_turn(AttitudeMeasurement(np.array([*after, 0.0]), INCLINOMETER))
     ray = rng.normal(size=3)
     assert turn is not None
     np.testing.assert_allclose(
@@ -140,13 +146,13 @@ def test_errors_are_as_large_as_stated_and_smaller_than_measured() -> None:
     for _ in range(60):
         bodies = swaying_bodies(rng, 25)
         true = np.c_[se3.roll_pitch(bodies[:, :3, :3]), np.zeros(25)]
-        levelling = Levelling()
+        levelling = AttitudeEstimator()
         for k, body in enumerate(bodies):
             motion = measured_motion(rng, bodies[k - 1], body) if k else None
             told = np.array([*(true[k, :2] + rng.normal(0, INCLINOMETER[:2])), np.nan])
             if k == 0:
                 told[2] = 0.0  # the height is known where the map begins, and carried on
-            levelling.add(motion, Measured(told, INCLINOMETER))
+            levelling.add(motion, AttitudeMeasurement(told, INCLINOMETER))
         errors.append(levelling.attitude.value - true)
         sigmas.append(levelling.attitude.sigma)
         carried.append(levelling.attitude.carried)
@@ -164,9 +170,9 @@ def test_errors_are_as_large_as_stated_and_smaller_than_measured() -> None:
 
 def test_without_links_what_is_measured_counts_alone() -> None:
     rng = np.random.default_rng(2)
-    levelling = Levelling()
+    levelling = AttitudeEstimator()
     for told in rng.normal(0, 0.05, (5, 2)):
-        levelling.add(None, Measured(np.array([*told, 0.0]), INCLINOMETER))
+        levelling.add(None, AttitudeMeasurement(np.array([*told, 0.0]), INCLINOMETER))
         np.testing.assert_allclose(levelling.attitude.value[-1, :2], told, atol=1e-5)
         np.testing.assert_allclose(levelling.attitude.sigma[-1], INCLINOMETER, rtol=1e-4)
 
@@ -176,18 +182,18 @@ def test_a_mount_changes_nothing() -> None:
     rng = np.random.default_rng(3)
     mount = se3.pose(Rotation.from_euler("ZYX", [0.3, 0.1, -0.2]).as_matrix(), [0.3, 0.1, 0.5])
     bodies = swaying_bodies(rng, 6)
-    own, by_camera = Levelling(), Levelling(mount)
+    own, by_camera = AttitudeEstimator(), AttitudeEstimator(mount)
     p_camera = rng.uniform([1, -1, -1], [4, 1, 1], (7, 3))
     p_body = p_camera @ mount[:3, :3].T + mount[:3, 3]
     for k, body in enumerate(bodies):
-        told = Measured(np.array([*se3.roll_pitch(body[:3, :3]), 0.0]), INCLINOMETER)
+        told = AttitudeMeasurement(np.array([*se3.roll_pitch(body[:3, :3]), 0.0]), INCLINOMETER)
         turn, seen_turn = own.expected_turn(told), by_camera.expected_turn(told)
         motion = measured_motion(rng, bodies[k - 1], body) if k else None
-        seen = None if motion is None else motion.of(se3.inverse(mount))
+        seen = None if motion is None else motion.of_body(se3.inverse(mount))
         own.add(motion, told)
         by_camera.add(seen, told)
         points = [
-            levelling.applied(Observations(p, np.tile(1e-4 * np.eye(3), (7, 1, 1))))
+            levelling.to_level_frame(Observations(p, np.tile(1e-4 * np.eye(3), (7, 1, 1))))
             for levelling, p in ((own, p_body), (by_camera, p_camera))
         ]
         np.testing.assert_allclose(points[1].position_m, points[0].position_m, atol=1e-12)
@@ -204,7 +210,7 @@ def test_far_points_are_expected_where_a_tilt_moves_them() -> None:
     before, after = se3.tilt(*rng.normal(0, 0.05, (2, 2)).T)
     p_world = rng.uniform([1e6, -3e5, -2e5], [2e6, 3e5, 2e5], (30, 3))
     uv_before, uv_after = (camera.project(p_world @ R)[:, :2] for R in (before, after))
-    np.testing.assert_allclose(camera.turned(uv_before, after.T @ before), uv_after, atol=1e-3)
+    np.testing.assert_allclose(camera.rotate_pixels(uv_before, after.T @ before), uv_after, atol=1e-3)
 
 
 def moved_from(value: np.ndarray, T: np.ndarray) -> np.ndarray:
@@ -245,7 +251,7 @@ def test_a_step_carries_errors_as_it_carries_the_attitude() -> None:
 
 def test_a_lost_step_leaves_the_height_but_for_what_it_may_have_climbed() -> None:
     kept = AttitudeFilter()
-    kept.measure(Measured(np.array([0.1, -0.1, 2.0]), np.array([0.01, 0.01, 0.05])))
+    kept.measure(AttitudeMeasurement(np.array([0.1, -0.1, 2.0]), np.array([0.01, 0.01, 0.05])))
     before = kept.covariance[2, 2]
     kept.move(None)
     assert kept.covariance[2, 2] == pytest.approx(before + LOST_M**2)
@@ -256,7 +262,7 @@ def test_a_lost_step_leaves_the_height_but_for_what_it_may_have_climbed() -> Non
 
 def test_the_first_frame_s_plane_is_the_map_s() -> None:
     kept = AttitudeFilter()
-    kept.measure(Measured(np.zeros(3), INCLINOMETER + 0.01))
+    kept.measure(AttitudeMeasurement(np.zeros(3), INCLINOMETER + 0.01))
     assert not kept.fresh.any()
 
 
@@ -269,7 +275,7 @@ def test_what_is_measured_adds_its_information(known: list[int]) -> None:
     kept = AttitudeFilter(covariance=root @ root.T)
     information = np.linalg.inv(kept.covariance)
     information[known, known] += 1 / sigma[known] ** 2
-    kept.measure(Measured(value, sigma))
+    kept.measure(AttitudeMeasurement(value, sigma))
     np.testing.assert_allclose(kept.covariance, np.linalg.inv(information), atol=1e-12)
     vector = np.zeros(3)
     vector[known] = value[known] / sigma[known] ** 2
@@ -278,10 +284,10 @@ def test_what_is_measured_adds_its_information(known: list[int]) -> None:
 
 def two_frames(shared_rad: float) -> tuple[np.ndarray, np.ndarray]:
     """Return sigmas and carried shares of a body that stands still, measured well, then badly."""
-    levelling = Levelling(shared_rad=shared_rad)
+    levelling = AttitudeEstimator(shared_rad=shared_rad)
     still = RigidMotion(np.eye(4), 1e-8 * np.eye(6), 9)
     for k, sigma in enumerate((0.01, 0.03)):
-        measured = Measured(np.zeros(3), np.array([sigma, sigma, 0.01]))
+        measured = AttitudeMeasurement(np.zeros(3), np.array([sigma, sigma, 0.01]))
         levelling.add(still if k else None, measured)
     return levelling.attitude.sigma, levelling.attitude.carried
 
@@ -301,9 +307,9 @@ def test_what_all_measurements_err_by_alike_is_carried_whole() -> None:
 
 def test_the_share_of_a_tilt_that_is_carried_is_the_mean_of_both_angles() -> None:
     """Roll is measured anew and carries nothing; pitch is not measured and carries all."""
-    levelling = Levelling()
-    levelling.add(None, Measured(np.zeros(3), np.full(3, 0.01)))
+    levelling = AttitudeEstimator()
+    levelling.add(None, AttitudeMeasurement(np.zeros(3), np.full(3, 0.01)))
     still = RigidMotion(np.eye(4), 1e-12 * np.eye(6), 9)
-    roll_alone = Measured(np.array([0.0, np.nan, np.nan]), np.array([1e-6, 1.0, 1.0]))
+    roll_alone = AttitudeMeasurement(np.array([0.0, np.nan, np.nan]), np.array([1e-6, 1.0, 1.0]))
     levelling.add(still, roll_alone)
     np.testing.assert_allclose(levelling.attitude.carried[1], [0.5, 1.0], atol=1e-6)

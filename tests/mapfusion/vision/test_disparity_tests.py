@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest, ncx2
 
-from mapfusion.vision.disparity_tests import FURTHER_TERMS, window_sums
+from mapfusion.vision.disparity_tests import FURTHER_TERMS, window_statistics
 from mapfusion.vision.subpixel import fit_planes
 from tests.mapfusion.vision.shifted_pictures import Picture, pair
 
@@ -16,7 +16,7 @@ def plane_scores(
     left: np.ndarray, right: np.ndarray, pixel: np.ndarray, plane: np.ndarray
 ) -> np.ndarray:
     """Scores and mean squared slopes (N, 3) of windows; halves are of larger ones."""
-    return window_sums(left, right, pixel, plane, HALF + 3, HALF)[1]
+    return window_statistics(left, right, pixel, plane, HALF + 3, HALF)[1]
 
 
 def apart(half: int = HALF) -> np.ndarray:
@@ -179,7 +179,9 @@ def test_halves_and_slopes_equal_plain_sums(halves: tuple[int, int]) -> None:
     left, right = pair(9.3, 0.02, -0.01, noise=3.0)
     for plane in PLANES:
         pixel = np.array(CENTRES)
-        squares, scores = window_sums(left, right, pixel, np.tile(plane, (len(pixel), 1)), *halves)
+        squares, scores = window_statistics(
+            left, right, pixel, np.tile(plane, (len(pixel), 1)), *halves
+        )
         for n, (u, v) in enumerate(CENTRES):
             x, y, r, g, h = looked_at(left, right, u, v, plane, halves[0]).T
             offset = r[y != 0].mean() if np.any(y != 0) else 0.0

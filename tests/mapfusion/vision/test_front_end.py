@@ -8,10 +8,9 @@ import pytest
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import transform_points
 from mapfusion.robot_log import Observations
-from mapfusion.vision.features import Features
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, observable
 from mapfusion.vision.surf import USurfParameters
-from mapfusion.vision.tracking import Tracker, TrackParameters
+from mapfusion.vision.tracking import Features, Tracker, TrackParameters
 from tests.mapfusion.vision.rendered_scene import Plane, render, wall
 
 CAMERA = StereoCamera()

@@ -6,10 +6,10 @@ import pytest
 
 from mapfusion.vision.harris import (
     HarrisParameters,
-    _strongest,
     detect,
     local_maxima,
     spread,
+    strongest_maxima,
 )
 
 
@@ -104,7 +104,7 @@ def test_equal_responses_keep_the_order_of_rows() -> None:
     response = np.zeros((60, 60), np.float32)
     response[30, 20], response[20, 30], response[25, 40] = 1, 1, 2
     parameters = HarrisParameters(border_px=5, min_slope=1.0)
-    assert _strongest(response, parameters).tolist() == [[40, 25], [30, 20], [20, 30]]
+    assert strongest_maxima(response, parameters).tolist() == [[40, 25], [30, 20], [20, 30]]
 
 
 def test_strongest_come_first_and_follow_the_image() -> None:

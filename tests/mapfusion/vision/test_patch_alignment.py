@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
-from mapfusion.vision.features import PATCH_SIDE_PX, cut_patches
 from mapfusion.vision.patch_alignment import Templates, fit_patches
+from mapfusion.vision.tracking import PATCH_SIDE_PX, cut_patches
 from tests.mapfusion.vision.shifted_pictures import Picture
 
 HALF = PATCH_SIDE_PX // 2

@@ -8,7 +8,7 @@ from scipy.ndimage import maximum_filter
 from scipy.stats import binom, chi2
 
 from mapfusion.vision.harris import HarrisParameters, detect
-from mapfusion.vision.stereo import StereoParameters, Verdict, match, search_rows
+from mapfusion.vision.stereo import MatchStatus, StereoParameters, match, search_rows
 from tests.mapfusion.vision.rendered_scene import Plane, render, wall
 from tests.mapfusion.vision.shifted_pictures import CAMERA, Picture, grid, pair
 
@@ -23,8 +23,8 @@ def test_disparity_of_a_known_plane(d: float, a: float, b: float) -> None:
     left, right = pair(d, a, b)
     uv = grid()
     matches = match(left, right, uv, CAMERA, PARAMETERS)
-    assert np.mean(matches.verdict == Verdict.MATCHED) > 0.95
-    matched = matches.verdict == Verdict.MATCHED
+    assert np.mean(matches.status == MatchStatus.MATCHED) > 0.95
+    matched = matches.status == MatchStatus.MATCHED
     error = (matches.disparity_px - (d + a * uv[:, 0] + b * uv[:, 1]))[matched]
     assert np.median(np.abs(error)) < 0.01
     assert abs(np.median(error)) < 0.004
@@ -45,7 +45,7 @@ def test_variance_is_that_of_the_errors(noise: float) -> None:
     for seed in range(4):
         left, right = pair(9.3, 0.02, -0.01, noise, seed)
         matches = match(left, right, uv, CAMERA, parameters)
-        ok = matches.verdict == Verdict.MATCHED
+        ok = matches.status == MatchStatus.MATCHED
         error = matches.disparity_px - (9.3 + 0.02 * uv[:, 0] - 0.01 * uv[:, 1])
         squares += np.sum((error[ok] / matches.sigma_px[ok]) ** 2)
         count += ok.sum()
@@ -73,9 +73,9 @@ def test_what_residuals_hold_beyond_noise_counts_as_often_as_it_is_alike() -> No
 def test_a_refinement_that_leaves_the_search_is_refused() -> None:
     """The search finds whole pixels: of 8.4 it is 8, and the least squares moves by 0.4."""
     left, right = pair(8.4)
-    for most, verdict in ((0.35, Verdict.DIVERGED), (0.45, Verdict.MATCHED)):
+    for most, status in ((0.35, MatchStatus.DIVERGED), (0.45, MatchStatus.MATCHED)):
         matches = match(left, right, grid(), CAMERA, replace(PARAMETERS, max_jump_px=most))
-        assert np.mean(matches.verdict == verdict) > 0.95
+        assert np.mean(matches.status == status) > 0.95
 
 
 def search_twin(
@@ -98,8 +98,8 @@ def test_search_equals_correlation_by_definition() -> None:
     left, right = pair(9.3, 0.02, -0.01, noise=20.0)
     pixel = np.rint(grid(step=25)).astype(np.int64)
     # no condition but the best score, so that unlikely matches are compared too
-    found, verdict = search_rows(left, right, pixel, 2, 30, 5, -1.0, 1.0, 10**6)
-    assert np.all(verdict == Verdict.MATCHED)
+    found, status = search_rows(left, right, pixel, 2, 30, 5, -1.0, 1.0, 10**6)
+    assert np.all(status == MatchStatus.MATCHED)
     expected = [search_twin(left, right, u, v, 2, 30, 5) for u, v in pixel]
     assert found.tolist() == expected
 
@@ -113,7 +113,7 @@ def test_repetition_is_ambiguous() -> None:
         for image in (stripes, np.roll(stripes, -9, 1))
     )
     matches = match(left, right, grid(), CAMERA, PARAMETERS)
-    assert np.all(matches.verdict == Verdict.AMBIGUOUS)
+    assert np.all(matches.status == MatchStatus.AMBIGUOUS)
 
 
 def test_what_only_the_left_camera_sees_is_one_sided() -> None:
@@ -127,9 +127,9 @@ def test_what_only_the_left_camera_sees_is_one_sided() -> None:
     right[90:131, 110:151] = patch
     uv = np.array([[140.0, 110.0]])
     parameters = replace(PARAMETERS, min_depth_m=0.25)  # disparities of both patches, 10 and 70
-    assert match(left, right, uv, CAMERA, parameters).verdict == Verdict.ONE_SIDED
+    assert match(left, right, uv, CAMERA, parameters).status == MatchStatus.ONE_SIDED
     unchecked = replace(parameters, max_round_trip_px=100, plane_probability=1.0)
-    assert match(left, right, uv, CAMERA, unchecked).verdict == Verdict.MATCHED
+    assert match(left, right, uv, CAMERA, unchecked).status == MatchStatus.MATCHED
 
 
 def box_scene(rng: np.random.Generator) -> list[Plane]:
@@ -154,10 +154,10 @@ BY_PLANE = replace(PARAMETERS, max_misfit_px=100.0, plane_misfit_px=0.2)
 
 
 @pytest.mark.parametrize(
-    ("tested", "verdict"), [(BY_HALVES, Verdict.SILHOUETTE), (BY_PLANE, Verdict.BENT)]
+    ("tested", "status"), [(BY_HALVES, MatchStatus.SILHOUETTE), (BY_PLANE, MatchStatus.BENT)]
 )
 def test_edges_are_rejected_and_slanted_walls_are_not(
-    tested: StereoParameters, verdict: Verdict
+    tested: StereoParameters, status: MatchStatus
 ) -> None:
     rng = np.random.default_rng(2)
     corners_of = HarrisParameters(max_corners=400, min_distance_px=5)
@@ -166,10 +166,10 @@ def test_edges_are_rejected_and_slanted_walls_are_not(
         left, right, depth = render(box_scene(rng), CAMERA, (x, 0.0, 0.05), 2.0, rng)
         uv = detect(left, corners_of)
         edge = step_px(depth, uv, 3) > 2
-        with_test, without = (match(left, right, uv, CAMERA, p).verdict for p in (tested, UNTESTED))
+        with_test, without = (match(left, right, uv, CAMERA, p).status for p in (tested, UNTESTED))
         on_edge += np.sum(edge)
-        passed_unchecked += np.sum(edge & (without == Verdict.MATCHED))
-        rejected += np.sum(edge & (without == Verdict.MATCHED) & (with_test == verdict))
+        passed_unchecked += np.sum(edge & (without == MatchStatus.MATCHED))
+        rejected += np.sum(edge & (without == MatchStatus.MATCHED) & (with_test == status))
     assert on_edge > 30
     assert passed_unchecked > 10
     assert rejected >= 0.9 * passed_unchecked
@@ -180,9 +180,9 @@ def test_edges_are_rejected_and_slanted_walls_are_not(
     u, v = np.rint(uv).astype(int).T
     if tested is BY_PLANE:  # at the wall's ends there are two surfaces in a window
         uv = uv[np.isfinite(maximum_filter(depth, 2 * tested.plane_half_px + 1)[v, u])]
-    found = match(left, right, uv, CAMERA, tested).verdict
-    assert np.mean(found == verdict) < 0.02
-    assert np.mean(found == Verdict.MATCHED) > 0.8
+    found = match(left, right, uv, CAMERA, tested).status
+    assert np.mean(found == status) < 0.02
+    assert np.mean(found == MatchStatus.MATCHED) > 0.8
 
 
 def test_a_narrow_strip_of_another_surface_is_told() -> None:
@@ -191,7 +191,7 @@ def test_a_narrow_strip_of_another_surface_is_told() -> None:
     u, v = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
     beside = (u - 60) % 50
     step = 0.5 * ((beside > PARAMETERS.half_px - 2) & (beside < 25))
-    tested, verdict = replace(BY_PLANE, noise_grey=2.0), []
+    tested, status = replace(BY_PLANE, noise_grey=2.0), []
     for seed in range(6):
         picture, rng = Picture(seed), np.random.default_rng(seed)
         images = [picture(u, v), np.roll(picture(u + step, v), -8, 1)]
@@ -199,8 +199,8 @@ def test_a_narrow_strip_of_another_surface_is_told() -> None:
             np.clip(np.rint(k + 2 * rng.standard_normal(k.shape)), 0, 255).astype(np.uint8)
             for k in images
         )
-        verdict.append(match(left, right, corners.reshape(-1, 2), CAMERA, tested).verdict)
-    assert np.mean(np.array(verdict) == Verdict.BENT) > 0.9
+        status.append(match(left, right, corners.reshape(-1, 2), CAMERA, tested).status)
+    assert np.mean(np.array(status) == MatchStatus.BENT) > 0.9
 
 
 def test_planes_are_bent_at_the_stated_rate() -> None:
@@ -215,13 +215,13 @@ def test_planes_are_bent_at_the_stated_rate() -> None:
     uv, bent = grid(step=2 * stated.plane_half_px + 1), []  # windows that do not overlap
     for seed in range(8):
         images = pair(9.0, noise=noise, seed=seed)
-        verdict = match(*images, uv, CAMERA, stated).verdict
-        bent += (verdict[verdict != Verdict.WEAK] == Verdict.BENT).tolist()
+        status = match(*images, uv, CAMERA, stated).status
+        bent += (status[status != MatchStatus.WEAK] == MatchStatus.BENT).tolist()
     low, high = binom.interval(0.999, len(bent), share)
     assert low <= np.sum(bent) <= high
     for more in ({"plane_misfit_px": 0.5}, {"max_rows_px": 0.5}):
-        verdict = match(*images, uv, CAMERA, replace(stated, **more)).verdict
-        assert np.sum(verdict == Verdict.BENT) <= 1
+        status = match(*images, uv, CAMERA, replace(stated, **more)).status
+        assert np.sum(status == MatchStatus.BENT) <= 1
 
 
 @pytest.mark.parametrize("shape", [(5, 5), (30, 30), (240, 320)])
@@ -230,7 +230,7 @@ def test_flat_and_tiny_images_have_no_matches(shape: tuple[int, int]) -> None:
     for level in (0, 100, 255):
         image = np.full(shape, level, np.uint8)
         matches = match(image, image, uv, CAMERA, PARAMETERS)
-        assert not np.any(matches.verdict == Verdict.MATCHED)
+        assert not np.any(matches.status == MatchStatus.MATCHED)
         assert np.isnan(matches.disparity_px).all()
         assert np.isnan(matches.sigma_px).all()
 
@@ -244,8 +244,8 @@ def test_every_pixel_of_the_image_may_be_asked_for() -> None:
         parameters = replace(PARAMETERS, half_px=half, silhouette_half_px=half, plane_half_px=half)
         matches = match(left, right, uv, CAMERA, parameters)
         margin = np.minimum(uv, [319, 239] - uv).min(1)
-        assert not np.any(matches.verdict[margin < half - 1] == Verdict.MATCHED)
-        ok = matches.verdict == Verdict.MATCHED
+        assert not np.any(matches.status[margin < half - 1] == MatchStatus.MATCHED)
+        ok = matches.status == MatchStatus.MATCHED
         assert np.abs(matches.disparity_px[ok] - 9.3).max() < 0.3
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
-from mapfusion.vision.disparity_tests import disagrees, window_sums
+from mapfusion.vision.disparity_tests import fails_silhouette_test, window_statistics
 from mapfusion.vision.subpixel import fit_planes
 from tests.mapfusion.vision.shifted_pictures import grid, pair
 
@@ -117,8 +117,8 @@ def test_the_worst_half_of_the_window_decides() -> None:
         worst.append(int(np.argmax(misfit)))
         for share, expected in ((0.999, True), (1.001, False)):
             most = share * misfit.max()
-            squares, _ = window_sums(left, right, np.array([[u, v]]), plane, 12, 8)
-            found = disagrees(squares, 1.0, most, 0.0)
+            squares, _ = window_statistics(left, right, np.array([[u, v]]), plane, 12, 8)
+            found = fails_silhouette_test(squares, 1.0, most, 0.0)
             assert found.tolist() == [expected]
     assert min(worst.count(side) for side in range(4)) >= 3
 
@@ -146,7 +146,7 @@ def test_rows_that_are_off_are_tolerated_where_asked() -> None:
     left, right = pair(8.0, rows=0.6)
     pixel = np.rint(grid(step=25)).astype(np.int64)
     plane = np.tile([8.0, 0.0, 0.0], (len(pixel), 1))
-    squares, _ = window_sums(left, right, pixel, plane, 12, 12)
-    refused = [disagrees(squares, 1.0, 0.05, rows).mean() for rows in (0, 0.4, 0.8)]
+    squares, _ = window_statistics(left, right, pixel, plane, 12, 12)
+    refused = [fails_silhouette_test(squares, 1.0, 0.05, rows).mean() for rows in (0, 0.4, 0.8)]
     assert refused[0] == refused[1] == 1
     assert refused[2] == 0

@@ -8,9 +8,15 @@ import pytest
 
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import transform_points
-from mapfusion.vision.features import PATCH_SIDE_PX, Features
 from mapfusion.vision.front_end import FrontEnd
-from mapfusion.vision.tracking import Tracker, TrackParameters, bend_of, link
+from mapfusion.vision.tracking import (
+    PATCH_SIDE_PX,
+    Features,
+    Tracker,
+    TrackParameters,
+    link,
+    projective_terms,
+)
 from tests.mapfusion.vision.rendered_scene import render, wall
 from tests.mapfusion.vision.shifted_pictures import Picture
 
@@ -102,7 +108,7 @@ def test_a_window_bends_as_the_homography_of_its_plane(seed: int) -> None:
     small = 1e-4 * np.concatenate([np.eye(2), -np.eye(2)])
     moved = later(small)[0]
     A = ((moved[:2] - moved[2:]) / 2e-4).T
-    (h,) = bend_of(np.array([[d, *slope]]), now)
+    (h,) = projective_terms(np.array([[d, *slope]]), now)
     x = rng.uniform(-8, 8, (20, 2))
     np.testing.assert_allclose(later(x)[0], place + x @ A.T / (1 + x @ h)[:, None], atol=1e-4)
     assert np.abs(x @ h).max() > 0.01
