@@ -17,15 +17,9 @@ from mapfusion.attitude import Attitude, write_attitude
 from mapfusion.datasets.camera_calibration import Rectification
 from mapfusion.datasets.formats import Level
 from mapfusion.datasets.levelling import LevelFrames, Levels, known_from
-from mapfusion.datasets.log_consistency import (
-    Finding,
-    Stated,
-    composed_spans,
-    disagreement,
-    motions_between_frames,
-    pose_mistakes,
-    truth_finding,
-)
+from mapfusion.datasets.log_consistency import Finding, disagreement, truth_finding
+from mapfusion.datasets.motion_agreement import Stated, pose_mistakes
+from mapfusion.datasets.relative_motion import composed_spans, motions_between_frames
 from mapfusion.datasets.stereo_recording import StereoRecording, sampled
 from mapfusion.datasets.text_files import NS
 from mapfusion.datasets.tum import TimedPoses

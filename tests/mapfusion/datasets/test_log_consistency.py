@@ -7,19 +7,18 @@ import pytest
 
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.datasets.log_consistency import (
-    Stated,
-    agreement,
-    chained,
     check_log,
-    compare,
-    composed_spans,
     gate_finding,
-    observed_motions,
-    odometry_motions,
     outside_gate,
-    pose_mistakes,
     truth_finding,
     without_jumps,
+)
+from mapfusion.datasets.motion_agreement import Stated, agreement, compare, pose_mistakes
+from mapfusion.datasets.relative_motion import (
+    composed_spans,
+    observed_motions,
+    odometry_motions,
+    poses_from_increments,
 )
 from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlamParameters
@@ -108,7 +107,9 @@ def test_robots_that_stand_turn_or_go_straight_are_sound() -> None:
     still, ahead = np.zeros((40, 3)), np.tile([0.1, 0, 0], (40, 1))
     turning = np.tile([0, 0, 0.05], (40, 1))
     for steps in (still, ahead, turning, np.concatenate([still[:20], ahead[:20]])):
-        assert not check_log(circling_log(40, 0.002, poses=chained(steps)), NOISE).findings
+        assert not check_log(
+            circling_log(40, 0.002, poses=poses_from_increments(steps)), NOISE
+        ).findings
 
 
 @pytest.mark.parametrize("name", JUMPS)
@@ -246,7 +247,7 @@ def test_motions_in_space_by_tracks() -> None:
 def test_the_ratio_of_lengths_is_recovered(share: float) -> None:
     log = circling_log(60, 0.0)
     observed = observed_motions(log, 4)
-    poses = chained(log.odometry * [share, share, 1])
+    poses = poses_from_increments(log.odometry * [share, share, 1])
     found = compare(observed, Stated(poses, NOISE))
     assert found.shift.ratio == pytest.approx(share, rel=0.06)
     assert found.shift.median == pytest.approx(min(share, 1 / share), rel=0.1)
@@ -290,7 +291,7 @@ def test_truth_against_odometry(name: str) -> None:
     change, words = TRUTHS[name]
     turn = 0.15 * np.sign(np.sin(np.arange(60) / 4))
     steps = np.column_stack([np.where(np.arange(60) % 20 < 14, 0.1, 0), np.zeros(60), turn])
-    path = chained(steps)
+    path = poses_from_increments(steps)
     log = circling_log(60, poses=path)
     spans = composed_spans(odometry_motions(log, NOISE), len(log))
     truth = change(path)
@@ -307,7 +308,7 @@ def test_truth_against_odometry(name: str) -> None:
 def test_shifts_of_motions_that_repeat_are_named_from_the_smallest_on(late: int) -> None:
     """Turns repeat every 25 frames, so that other shifts explain the truth as well."""
     turn = 0.15 * np.sin(2 * np.pi * np.arange(120) / 25)
-    path = chained(np.column_stack([np.full(120, 0.1), np.zeros(120), turn]))
+    path = poses_from_increments(np.column_stack([np.full(120, 0.1), np.zeros(120), turn]))
     log = circling_log(120, poses=path)
     spans = composed_spans(odometry_motions(log, NOISE), len(log))
     truth = path[np.clip(np.arange(120) - late, 0, 119)]
@@ -345,7 +346,7 @@ def test_truth_with_quaternions_in_another_order() -> None:
 def test_spans_compose_motions() -> None:
     log = circling_log(21, 0.01)
     spans = composed_spans(odometry_motions(log, NOISE), len(log))
-    path = chained(log.odometry)
+    path = poses_from_increments(log.odometry)
     for span in spans:
         expected = between(path[span.start], path[span.end])
         found = span.motion[:, [0, 1, 5]]
