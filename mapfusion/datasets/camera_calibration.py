@@ -136,7 +136,7 @@ _DISTORTIONS: dict[str, Distortion] = {
 _COEFFICIENT_KEYS = ("distortion_coefficients", "distortion_coeffs")
 
 
-def lens_of(where: str, camera: Mapping[str, Any]) -> Lens:
+def parse_lens(where: str, camera: Mapping[str, Any]) -> Lens:
     """A pinhole camera with its distortion.
 
     Args:
@@ -170,7 +170,7 @@ def lens_of(where: str, camera: Mapping[str, Any]) -> Lens:
         raise InputError(f"{where}: {error}") from error
 
 
-def motion_of(where: str, key: str, holder: Mapping[str, Any]) -> Float:
+def parse_transform(where: str, key: str, holder: Mapping[str, Any]) -> Float:
     """A rigid motion (4, 4): rows of numbers, 16 numbers, or EuRoC's mapping with `data`.
 
     Args:
@@ -208,7 +208,7 @@ def _short(value: Any) -> str:
     return f"{len(flat)} numbers" if is_numbers else reprlib.repr(value)
 
 
-def section(where: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+def parse_section(where: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     """A mapping within a document; raises InputError where there is none."""
     found = document.get(key)
     if not isinstance(found, Mapping):

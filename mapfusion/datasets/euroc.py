@@ -19,18 +19,24 @@ from typing import Any
 
 import numpy as np
 
-from mapfusion.datasets.camera_calibration import StereoCalibration, lens_of, motion_of
+from mapfusion.datasets.camera_calibration import StereoCalibration, parse_lens, parse_transform
 from mapfusion.datasets.export import OnFrame, StereoDrive, write_picture, write_text
-from mapfusion.datasets.imu import Inertial
+from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.levelling import MountSettings, robot_in_body
-from mapfusion.datasets.stereo_recording import PictureFile, ReadYaml, Shot, StereoRecording, paired
+from mapfusion.datasets.stereo_recording import (
+    PictureFile,
+    ReadYaml,
+    Shot,
+    StereoRecording,
+    pair_shots,
+)
 from mapfusion.datasets.text_files import (
     POSES,
+    parse_time_ns,
+    read_rows,
+    read_time_series,
     require_columns,
     require_increasing,
-    rows_of,
-    time_in_ns,
-    timed_numbers,
 )
 from mapfusion.datasets.tum import ODOMETRY_FILE, TimedPoses, read_odometry, tum_text
 from mapfusion.errors import InputError
@@ -74,7 +80,7 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
         raise InputError(f"{root}: sensor.yaml of cam0 and cam1: {error}") from error
     (left, lost_left), (right, lost_right) = (_shots(camera) for camera in cameras)
     try:
-        time_ns, pictures, dropped = paired(left, right)
+        time_ns, pictures, dropped = pair_shots(left, right)
     except InputError as error:
         raise InputError(f"{root}: {error}") from error
     T_body_robot, T_robot_left = robot_in_body(mounts[0])
@@ -98,15 +104,15 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
 def _camera(path: Path, read_yaml: ReadYaml) -> tuple[Any, Float]:
     """The lens, and T_BS (4, 4)."""
     found: Mapping[str, Any] = read_yaml(path)
-    return lens_of(str(path), found), motion_of(str(path), "T_BS", found)
+    return parse_lens(str(path), found), parse_transform(str(path), "T_BS", found)
 
 
 def _shots(camera: Path) -> tuple[list[Shot], list[str]]:
     """The pictures of one camera that are there, and what is said of those that are not."""
     path, shots, lines, missing = camera / "data.csv", list[Shot](), list[int](), list[str]()
-    for line, words in rows_of(path, "times and names of pictures", ","):
+    for line, words in read_rows(path, "times and names of pictures", ","):
         require_columns(path, line, words, "time file")
-        time_ns, picture = time_in_ns(path, line, words[0], 1), camera / "data" / words[1]
+        time_ns, picture = parse_time_ns(path, line, words[0], 1), camera / "data" / words[1]
         name = f"{camera.name}/data/{words[1]}"
         if picture.is_file():
             shots.append(Shot(time_ns, name, PictureFile(picture)))
@@ -124,21 +130,23 @@ def _shots(camera: Path) -> tuple[list[Shot], list[str]]:
     return shots, missing
 
 
-def _felt(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> Inertial:
+def _felt(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> ImuData:
     """Accelerations and angular velocities in the robot's axes."""
     sensor, path = imu / "sensor.yaml", imu / "data.csv"
-    T_body_imu = motion_of(str(sensor), "T_BS", read_yaml(sensor))
-    time_ns, own = timed_numbers(path, "accelerations", _FELT_COLUMNS, 1, ",")
+    T_body_imu = parse_transform(str(sensor), "T_BS", read_yaml(sensor))
+    time_ns, own = read_time_series(path, "accelerations", _FELT_COLUMNS, 1, ",")
     turn = se3.between(T_body_robot, T_body_imu)[:3, :3].T
     try:
-        return Inertial(time_ns, own[:, 3:] @ turn, own[:, :3] @ turn)
+        return ImuData(time_ns, own[:, 3:] @ turn, own[:, :3] @ turn)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
 
 def _states(path: Path) -> TimedPoses:
     """T_world_body of the true states."""
-    time_ns, values = timed_numbers(path, "true states", _STATE_COLUMNS, 1, ",", POSES, more=True)
+    time_ns, values = read_time_series(
+        path, "true states", _STATE_COLUMNS, 1, ",", POSES, more=True
+    )
     if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):
         raise InputError(f"{path}: holds a quaternion of length 0")
     return TimedPoses(time_ns, se3.from_quaternions(values[:, :3], values[:, [4, 5, 6, 3]]))

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mapfusion.datasets.stereo_recording import ReadYaml, StereoRecording
 
 
-Level = Literal["auto", "mount", "pictures", "floor", "imu", "odometry"]
+AttitudeSource = Literal["auto", "mount", "pictures", "floor", "imu", "odometry"]
 
 
 _LONGEST_NAME = 40  # of a robot: names become parts of file names
@@ -151,10 +151,10 @@ def import_recording(
     importer, function = _found(format_name)
     if not importer.stereo:
         return function(folder, destination, settings)
-    from mapfusion.datasets.stereo_import import Cut, StereoImport, write_imported
+    from mapfusion.datasets.stereo_import import RecordingPart, StereoImport, write_imported
 
     recording = read_recording(format_name, folder, settings, read_yaml)
-    whole = Cut(robot_name(recording.name), slice(None))
+    whole = RecordingPart(robot_name(recording.name), slice(None))
     return write_imported(destination, [StereoImport(recording).log_of(whole)])
 
 

@@ -19,7 +19,12 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.datasets.camera_calibration import StereoCalibration, lens_of, motion_of, section
+from mapfusion.datasets.camera_calibration import (
+    StereoCalibration,
+    parse_lens,
+    parse_section,
+    parse_transform,
+)
 from mapfusion.datasets.levelling import MountSettings, level_mount, robot_in_body
 from mapfusion.datasets.stereo_recording import (
     MOST_APART_NS,
@@ -27,14 +32,14 @@ from mapfusion.datasets.stereo_recording import (
     ReadYaml,
     Shot,
     StereoRecording,
-    paired,
+    pair_shots,
 )
 from mapfusion.datasets.text_files import (
     NS,
+    parse_time_ns,
+    read_rows,
     require_columns,
     require_increasing,
-    rows_of,
-    time_in_ns,
 )
 from mapfusion.datasets.tum import ODOMETRY_FILE, TRUTH_FILE, read_odometry, read_tum
 from mapfusion.errors import InputError
@@ -92,7 +97,7 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
             for name in (settings.left, settings.right)
         )
     try:
-        made = paired(left, right, round(settings.most_apart_s * NS))
+        made = pair_shots(left, right, round(settings.most_apart_s * NS))
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     time_ns, pictures, dropped = made
@@ -118,10 +123,10 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
 def _calibration(path: Path, read_yaml: ReadYaml) -> tuple[StereoCalibration, Float]:
     """The pair, and T_robot_left (4, 4)."""
     document = read_yaml(path)
-    left, right = (section(path, document, name) for name in ("cam0", "cam1"))
-    T_right_left = motion_of(f"{path}: cam1", "T_cn_cnm1", right)
+    left, right = (parse_section(path, document, name) for name in ("cam0", "cam1"))
+    T_right_left = parse_transform(f"{path}: cam1", "T_cn_cnm1", right)
     try:
-        lenses = lens_of(f"{path}: cam0", left), lens_of(f"{path}: cam1", right)
+        lenses = parse_lens(f"{path}: cam0", left), parse_lens(f"{path}: cam1", right)
         calibration = StereoCalibration(*lenses, se3.inverse(T_right_left))
     except InputError as error:
         where = "" if str(error).startswith(str(path)) else f"{path}: cam1: "
@@ -129,7 +134,7 @@ def _calibration(path: Path, read_yaml: ReadYaml) -> tuple[StereoCalibration, Fl
     if "T_BS" not in left:
         baseline_m = float(calibration.T_left_right[0, 3])
         return calibration, level_mount(baseline_m, 0.0, _HEIGHT_M)
-    T_body_left = motion_of(f"{path}: cam0", "T_BS", left)
+    T_body_left = parse_transform(f"{path}: cam0", "T_BS", left)
     return calibration, robot_in_body(T_body_left)[1]
 
 
@@ -142,12 +147,12 @@ def _named(folder: Path, times: Path) -> list[Shot]:
         kinds = ", ".join(sorted(_KINDS))
         raise InputError(f"{folder}: holds no picture of one camera ({kinds})")
     if times.is_file():
-        rows = list(rows_of(times, "times of pictures"))
+        rows = list(read_rows(times, "times of pictures"))
         if len(rows) != len(paths):
             raise InputError(
                 f"{times}: has {len(rows)} times for {len(paths)} pictures of {folder}"
             )
-        time_ns = [time_in_ns(times, line, words[0], NS) for line, words in rows]
+        time_ns = [parse_time_ns(times, line, words[0], NS) for line, words in rows]
         require_increasing(times, [line for line, _ in rows], np.array(time_ns, dtype=np.int64))
     else:
         time_ns = [_time_of(path, times) for path in paths]
@@ -162,18 +167,18 @@ def _named(folder: Path, times: Path) -> list[Shot]:
 
 def _time_of(path: Path, times: Path) -> int:
     if _IN_NS.fullmatch(path.stem):
-        return time_in_ns(path, 1, path.stem, 1)
+        return parse_time_ns(path, 1, path.stem, 1)
     if _IN_S.fullmatch(path.stem):
-        return time_in_ns(path, 1, path.stem, NS)
+        return parse_time_ns(path, 1, path.stem, NS)
     told = "is named by no time (nanoseconds, or seconds with a decimal point)"
     raise InputError(f"{path}: {told}; give the times in {times.name}")
 
 
 def _listed(path: Path) -> tuple[list[Shot], list[Shot]]:
     left, right, lines = list[Shot](), list[Shot](), list[int]()
-    for line, words in rows_of(path, "pairs of pictures", ","):
+    for line, words in read_rows(path, "pairs of pictures", ","):
         require_columns(path, line, words, "time left_file right_file")
-        time_ns = time_in_ns(path, line, words[0], NS)
+        time_ns = parse_time_ns(path, line, words[0], NS)
         for name, shots in zip(words[1:], (left, right), strict=True):
             picture = path.parent / name
             if not picture.is_file():

@@ -25,7 +25,7 @@ SHARED_RAD = 0.005
 
 
 @dataclass(frozen=True)
-class Inertial:
+class ImuData:
     """What an accelerometer and gyroscopes felt, in the robot's axes.
 
     Attributes:

@@ -39,15 +39,21 @@ from mapfusion.datasets.camera_calibration import (
 )
 from mapfusion.datasets.export import OnFrame, StereoDrive, write_picture, write_text
 from mapfusion.datasets.levelling import MountSettings, level_mount
-from mapfusion.datasets.stereo_recording import PictureFile, ReadYaml, Shot, StereoRecording, paired
+from mapfusion.datasets.stereo_recording import (
+    PictureFile,
+    ReadYaml,
+    Shot,
+    StereoRecording,
+    pair_shots,
+)
 from mapfusion.datasets.text_files import (
     NS,
     POSES,
-    numbers,
+    parse_numbers,
+    parse_time_ns,
+    read_rows,
     require_columns,
     require_increasing,
-    rows_of,
-    time_in_ns,
 )
 from mapfusion.datasets.tum import ODOMETRY_FILE, TimedPoses, read_odometry, tum_text
 from mapfusion.errors import InputError
@@ -117,7 +123,7 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
     times = _times(timed)
     left, right = (numbered_shots(each, _DIGITS, each.name, times, timed) for each in folders)
     try:
-        time_ns, pictures, dropped = paired(left, right)
+        time_ns, pictures, dropped = pair_shots(left, right)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     calibration = _calibration(folder / "calib.txt", first, pictures[0][0]().shape[:2])
@@ -142,10 +148,10 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
 
 def _times(path: Path) -> np.ndarray:
     lines, times = list[int](), list[int]()
-    for line, words in rows_of(path, "times of a KITTI sequence"):
+    for line, words in read_rows(path, "times of a KITTI sequence"):
         require_columns(path, line, words, "time")
         lines.append(line)
-        times.append(time_in_ns(path, line, words[0], NS))
+        times.append(parse_time_ns(path, line, words[0], NS))
     time_ns = np.array(times, dtype=np.int64)
     require_increasing(path, lines, time_ns)
     return time_ns
@@ -154,15 +160,15 @@ def _times(path: Path) -> np.ndarray:
 def _calibration(path: Path, first: int, shape: tuple[int, int]) -> StereoCalibration:
     matrices = {
         words[0].removesuffix(":"): (line, words[1:])
-        for line, words in rows_of(path, "calibration of a KITTI sequence")
+        for line, words in read_rows(path, "calibration of a KITTI sequence")
     }
     found = []
     for name in (f"P{first}", f"P{first + 1}"):
-        found.append(named_matrix(path, matrices, name, (3, 4)))
-    return rectified_pair(path, found, (shape[1], shape[0]))
+        found.append(parse_matrix(path, matrices, name, (3, 4)))
+    return rectified_calibration(path, found, (shape[1], shape[0]))
 
 
-def named_matrix(
+def parse_matrix(
     path: Path, told: dict[str, tuple[int, list[str]]], name: str, shape: tuple[int, ...]
 ) -> Float:
     """A matrix of a calibration file, by the name that its line begins with.
@@ -183,10 +189,12 @@ def named_matrix(
     if len(words) != n:
         found = f"{name}: has {len(words)} numbers, expected {n} ({' x '.join(map(str, shape))})"
         raise InputError(f"{path}, line {line}: {found}")
-    return np.array(numbers(path, line, words)).reshape(shape)
+    return np.array(parse_numbers(path, line, words)).reshape(shape)
 
 
-def rectified_pair(path: Path, found: list[Float], size_px: tuple[int, int]) -> StereoCalibration:
+def rectified_calibration(
+    path: Path, found: list[Float], size_px: tuple[int, int]
+) -> StereoCalibration:
     """Two cameras of projection matrices (3, 4) that were read at `path`; raises InputError."""
     lenses = []
     try:
@@ -204,9 +212,9 @@ def rectified_pair(path: Path, found: list[Float], size_px: tuple[int, int]) -> 
 def _truth(path: Path, time_ns: np.ndarray, T_robot_left: Float) -> TimedPoses:
     """T_world_robot; the world is the robot's frame at the beginning."""
     rows = []
-    for line, words in rows_of(path, "true poses"):
+    for line, words in read_rows(path, "true poses"):
         require_columns(path, line, words, _POSE_COLUMNS, POSES)
-        rows.append(numbers(path, line, words))
+        rows.append(parse_numbers(path, line, words))
     if len(rows) != len(time_ns):
         raise InputError(f"{path}: has {len(rows)} poses for {len(time_ns)} times")
     P = np.array(rows).reshape(-1, 3, 4)
@@ -242,23 +250,23 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
         for each in cameras
     )
     try:
-        time_ns, pictures, dropped = paired(left, right)
+        time_ns, pictures, dropped = pair_shots(left, right)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from error
     calibration = _day_file(drive, "calib_cam_to_cam.txt")
     told = _named(calibration)
-    P = [named_matrix(calibration, told, f"P_rect_{first + k:02d}", (3, 4)) for k in (0, 1)]
-    width, height = named_matrix(calibration, told, f"S_rect_{first:02d}", (2,)).astype(int)
+    P = [parse_matrix(calibration, told, f"P_rect_{first + k:02d}", (3, 4)) for k in (0, 1)]
+    width, height = parse_matrix(calibration, told, f"S_rect_{first:02d}", (2,)).astype(int)
     size = pictures[0][0]().shape[1::-1]
     if size != (width, height):
         found = f"pictures are {size[0]}x{size[1]}, rectified ones {width}x{height}"
         raise InputError(f"{folder}: {found}; give the drive whose name ends in _sync")
-    pair = rectified_pair(calibration, P, size)
+    pair = rectified_calibration(calibration, P, size)
     baseline_m = float(pair.T_left_right[0, 3])
     T_robot_left = settings.mount.applied(level_mount(baseline_m, 0.0, HEIGHT_M))
     truth = None
     if (drive / "oxts").is_dir():
-        R_rect = named_matrix(calibration, told, "R_rect_00", (3, 3))
+        R_rect = parse_matrix(calibration, told, "R_rect_00", (3, 3))
         beside = [-P[0][0, 3] / P[0][0, 0], 0.0, 0.0]  # of the left camera, from the rectified 0
         T_imu_left = se3.inverse(_rectified_from_imu(drive, R_rect)) @ se3.pose(np.eye(3), beside)
         T_imu_ahead = T_imu_left @ se3.inverse(se3.pose(R_ROBOT_OPTICAL, np.zeros(3)))
@@ -281,7 +289,7 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
 def _stamps(path: Path) -> np.ndarray:
     """Times (T,) int64 in ns of the lines of `timestamps.txt`."""
     lines, times = list[int](), list[int]()
-    for line, words in rows_of(path, "times of a raw drive of KITTI"):
+    for line, words in read_rows(path, "times of a raw drive of KITTI"):
         try:
             when = np.datetime64("T".join(words), "ns")
         except ValueError:
@@ -300,7 +308,7 @@ def _day_file(drive: Path, name: str) -> Path:
 
 def _named(path: Path) -> dict[str, tuple[int, list[str]]]:
     """Line number and words by the name that each line begins with."""
-    rows = rows_of(path, "calibration of KITTI's raw data")
+    rows = read_rows(path, "calibration of KITTI's raw data")
     return {words[0].removesuffix(":"): (line, words[1:]) for line, words in rows}
 
 
@@ -310,7 +318,10 @@ def _rectified_from_imu(drive: Path, R_rect: Float) -> Float:
     for name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"):
         path = _day_file(drive, name)
         told = _named(path)
-        step = se3.pose(named_matrix(path, told, "R", (3, 3)), named_matrix(path, told, "T", (3,)))
+        step = se3.pose(
+            parse_matrix(path, told, "R", (3, 3)),
+            parse_matrix(path, told, "T", (3,)),
+        )
         require_rigid(f"{path}: R and T", step)
         T = T @ step
     return T
@@ -323,7 +334,7 @@ def _driven(oxts: Path) -> TimedPoses:
     for k, stamp_ns in enumerate(time_ns.tolist()):
         path = oxts / "data" / f"{k:0{_RAW_DIGITS}d}.txt"
         if path.is_file():  # some drives lack a few
-            state = next(rows_of(path, "a state"), None)
+            state = next(read_rows(path, "a state"), None)
             if state is None:
                 continue
             line, words = state
@@ -331,7 +342,7 @@ def _driven(oxts: Path) -> TimedPoses:
                 found = f"has {len(words)} columns, expected {_OXTS_NUMBERS} (of an OXTS unit)"
                 raise InputError(f"{path}, line {line}: {found}")
             known.append(stamp_ns)
-            rows.append(numbers(path, line, words))
+            rows.append(parse_numbers(path, line, words))
     if not rows:
         raise InputError(f"{oxts}: holds no data/{'0' * _RAW_DIGITS}.txt")
     latitude, longitude, up, roll, pitch, yaw = np.array(rows)[:, :6].T

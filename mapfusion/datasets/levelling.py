@@ -7,8 +7,8 @@ import numpy as np
 
 from mapfusion.attitude import Attitude, moved
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
-from mapfusion.datasets.formats import Level
-from mapfusion.datasets.imu import SHARED_RAD, Inertial
+from mapfusion.datasets.formats import AttitudeSource
+from mapfusion.datasets.imu import SHARED_RAD, ImuData
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, chi_square_bound
@@ -90,7 +90,9 @@ def robot_in_body(T_body_camera: Float) -> tuple[Float, Float]:
     return T_body_robot, inverse(T_body_robot) @ ahead
 
 
-def levelled(observed: Observations, camera: StereoCamera, T_robot_left: Float) -> Observations:
+def level_observations(
+    observed: Observations, camera: StereoCamera, T_robot_left: Float
+) -> Observations:
     """Observations of a camera that was taken for a level one, where the mount truly has them."""
     R, t = T_robot_left[:3, :3], T_robot_left[:3, 3]
     if np.array_equal(R, np.eye(3)) and np.array_equal(t, camera.p_robot_left):
@@ -144,7 +146,7 @@ class Floor:
         return np.array(value), sigma[[1, 0, 2]]
 
 
-def floor_of(points: Observations, camera_height_m: float, probability: float) -> Floor | None:
+def fit_floor(points: Observations, camera_height_m: float, probability: float) -> Floor | None:
     """The floor among points (N, 3), z up from where it about is.
 
     Weighted least squares of the points' heights over those inside a gate, again and again, while a
@@ -201,7 +203,9 @@ _ON_THE_FLOOR = 0.99  # share of the floor's own points that its gate keeps
 _ROAD_RAD = 0.02
 
 
-def known_from(wanted: Level, odometry: Float | None, inertial: Inertial | None = None) -> Level:
+def choose_attitude_source(
+    wanted: AttitudeSource, odometry: Float | None, inertial: ImuData | None = None
+) -> AttitudeSource:
     """What `auto` stands for, by what was recorded of dead reckoning (T, 4, 4) and acceleration."""
     if wanted != "auto":
         return wanted
@@ -211,7 +215,7 @@ def known_from(wanted: Level, odometry: Float | None, inertial: Inertial | None 
     return "odometry" if tilts else "mount"
 
 
-class Levels:
+class AttitudeMeasurements:
     """What is measured of the attitude in each frame of a log.
 
     Args:
@@ -230,7 +234,7 @@ class Levels:
 
     def __init__(
         self,
-        known: Level,
+        known: AttitudeSource,
         camera: StereoCamera,
         T_robot_left: Float,
         odometry: Float | None,
@@ -239,7 +243,7 @@ class Levels:
     ) -> None:
         self.camera, self.T_robot_left = camera, T_robot_left
         self._counted = counted
-        self._known: Level = known
+        self._known: AttitudeSource = known
         self._odometry, self._tilts = odometry, tilts
 
     @property
@@ -279,12 +283,12 @@ class Levels:
     def _floor(self, found: Features, sigma_uv_px: float) -> Measured | None:
         noise = (sigma_uv_px, found.sigma_disparity_px)
         points = Observations(*self.camera.triangulate(found.uv_px, found.disparity_px, *noise))
-        points = levelled(points, self.camera, self.T_robot_left)
-        floor = floor_of(points, float(self.T_robot_left[2, 3]), _ON_THE_FLOOR)
+        points = level_observations(points, self.camera, self.T_robot_left)
+        floor = fit_floor(points, float(self.T_robot_left[2, 3]), _ON_THE_FLOOR)
         return None if floor is None else Measured(*floor.attitude)
 
 
-class LevelFrames:
+class LevelledFrames:
     """What became of the frames so far.
 
     Args:
@@ -297,7 +301,7 @@ class LevelFrames:
         linked: share of the features of the frame before that were found again; NaN at first.
     """
 
-    def __init__(self, vision: FrontEndParameters, levels: Levels) -> None:
+    def __init__(self, vision: FrontEndParameters, levels: AttitudeMeasurements) -> None:
         self.observed: list[Observations] = []
         self.motions: list[RigidMotion | None] = []
         self.linked: list[float] = []
@@ -325,7 +329,7 @@ class LevelFrames:
             own = self._levelling.applied(frame.observations)
         else:
             frame = self._observer.observe(found, steps)
-            own = levelled(frame.observations, levels.camera, levels.T_robot_left)
+            own = level_observations(frame.observations, levels.camera, levels.T_robot_left)
         again = float(np.sum(frame.tracks.length > 1)) / max(self._before, 1)
         self.linked.append(again if self.observed else np.nan)
         self._before = len(found)

@@ -21,9 +21,9 @@ from mapfusion.datasets.camera_calibration import (
     Lens,
     StereoCalibration,
 )
-from mapfusion.datasets.imu import Inertial
+from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.levelling import MountSettings, level_mount, upright
-from mapfusion.datasets.stereo_recording import ReadYaml, Shot, StereoRecording, paired
+from mapfusion.datasets.stereo_recording import ReadYaml, Shot, StereoRecording, pair_shots
 from mapfusion.datasets.text_files import NS
 from mapfusion.datasets.tum import TimedPoses
 from mapfusion.errors import InputError, did_you_mean, one_line
@@ -132,7 +132,7 @@ _DISTORTIONS: dict[str, Distortion] = {
 }
 
 
-def picture(message: Any) -> np.ndarray:
+def decode_image(message: Any) -> np.ndarray:
     """Grey levels (H, W), uint8 or uint16, of an Image or a CompressedImage.
 
     Raises:
@@ -159,7 +159,7 @@ def picture(message: Any) -> np.ndarray:
     return levels if conversion is None else cv2.cvtColor(levels, conversion)
 
 
-def calibration(left: Any, right: Any, rectified: bool) -> StereoCalibration:
+def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibration:
     """The pair that two CameraInfo messages tell, of raw pictures or of rectified ones.
 
     Raises:
@@ -180,7 +180,7 @@ def calibration(left: Any, right: Any, rectified: bool) -> StereoCalibration:
     return StereoCalibration(_raw(left), _raw(right), T_left_right)
 
 
-def pose(message: Any) -> Float:
+def pose_of_message(message: Any) -> Float:
     """A pose (4, 4) of an Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped."""
     if hasattr(message, "transform"):
         t, q = message.transform.translation, message.transform.rotation
@@ -193,9 +193,12 @@ def pose(message: Any) -> Float:
     return se3.from_quaternions([t.x, t.y, t.z], xyzw)
 
 
-def chained(transforms: list[Any], target: str, source: str) -> Float | None:
+def lookup_transform(transforms: list[Any], target: str, source: str) -> Float | None:
     """T_target_source (4, 4) through a tree of TransformStamped; None where it leads nowhere."""
-    parent = {_frame(t.child_frame_id): (_frame(t.header.frame_id), pose(t)) for t in transforms}
+    parent = {
+        _frame(t.child_frame_id): (_frame(t.header.frame_id), pose_of_message(t))
+        for t in transforms
+    }
     up, lines = [_line(parent, _frame(name)) for name in (target, source)], None
     for frame, T_frame_source in up[1].items():
         if frame in up[0]:
@@ -298,7 +301,7 @@ class _Message:
         for _, message in self.bag.messages(self.topic, self.recorded_ns):
             if stamp_ns(message) == self.stamp_ns:
                 try:
-                    return picture(message)
+                    return decode_image(message)
                 except InputError as error:
                     raise InputError(
                         f"{self.bag.path}: {self.topic} at {self.stamp_ns} ns: {error}"
@@ -324,7 +327,7 @@ def read_rosbag(path: Path, settings: RosbagSettings, _: ReadYaml) -> StereoReco
     pair = _calibration(bag, settings)
     left, right = (_shots(bag, topic) for topic in topics)
     try:
-        time_ns, pictures, dropped = paired(left, right)
+        time_ns, pictures, dropped = pair_shots(left, right)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     T_robot_left, felt = _mount(bag, settings, pair)
@@ -358,7 +361,7 @@ def _calibration(bag: Bag, settings: RosbagSettings) -> StereoCalibration:
     if rectified is None:
         rectified = all("rect" in topic for topic in pictures)
     try:
-        return calibration(infos[0], infos[1], rectified)
+        return stereo_calibration(infos[0], infos[1], rectified)
     except (InputError, ValueError) as error:
         raise InputError(f"{bag.path}: {error}") from error
 
@@ -381,7 +384,7 @@ def _shots(bag: Bag, topic: str) -> list[Shot]:
 
 def _poses(bag: Bag, topic: str) -> TimedPoses:
     try:
-        found = {stamp_ns(message): pose(message) for _, message in bag.messages(topic)}
+        found = {stamp_ns(message): pose_of_message(message) for _, message in bag.messages(topic)}
     except InputError as error:
         raise InputError(f"{bag.path}: {topic}: {error}") from error
     if not found:
@@ -395,14 +398,14 @@ def _poses(bag: Bag, topic: str) -> TimedPoses:
 
 def _mount(
     bag: Bag, settings: RosbagSettings, pair: StereoCalibration
-) -> tuple[Float, Inertial | None]:
+) -> tuple[Float, ImuData | None]:
     """T_robot_left (4, 4), x ahead, y left, z up, and what `imu` felt in the robot's axes."""
     transforms: list[Any] = []
     if "/tf_static" in bag.topics:
         transforms = [t for _, m in bag.messages("/tf_static") for t in m.transforms]
     camera = bag.first(settings.left).header.frame_id
     optical = se3.pose(R_ROBOT_OPTICAL, np.zeros(3))
-    T_base_left = chained(transforms, settings.base, camera)
+    T_base_left = lookup_transform(transforms, settings.base, camera)
     baseline_m = float(np.linalg.norm(pair.T_left_right[:3, 3]))
     T_robot_left = (
         level_mount(baseline_m, 0.0, _HEIGHT_M)
@@ -412,7 +415,7 @@ def _mount(
     if not settings.imu:
         return T_robot_left, None
     imu = bag.first(settings.imu).header.frame_id
-    T_left_imu = chained(transforms, camera, imu)
+    T_left_imu = lookup_transform(transforms, camera, imu)
     if T_left_imu is None:
         lost = f"/tf_static leads from {imu!r} to no camera {camera!r}"
         raise InputError(f"{bag.path}: --imu {settings.imu}: {lost}")
@@ -430,9 +433,9 @@ def _mount(
     # a covariance that begins with -1 says that nothing was measured (sensor_msgs/Imu)
     counts = all(m.angular_velocity_covariance[0] != -1 for m in messages)
     try:
-        Inertial(time_ns, forces)  # is there gravity at all?
+        ImuData(time_ns, forces)  # is there gravity at all?
         T_robot_left = upright(T_robot_left, forces.mean(axis=0))
         turn = T_robot_left[:3, :3].T
-        return T_robot_left, Inertial(time_ns, forces @ turn, rates @ turn if counts else None)
+        return T_robot_left, ImuData(time_ns, forces @ turn, rates @ turn if counts else None)
     except InputError as error:
         raise InputError(f"{bag.path}: --imu {settings.imu}: {error}") from error

@@ -15,12 +15,16 @@ import numpy as np
 
 from mapfusion.attitude import Attitude, write_attitude
 from mapfusion.datasets.camera_calibration import Rectification
-from mapfusion.datasets.formats import Level
-from mapfusion.datasets.levelling import LevelFrames, Levels, known_from
+from mapfusion.datasets.formats import AttitudeSource
+from mapfusion.datasets.levelling import (
+    AttitudeMeasurements,
+    LevelledFrames,
+    choose_attitude_source,
+)
 from mapfusion.datasets.log_consistency import Finding, disagreement, truth_finding
 from mapfusion.datasets.motion_agreement import Stated, pose_mistakes
 from mapfusion.datasets.relative_motion import composed_spans, motions_between_frames
-from mapfusion.datasets.stereo_recording import StereoRecording, sampled
+from mapfusion.datasets.stereo_recording import StereoRecording, sample_indices
 from mapfusion.datasets.text_files import NS
 from mapfusion.datasets.tum import TimedPoses
 from mapfusion.errors import InputError, OutOfRangeError
@@ -60,7 +64,7 @@ _MEDIAN_ERROR = 0.6745  # of a normal variable, in standard deviations
 _SIDE_M = (0.01, 10.0)  # of the described window, what the setting allows
 
 
-def derived_vision(camera: StereoCamera) -> FrontEndParameters:
+def front_end_for_camera(camera: StereoCamera) -> FrontEndParameters:
     """Settings by the camera alone: depths by disparity, shifts and corners by the image's size."""
     usual = FrontEndParameters()
     scale = camera.focal_px * camera.baseline_m / (_USUAL.focal_px * _USUAL.baseline_m)
@@ -88,7 +92,7 @@ def derived_vision(camera: StereoCamera) -> FrontEndParameters:
     )
 
 
-def measured_vision(
+def front_end_for_recording(
     camera: StereoCamera, apart: Sequence[Pair], run: Sequence[Pair]
 ) -> FrontEndParameters:
     """Settings by the camera and by what a recording shows.
@@ -98,7 +102,7 @@ def measured_vision(
         apart: pairs (H, W) uint8 from all over the recording.
         run: pairs that follow one another, for what tracks do.
     """
-    vision = derived_vision(camera)
+    vision = front_end_for_camera(camera)
     noise = measured_noise(apart, camera, vision.harris, vision.stereo)
     if noise is not None:
         stereo = limits_for(vision.stereo, noise, _TRUE_SHARE)
@@ -113,12 +117,12 @@ def measured_vision(
         camera.focal_px * camera.baseline_m / front_end.extract(*pair).disparity_px
         for pair in apart
     ]
-    vision = with_window_for(vision, camera, np.concatenate([*depth_m, np.empty(0)]))
+    vision = scale_descriptor_window(vision, camera, np.concatenate([*depth_m, np.empty(0)]))
     front_end = FrontEnd(camera, vision)
     return _by_tracks(camera, vision, [front_end.extract(*pair) for pair in run])
 
 
-def with_window_for(
+def scale_descriptor_window(
     vision: FrontEndParameters, camera: StereoCamera, depth_m: Float
 ) -> FrontEndParameters:
     """With a described window that suits depths (N,) that were seen; as it is where none were.
@@ -141,7 +145,7 @@ def _by_tracks(
     observer = Observer.of(camera, vision)
     seen = [observer.observe(found).tracks for found in frames]
     strays = [
-        strays_px(camera, before, after)
+        reprojection_errors_px(camera, before, after)
         for before, after in itertools.pairwise(seen)
         if after.motion is not None
     ]
@@ -158,7 +162,7 @@ def _by_tracks(
     return vision
 
 
-def strays_px(camera: StereoCamera, before: Tracks, after: Tracks) -> Float:
+def reprojection_errors_px(camera: StereoCamera, before: Tracks, after: Tracks) -> Float:
     """By how much points of the tracks lie beside where the motion takes them (2N,), u and v.
 
     Only where a motion is known.
@@ -188,7 +192,7 @@ Calibration = Callable[[CalibrationError], CalibrationError]
 
 
 @dataclass(frozen=True)
-class Cut:
+class RecordingPart:
     """A robot, and which pairs of the recording are its frames."""
 
     robot: str
@@ -263,18 +267,18 @@ class StereoImport:
         self.camera: StereoCamera = self._rectification.camera
         by_camera = self._vision_of_camera()
         self.calibration_error = calibration(usual_calibration(self.camera))
-        pairs = [self.rectified(k) for k in sampled(len(recording))]
+        pairs = [self.rectified(k) for k in sample_indices(len(recording))]
         self._require_rows(pairs, by_camera)
         middle = max((len(recording) - _RUN) // 2, 0)
         run = [self.rectified(k) for k in range(len(recording))[middle : middle + _RUN]]
-        self.vision = adjust(measured_vision(self.camera, pairs, run))
+        self.vision = adjust(front_end_for_recording(self.camera, pairs, run))
         turn = se3.pose(self._rectification.R_left_rectified, np.zeros(3))
         self.T_robot_camera: Float = recording.T_robot_left @ turn
 
     def _vision_of_camera(self) -> FrontEndParameters:
         """Derive front-end settings from the calibration; raises InputError that names it."""
         try:
-            return derived_vision(self.camera)
+            return front_end_for_camera(self.camera)
         except OutOfRangeError as error:
             told = self._recording.calibrated_by or self._recording.name
             pair = f"the baseline is {self.camera.baseline_m:g} m"
@@ -308,7 +312,10 @@ class StereoImport:
             raise InputError(f"{self._recording.name}: {found} (median of {len(off)}); {remedy}")
 
     def log_of(
-        self, cut: Cut, on_progress: OnProgress = lambda *_: None, level: Level = "auto"
+        self,
+        cut: RecordingPart,
+        on_progress: OnProgress = lambda *_: None,
+        level: AttitudeSource = "auto",
     ) -> Imported:
         """The log of one robot, with its truth; `level` is where its attitude is known from.
 
@@ -322,15 +329,17 @@ class StereoImport:
         time_ns = self._recording.time_ns[rows]
         reckoned, T_world_robot = self._odometry(time_ns), self._truth(time_ns)
         truth = None if T_world_robot is None else se3.planar(T_world_robot)
-        known = known_from(level, reckoned, self._recording.inertial)
+        known = choose_attitude_source(level, reckoned, self._recording.inertial)
         if known == "odometry" and reckoned is None:
             raise InputError(f"--level odometry: {self._recording.name} has no odometry")
         tilts, counted = self._felt(time_ns) if known == "imu" else (None, None)
         usual_ns = np.median(np.diff(self._recording.time_ns))
         steps = np.diff(time_ns, prepend=time_ns[0]) / usual_ns
         front_end = FrontEnd(self.camera, self.vision)
-        levels = Levels(known, self.camera, self.T_robot_camera, reckoned, tilts, counted)
-        frames = LevelFrames(self.vision, levels)
+        levels = AttitudeMeasurements(
+            known, self.camera, self.T_robot_camera, reckoned, tilts, counted
+        )
+        frames = LevelledFrames(self.vision, levels)
         for n, k in enumerate(rows):
             frames.add(front_end.extract(*self.rectified(k)), float(steps[n]))
             on_progress(f"{cut.robot}: track features", n + 1, len(rows))
@@ -347,7 +356,7 @@ class StereoImport:
         told = seen.covariance, attitude, int(seen.guessed.sum())
         return Imported(log, truth, linked, *told, findings=findings)
 
-    def _attitude(self, frames: LevelFrames, known: Level) -> Attitude | None:
+    def _attitude(self, frames: LevelledFrames, known: AttitudeSource) -> Attitude | None:
         """By which the frames were levelled; raises InputError."""
         try:
             return frames.attitude

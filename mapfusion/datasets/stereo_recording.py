@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from mapfusion.datasets.camera_calibration import StereoCalibration
-from mapfusion.datasets.imu import Inertial
+from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.tum import TimedPoses
 from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
@@ -66,12 +66,12 @@ def unused_bits(loads: Iterable[Load]) -> int:
     return max(brightest.bit_length() - _BITS, 0)
 
 
-def sampled(n: int) -> list[int]:
+def sample_indices(n: int) -> list[int]:
     """Some of n pictures, evenly spread, the first and the last among them."""
     return sorted(set(np.linspace(0, n - 1, min(n, _SAMPLED)).astype(int).tolist()))
 
 
-def eight_bit(image: np.ndarray, shift: int) -> np.ndarray:
+def to_eight_bits(image: np.ndarray, shift: int) -> np.ndarray:
     """Grey levels (H, W) uint8; 16-bit ones shifted, and what is brighter than 255 cut."""
     levels = grey(image)
     if levels.dtype == np.uint8:
@@ -124,7 +124,7 @@ class StereoRecording:
     truth: TimedPoses | None = None
     odometry: TimedPoses | None = None
     dropped: tuple[str, ...] = ()
-    inertial: Inertial | None = None
+    inertial: ImuData | None = None
     calibrated_by: str = ""
     _shift: list[int] = field(default_factory=list, repr=False)
 
@@ -135,9 +135,9 @@ class StereoRecording:
     def pair(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Raw pictures (H, W) uint8 of pair k; raises InputError that names the file."""
         if not self._shift:  # one for all, so that the same grey means the same light
-            both = [load for n in sampled(len(self)) for load in self.pictures[n]]
+            both = [load for n in sample_indices(len(self)) for load in self.pictures[n]]
             self._shift.append(unused_bits(both))
-        left, right = (eight_bit(load(), self._shift[0]) for load in self.pictures[k])
+        left, right = (to_eight_bits(load(), self._shift[0]) for load in self.pictures[k])
         return left, right
 
     def __iter__(self) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
@@ -146,7 +146,7 @@ class StereoRecording:
             yield (int(self.time_ns[k]) - int(self.time_ns[0])) / 1e9, *self.pair(k)
 
 
-def paired(
+def pair_shots(
     left: Sequence[Shot], right: Sequence[Shot], most_apart_ns: int = MOST_APART_NS
 ) -> tuple[np.ndarray, list[tuple[Load, Load]], tuple[str, ...]]:
     """Pictures of two cameras that were taken together, each camera's in the order of time.

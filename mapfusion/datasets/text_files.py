@@ -17,7 +17,9 @@ POSES = {8: "TUM's poses have 8", 12: "KITTI's poses have 12", 17: "EuRoC's true
 _SEPARATORS = {",": "commas", ";": "semicolons", None: "spaces"}
 
 
-def rows_of(path: Path, what: str, separator: str | None = None) -> Iterator[tuple[int, list[str]]]:
+def read_rows(
+    path: Path, what: str, separator: str | None = None
+) -> Iterator[tuple[int, list[str]]]:
     """Line number and words of each line that is neither empty nor a comment (#).
 
     Raises:
@@ -67,7 +69,7 @@ def require_columns(
     )
 
 
-def numbers(path: Path, line: int, words: list[str]) -> list[float]:
+def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
     """The numbers that the words of a line are; raises InputError for other words or huge ones."""
     try:
         found = [float(word) for word in words]
@@ -78,7 +80,7 @@ def numbers(path: Path, line: int, words: list[str]) -> list[float]:
     return found
 
 
-def time_in_ns(path: Path, line: int, word: str, unit_ns: int) -> int:
+def parse_time_ns(path: Path, line: int, word: str, unit_ns: int) -> int:
     """A time as written, in whole nanoseconds; `unit_ns` of its unit. Raises InputError."""
     try:
         exact = Decimal(word) * unit_ns
@@ -104,7 +106,7 @@ def require_increasing(path: Path, lines: list[int], time_ns: np.ndarray) -> Non
         raise InputError(f"{path}, line {lines[k]}: {back}; times must increase{unit}")
 
 
-def timed_numbers(
+def read_time_series(
     path: Path,
     what: str,
     columns: str,
@@ -123,11 +125,11 @@ def timed_numbers(
     """
     wanted = len(columns.split())
     lines, times, values = [], [], []
-    for line, words in rows_of(path, what, separator):
+    for line, words in read_rows(path, what, separator):
         require_columns(path, line, words, columns, formats, more)
         lines.append(line)
-        times.append(time_in_ns(path, line, words[0], unit_ns))
-        values.append(numbers(path, line, words[1:wanted]))
+        times.append(parse_time_ns(path, line, words[0], unit_ns))
+        values.append(parse_numbers(path, line, words[1:wanted]))
     time_ns = np.array(times, dtype=np.int64)
     require_increasing(path, lines, time_ns)
     return time_ns, np.array(values, dtype=np.float64).reshape(-1, wanted - 1)

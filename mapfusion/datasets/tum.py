@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapfusion.datasets.text_files import NS, POSES, rows_of, timed_numbers
+from mapfusion.datasets.text_files import NS, POSES, read_rows, read_time_series
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float
@@ -118,7 +118,7 @@ def read_tum(path: Path) -> TimedPoses:
         InputError: the file is missing, damaged or foreign; names the line.
     """
     what, columns = "a trajectory in the TUM format", "time x y z qx qy qz qw"
-    time_ns, values = timed_numbers(path, what, columns, NS, formats=POSES)
+    time_ns, values = read_time_series(path, what, columns, NS, formats=POSES)
     if not len(values):
         raise InputError(f"{path}: holds no pose")
     if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):
@@ -135,7 +135,7 @@ def read_odometry(path: Path) -> TimedPoses:
     poses = read_tum(path)
     fallen = np.flatnonzero(poses.T[:, 2, 2] <= 0)
     if len(fallen):
-        lines = [line for line, _ in rows_of(path, "a trajectory in the TUM format")]
+        lines = [line for line, _ in read_rows(path, "a trajectory in the TUM format")]
         line = lines[int(fallen[0])]
         remedy = "is the quaternion x y z w?"
         raise InputError(f"{path}, line {line}: the robot stands on its head; {remedy}")

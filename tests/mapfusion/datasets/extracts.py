@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapfusion.datasets.stereo_import import Cut
+from mapfusion.datasets.stereo_import import RecordingPart
 from mapfusion.geometry import se2
 
 RECORDINGS = Path(os.environ.get("MAPFUSION_RECORDINGS", "none"))
-WHOLE = Cut("R1", slice(None))
+WHOLE = RecordingPart("R1", slice(None))
 needs_recordings = pytest.mark.skipif(
     not RECORDINGS.is_dir(), reason="MAPFUSION_RECORDINGS is not set"
 )

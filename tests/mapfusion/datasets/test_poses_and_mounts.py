@@ -5,7 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
-from mapfusion.datasets.levelling import MountSettings, level_mount, levelled, robot_in_body
+from mapfusion.datasets.levelling import (
+    MountSettings,
+    level_mount,
+    level_observations,
+    robot_in_body,
+)
 from mapfusion.datasets.tum import TimedPoses
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
@@ -76,7 +81,7 @@ def test_a_level_camera_keeps_its_observations() -> None:
     camera, rng = StereoCamera(), np.random.default_rng(0)
     seen = Observations(rng.normal(size=(5, 3)), np.tile(np.eye(3), (5, 1, 1)))
     T = level_mount(camera.baseline_m, camera.mount_x_m, camera.mount_z_m)
-    assert levelled(seen, camera, T) is seen
+    assert level_observations(seen, camera, T) is seen
 
 
 def test_what_is_fixed_to_a_body_moves_with_it() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.mapping import run_log
@@ -120,7 +120,7 @@ def test_kitti_paths_are_no_worse_than_their_odometry(work: StereoImport) -> Non
     for name, rows in CUTS.items():
         frames = np.arange(26)[rows]
         first = int(np.argmax(frames >= UNMEASURED))
-        one = work.log_of(Cut(name.replace("-", "_"), rows))
+        one = work.log_of(RecordingPart(name.replace("-", "_"), rows))
         for kept, ratio in zip((whole, measured), over_odometry(one, first), strict=True):
             kept.append(ratio)
     assert max(measured) <= 1.0

@@ -10,7 +10,7 @@ import pytest
 from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import EXPORTERS, export_drive, read_recording, settings_class
 from mapfusion.datasets.levelling import MountSettings
-from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2, se3
@@ -61,7 +61,7 @@ def imported(
     recording = read_again(name, path)
     assert recording.name == "R1"
     work = StereoImport(recording, every_frame)
-    return name, recording, work.log_of(Cut("R1", slice(None))), work
+    return name, recording, work.log_of(RecordingPart("R1", slice(None))), work
 
 
 def test_there_is_a_test_of_each_format() -> None:
@@ -148,7 +148,7 @@ def test_a_body_that_tilts_is_written_and_read(
         atol=1e-9,
     )  # fmt: skip
     np.testing.assert_allclose(se3.roll_pitch(told[:, :3, :3]), tilt_rad + 0.004, atol=1e-12)
-    made = StereoImport(recording, every_frame).log_of(Cut("R1", slice(None)))
+    made = StereoImport(recording, every_frame).log_of(RecordingPart("R1", slice(None)))
     np.testing.assert_allclose(made.log.odometry, WHEELS, atol=1e-12)
     assert made.attitude is not None
     np.testing.assert_allclose(made.attitude.value[0, :2], tilt_rad[0] + 0.004, atol=1e-4)

@@ -11,8 +11,8 @@ import pytest
 
 from mapfusion.datasets.formats import import_recording, read_recording, settings_class
 from mapfusion.datasets.levelling import MountSettings
-from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
-from mapfusion.datasets.stereo_recording import Shot, paired
+from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
+from mapfusion.datasets.stereo_recording import Shot, pair_shots
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2, se3
 from mapfusion.robot_log import read_log
@@ -50,7 +50,7 @@ def read(name: str, folder: Path, **mount: float) -> Any:
 
 
 def imported(name: str, folder: Path, rows: slice = slice(None), **mount: float) -> Imported:
-    return StereoImport(read(name, folder, **mount)).log_of(Cut("R1", rows))
+    return StereoImport(read(name, folder, **mount)).log_of(RecordingPart("R1", rows))
 
 
 @pytest.fixture(scope="module")
@@ -189,12 +189,12 @@ def test_pairs_are_each_others_nearest_in_time() -> None:
         return [Shot(round(1e6 * t), f"{t}", lambda: np.zeros((1, 1))) for t in times_ms]
 
     left, right = shots(0, 50, 100, 150, 200, 300, 301.5), shots(1, 51, 99, 101, 149, 260, 301)
-    times, pictures, dropped = paired(left, right)
+    times, pictures, dropped = pair_shots(left, right)
     assert (times / 1e6).tolist() == [0, 50, 100, 150, 301.5]
     assert len(pictures) == 5
     assert [text.split(" (")[0] for text in dropped] == ["200", "300", "101", "260"]
     with pytest.raises(InputError, match="make 1 pairs"):
-        paired(shots(0, 50), shots(0, 90))
+        pair_shots(shots(0, 50), shots(0, 90))
 
 
 def test_a_list_of_pairs_stands_for_folders(pairs: list[Pair], tmp_path: Path) -> None:
@@ -251,7 +251,7 @@ def test_front_end_settings_can_be_replaced(folders: dict[str, Path]) -> None:
         return replace(derived, harris=replace(derived.harris, max_corners=20))
 
     work = StereoImport(read("kitti", folders["kitti"]), fewer)
-    assert work.log_of(Cut("R1", slice(None))).observations.max() <= 20
+    assert work.log_of(RecordingPart("R1", slice(None))).observations.max() <= 20
 
 
 def test_pictures_go_with_the_times_in_their_names(tmp_path: Path) -> None:
