@@ -137,7 +137,7 @@ def test_a_body_that_tilts_is_written_and_read(
 ) -> None:
     """The truth in space; what it measures of its tilt with the odometry, which stays the same."""
     tilt_rad = np.array([[0.05, -0.02], [0.01, 0.06], [-0.04, 0.03]])
-    tilted = replace(written, tilt_rad=tilt_rad, told_tilt_rad=tilt_rad + 0.004)
+    tilted = replace(written, tilt_rad=tilt_rad, measured_tilt_rad=tilt_rad + 0.004)
     (path,) = export_drive(name, tmp_path, tilted)
     recording = read_again(name, path)
     assert recording.truth is not None

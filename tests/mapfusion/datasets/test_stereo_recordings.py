@@ -189,12 +189,12 @@ def test_pairs_are_each_others_nearest_in_time() -> None:
         return [Shot(round(1e6 * t), f"{t}", lambda: np.zeros((1, 1))) for t in times_ms]
 
     left, right = shots(0, 50, 100, 150, 200, 300, 301.5), shots(1, 51, 99, 101, 149, 260, 301)
-    times, pictures, dropped = pair_shots(left, right)
+    times, pictures, dropped = pair_shots(Path("drive"), left, right)
     assert (times / 1e6).tolist() == [0, 50, 100, 150, 301.5]
     assert len(pictures) == 5
     assert [text.split(" (")[0] for text in dropped] == ["200", "300", "101", "260"]
     with pytest.raises(InputError, match="make 1 pairs"):
-        pair_shots(shots(0, 50), shots(0, 90))
+        pair_shots(Path("drive"), shots(0, 50), shots(0, 90))
 
 
 def test_a_list_of_pairs_stands_for_folders(pairs: list[Pair], tmp_path: Path) -> None:
