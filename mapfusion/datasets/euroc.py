@@ -40,7 +40,6 @@ from mapfusion.datasets.text_files import (
 from mapfusion.datasets.tum import ODOMETRY_FILE, TimedPoses, read_odometry, tum_text
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
-from mapfusion.geometry.numerics import Float
 
 STATES = "state_groundtruth_estimate0"
 _IMU_COLUMNS = "time wx wy wz ax ay az"
@@ -93,7 +92,14 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
     imu, states = root / "imu0", root / STATES / "data.csv"
     inertial, truth = None, None
     if (imu / "data.csv").exists():
-        inertial = _read_imu(imu, T_body_robot, read_yaml)
+        sensor, path = imu / "sensor.yaml", imu / "data.csv"
+        T_body_imu = parse_transform(str(sensor), "T_BS", read_yaml(sensor))
+        imu_ns, values = read_time_series(path, "accelerations", _IMU_COLUMNS, 1, ",")
+        R_imu_robot = se3.between(T_body_robot, T_body_imu)[:3, :3].T
+        try:
+            inertial = ImuData(imu_ns, values[:, 3:] @ R_imu_robot, values[:, :3] @ R_imu_robot)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
     if states.exists():
         truth_ns, values = read_time_series(
             states, "true states", _STATE_COLUMNS, 1, ",", POSES, more=True
@@ -138,18 +144,6 @@ def _read_pictures(camera: Path) -> tuple[list[Shot], list[str]]:
         raise InputError(f"{path}: {lost}; {folder}")
     require_increasing(path, lines, np.array([shot.time_ns for shot in shots], dtype=np.int64))
     return shots, missing
-
-
-def _read_imu(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> ImuData:
-    """Return accelerations and angular velocities in the robot's axes."""
-    sensor, path = imu / "sensor.yaml", imu / "data.csv"
-    T_body_imu = parse_transform(str(sensor), "T_BS", read_yaml(sensor))
-    time_ns, own = read_time_series(path, "accelerations", _IMU_COLUMNS, 1, ",")
-    turn = se3.between(T_body_robot, T_body_imu)[:3, :3].T
-    try:
-        return ImuData(time_ns, own[:, 3:] @ turn, own[:, :3] @ turn)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def write_euroc(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Path]:

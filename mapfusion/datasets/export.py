@@ -59,7 +59,7 @@ class StereoDrive:
         require_shape("odometry", self.odometry, (len(self.time_s), 3))
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.time_s)
 
     @property

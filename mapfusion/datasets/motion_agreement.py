@@ -118,22 +118,19 @@ def agreement(
         upper = median + quantile * np.sqrt(np.pi / 2) * spread / np.sqrt(n)
         if n_above:
             upper = min(upper, float(np.sort(values)[n - n_above]))
-    return Agreement(n, median, upper, _length_ratio(observed[sure], stated[sure]))
 
-
-def _length_ratio(observed: Float, stated: Float) -> float:
-    """Return the median length of stated vectors (N, 3) over that of the observed vectors.
-
-    Observed vectors are projected onto the stated ones if most of them point the same way.
-    """
-    square = np.sum(stated**2, axis=1)
+    # Ratio of lengths, with observed vectors projected onto stated ones if most point the same way.
+    square = np.sum(stated[sure] ** 2, axis=1)
     if not np.median(square) > 0:
-        return 0.0
-    along = float(np.median(np.sum(observed * stated, axis=1)[square > 0] / square[square > 0]))
+        return Agreement(n, median, upper, 0.0)
+    moving = square > 0
+    products = np.sum(observed[sure] * stated[sure], axis=1)
+    along = float(np.median(products[moving] / square[moving]))
     if along > 0:
-        return 1.0 / along
-    lengths = [float(np.median(np.linalg.norm(values, axis=1))) for values in (stated, observed)]
-    return lengths[0] / lengths[1] if lengths[1] > 0 else np.inf
+        return Agreement(n, median, upper, 1.0 / along)
+    length_observed, length_stated = (float(np.median(each)) for each in lengths[:, sure])
+    ratio = length_stated / length_observed if length_observed > 0 else np.inf
+    return Agreement(n, median, upper, ratio)
 
 
 class Comparison(NamedTuple):
@@ -236,9 +233,19 @@ def likely_cause(
     poses = mistakes[""]
     sigma = Stated(poses, noise).sigma(observed)
     best: _Cause | None = None
-    for candidates in _candidates(mistakes):
-        for text, axes, corrected in candidates:
-            cause = _corrected(text, observed, axes, corrected, sigma)
+    # Candidates, the simplest first: common axes, mistakes, other axes, axes and mistakes combined.
+    axes = list(_axis_conventions())
+    common, others = axes[:_COMMON_AXES], axes[_COMMON_AXES:]
+    wrong = [(text, each) for text, each in mistakes.items() if text]
+    stages = (
+        [(text, R, poses) for R, text in common],
+        [(text, common[0][0], each) for text, each in wrong],
+        [(text, R, poses) for R, text in others],
+        [(f"{text}{_AND}{own}", R, each) for R, own in axes[1:] for text, each in wrong],
+    )
+    for candidates in stages:
+        for text, R_robot_stated, corrected in candidates:
+            cause = _correct_axes_and_unit(text, observed, R_robot_stated, corrected, sigma)
             if best is None or cause.comparison.worst > best.comparison.worst + _TIE:
                 best = cause
         if best is not None and best.comparison.worst >= _EXPLAINED:
@@ -264,7 +271,9 @@ def likely_cause(
     return "no common mistake explains it: is it another run's, or the calibration another's?"
 
 
-def _corrected(text: str, observed: Motions, axes: Float, poses: Float, sigma: Float) -> _Cause:
+def _correct_axes_and_unit(
+    text: str, observed: Motions, axes: Float, poses: Float, sigma: Float
+) -> _Cause:
     """Return the cause with axes R_robot_stated (3, 3) and the unit corrected."""
     shift, turn = motions_of_poses(poses, observed.start, observed.end)
     # Rotation vectors are axial vectors: mirrored axes change their sign.
@@ -299,20 +308,6 @@ def _frames_late(observed: Motions, poses: Float) -> list[int]:
         if value > least and value >= max(worst.get(delay + by, -1.0) for by in (-1, 1))
     ]
     return sorted(peaks, key=abs)
-
-
-def _candidates(mistakes: Mapping[str, Float]) -> Iterator[list[tuple[str, Float, Float]]]:
-    """Yield text, axes and poses of causes, the simplest first.
-
-    The order is common axes, mistakes, other axes, and finally combinations of axes and mistakes.
-    """
-    axes = list(_axis_conventions())
-    common, others = axes[:_COMMON_AXES], axes[_COMMON_AXES:]
-    right, *wrong = mistakes.items()
-    yield [(text, R, right[1]) for R, text in common]
-    yield [(text, common[0][0], poses) for text, poses in wrong]
-    yield [(text, R, right[1]) for R, text in others]
-    yield [(f"{text}, and {own}", R, poses) for R, own in axes[1:] for text, poses in wrong]
 
 
 def _axis_conventions() -> Iterator[tuple[Float, str]]:

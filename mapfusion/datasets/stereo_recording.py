@@ -125,7 +125,7 @@ class StereoRecording:
     _shift: list[int] = field(default_factory=list, repr=False)
 
     def __len__(self) -> int:
-        """Number of pairs."""
+        """Return the number of pairs."""
         return len(self.pictures)
 
     def pair(self, k: int) -> tuple[np.ndarray, np.ndarray]:
