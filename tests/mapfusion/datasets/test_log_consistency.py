@@ -13,7 +13,7 @@ from mapfusion.datasets.log_consistency import (
     truth_finding,
     without_jumps,
 )
-from mapfusion.datasets.motion_agreement import Stated, agreement, compare, pose_mistakes
+from mapfusion.datasets.motion_agreement import pose_mistakes
 from mapfusion.datasets.relative_motion import (
     composed_spans,
     observed_motions,
@@ -25,7 +25,7 @@ from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.mapping import Frame, run_log
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.se2 import between, compose, inverse, rotation, transform_points, wrap
+from mapfusion.geometry.se2 import compose, inverse, transform_points
 from mapfusion.geometry.se3 import from_planar, from_quaternions
 from mapfusion.robot_log import Observations, RobotLog, first_frames
 from mapfusion.smoother.smooth import SmootherParameters, smooth
@@ -196,31 +196,6 @@ def test_share_outside_the_gate(sound: RobotLog) -> None:
     assert finding.kind == "gate"
 
 
-def test_planar_motions_and_their_covariance() -> None:
-    """Against the motion that was made, over a thousand draws; one false link changes nothing."""
-    T, sigma = np.array([0.3, -0.1, 0.2]), 0.02
-    rng, off = np.random.default_rng(3), []
-    points = rng.uniform(-4, 4, (12, 2))
-    before = points @ rotation(T[2]).T + T[:2]
-    for draw in range(150):
-        seen = np.concatenate([before, points]) + rng.normal(0, sigma, (24, 2))
-        if draw % 2:
-            seen[3] += 1.0
-        made = Observations(
-            np.column_stack([seen, np.zeros(24)]),
-            np.tile(np.diag([sigma**2, sigma**2, 0]), (24, 1, 1)),
-            label=np.tile(np.arange(12, dtype=np.int32), 2),
-        )
-        log = RobotLog(
-            "R1", True, np.array([0.0, 1.0]), np.zeros((2, 3)), np.repeat([0, 1], 12), made
-        )
-        found = observed_motions(log)
-        error = found.motion[0, [0, 1, 5]] - T
-        own = found.covariance[0][np.ix_([0, 1, 5], [0, 1, 5])]
-        off.append(error @ np.linalg.solve(own, error))
-    assert np.mean(off) == pytest.approx(3, abs=0.7)  # chi-square of 3 degrees of freedom
-
-
 def test_motions_in_space_by_tracks() -> None:
     """Of a log with heights: a robot that goes ahead, and odometry in a camera's axes."""
     rng, n = np.random.default_rng(5), 12
@@ -241,39 +216,6 @@ def test_motions_in_space_by_tracks() -> None:
     assert not check_log(log, NOISE).findings
     in_mm = replace(log, odometry=1000 * odometry)
     assert "millimetres" in check_log(in_mm, NOISE).findings[0].text
-
-
-@pytest.mark.parametrize("share", [0.4, 1.0, 3.0])
-def test_the_ratio_of_lengths_is_recovered(share: float) -> None:
-    log = circling_log(60, 0.0)
-    observed = observed_motions(log, 4)
-    poses = poses_from_increments(log.odometry * [share, share, 1])
-    found = compare(observed, Stated(poses, NOISE))
-    assert found.shift.ratio == pytest.approx(share, rel=0.06)
-    assert found.shift.median == pytest.approx(min(share, 1 / share), rel=0.1)
-    assert found.turn.median > 0.9
-
-
-def test_medians_at_the_limit_pass_as_seldom_as_asked() -> None:
-    """The upper end of the interval lies below the true median with the probability asked for."""
-    rng, asked, n = np.random.default_rng(0), 0.05, 25
-    observed = np.tile([1.0, 0, 0], (n, 1))
-    none = np.full(n, 1e-3)
-    below = 0
-    for _ in range(600):
-        stated = observed * (0.7 + rng.normal(0, 0.05, (n, 1)))
-        below += agreement(observed, stated, none, none, asked).upper < 0.7
-    assert 0.01 < below / 600 < 0.085
-
-
-def test_few_or_unsure_motions_say_nothing() -> None:
-    ahead, back, sigma = np.tile([1.0, 0, 0], (3, 1)), np.tile([-1.0, 0, 0], (3, 1)), np.ones(3)
-    assert agreement(ahead, back, sigma / 100, sigma / 100, 0.001).upper == np.inf
-    many = np.tile([[1.0, 0, 0]], (50, 1))
-    assert agreement(many, -many, np.ones(50), np.ones(50), 0.001).n == 0
-    opposed = agreement(many, -many, np.ones(50) / 100, np.ones(50) / 100, 0.001)
-    assert opposed.median == pytest.approx(-1)
-    assert opposed.upper < -0.9
 
 
 TRUTHS = {
@@ -341,15 +283,3 @@ def test_truth_with_quaternions_in_another_order() -> None:
     finding = truth_finding("the odometry", spans, wrong)
     assert finding is not None
     assert "quaternions look like" in finding.text
-
-
-def test_spans_compose_motions() -> None:
-    log = circling_log(21, 0.01)
-    spans = composed_spans(odometry_motions(log, NOISE), len(log))
-    path = poses_from_increments(log.odometry)
-    for span in spans:
-        expected = between(path[span.start], path[span.end])
-        found = span.motion[:, [0, 1, 5]]
-        np.testing.assert_allclose(found[:, :2], expected[:, :2], atol=1e-12)
-        np.testing.assert_allclose(wrap(found[:, 2] - expected[:, 2]), 0, atol=1e-12)
-    assert [int((span.end - span.start)[0]) for span in spans] == [1, 2, 4]
