@@ -87,9 +87,9 @@ IMPORTERS = {
         stereo=True,
         options={
             "left": "Topic of the left camera's pictures.",
-            "right": "Topic of the right camera's.",
-            "odom": "Topic of the robot's odometry; without it the pictures tell.",
-            "imu": "Topic of an IMU: its accelerations level the camera, and each frame.",
+            "right": "Topic of the right camera's pictures.",
+            "odom": "Topic of the robot's odometry; without it visual odometry is used.",
+            "imu": "Topic of an IMU: its accelerations level the camera and each frame.",
         },
     ),
 }

@@ -174,8 +174,8 @@ def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibrat
         raise InputError("camera_info: the right camera's P holds no focal length")
     baseline_m = -P_right[0, 3] / P_right[0, 0]
     if not baseline_m > 0:
-        told = "the right camera's P holds no baseline"
-        raise InputError(f"camera_info: {told}; are the cameras a pair, and not exchanged?")
+        found = "the right camera's P holds no baseline"
+        raise InputError(f"camera_info: {found}; are the cameras a pair, and not exchanged?")
     apart = se3.pose(np.eye(3), [baseline_m, 0.0, 0.0])
     if rectified:
         return StereoCalibration(_rectified_lens(left), _rectified_lens(right), apart)
@@ -364,8 +364,8 @@ def _read_pictures(bag: Bag, topic: str) -> list[Shot]:
         own_ns = stamp_ns(message)
         if last_ns is not None and own_ns <= last_ns:
             back = f"{(last_ns - own_ns) / 1e9:g} s"
-            told = f"the picture recorded at {recorded_ns} ns runs back by {back}"
-            raise InputError(f"{bag.path}: {topic}: {told}; times must increase")
+            found = f"the picture recorded at {recorded_ns} ns runs back by {back}"
+            raise InputError(f"{bag.path}: {topic}: {found}; times must increase")
         last_ns = own_ns
         load = _BagPicture(bag, topic, recorded_ns, own_ns)
         shots.append(Shot(own_ns, f"{topic} at {own_ns} ns", load))

@@ -186,10 +186,10 @@ def pair_shots(
     return left_ns[[i for i, _ in both]], pictures, tuple(dropped)
 
 
-def _nearest(these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """Return for each time of `these` (N,) the index of the nearest of `those` (M,), increasing."""
-    if not len(those):
+def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the index of the nearest of other times (M,) for each time (N,); both increase."""
+    if not len(others):
         return np.empty(0, dtype=np.int64)
-    after = np.clip(np.searchsorted(those, these), 0, len(those) - 1)
+    after = np.clip(np.searchsorted(others, times), 0, len(others) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(np.abs(those[before] - these) <= np.abs(those[after] - these), before, after)
+    return np.where(np.abs(others[before] - times) <= np.abs(others[after] - times), before, after)

@@ -1,4 +1,4 @@
-"""Up by an accelerometer: exact at rest, as sure as stated on a swaying body, read as EuRoC is."""
+"""Tilts from an accelerometer, rotations from gyroscopes, and IMU data of EuRoC."""
 
 from pathlib import Path
 
@@ -23,14 +23,14 @@ T_BODY_IMU = se3.pose(se3.tilt(0.4, -0.2), [0.1, 0.0, 0.2])
 
 
 def correlated(rng: np.random.Generator, n: int, rms: float, over: float) -> np.ndarray:
-    """(n, 2) of a first-order process that forgets within so many samples."""
+    """Return a first-order autoregressive process, shape (n, 2), with a correlation length."""
     keep = np.exp(-1 / over)
     drawn = rng.standard_normal((n + 2000, 2)) * rms * np.sqrt(1 - keep**2)
     return lfilter([1.0], [1.0, -keep], drawn, axis=0)[2000:]
 
 
 def at_rest(tilt_rad: np.ndarray) -> np.ndarray:
-    """What is felt (n, 3) in a body's axes by gravity alone."""
+    """Return gravity in the axes of a body, shape (n, 3)."""
     return GRAVITY * se3.tilt(*tilt_rad.T)[:, 2]
 
 
@@ -43,7 +43,7 @@ def test_at_rest_it_is_the_body_s_tilt() -> None:
 
 
 def test_each_frame_averages_the_whole_time_halfway_to_its_neighbours() -> None:
-    """The mean over a window about the frame is the tilt there, of a body that rolls steadily."""
+    """The mean over a window is the tilt at its centre for a constant roll rate."""
     frames = 10**9 + np.arange(5) * 10**8
     sample_ns = np.arange(0, 2 * 10**9, 10**6) + 5 * 10**5  # none on an edge of a window
     roll = 0.3 * (sample_ns / 1e9 - 1.2)
@@ -62,7 +62,7 @@ def test_frames_without_it_are_unknown() -> None:
 
 
 def swayed(rng: np.random.Generator, n_frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors, stated deviations (T, 2) and errors of what was felt alone.
+    """Return errors, stated deviations (T, 2) and errors of the accelerometer alone.
 
     Of a body that sways by 3 degrees over half a second, speeds up and slows down by 0.4 m/s² over
     a second, and feels 0.03 m/s² too much.
@@ -95,7 +95,7 @@ def test_of_a_body_that_sways_it_is_as_sure_as_stated() -> None:
 
 @pytest.mark.parametrize("rate_hz", [50, 200])
 def test_turns_of_gyroscopes_are_the_body_s(rate_hz: int) -> None:
-    """Of one that turns about an axis of its own that turns, by the integral of its rate."""
+    """The rotation about a rotating axis equals the integral of the angular velocity."""
     frames = 10**9 + np.arange(11) * 10**8
     sample_ns = np.arange(0, 21 * 10**8, 10**9 // rate_hz)
     t = sample_ns / 1e9
@@ -123,7 +123,7 @@ def test_turns_are_unknown_where_gyroscopes_are_silent() -> None:
 
 
 def test_gyroscopes_hold_a_tilt_where_pictures_show_nothing() -> None:
-    """A body that speeds up as it likes, so that its accelerometer says little; 30 frames blind."""
+    """Gyroscopes bridge 30 frames without pictures when strong accelerations hide gravity."""
     off, stated = [], []
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -150,7 +150,7 @@ def test_gyroscopes_hold_a_tilt_where_pictures_show_nothing() -> None:
 
 
 def write_felt(root: Path, acceleration: np.ndarray) -> None:
-    """`imu0` of EuRoC's layout beside the pictures, of the body of `written_layouts`."""
+    """Write `imu0` in EuRoC's layout for the body of `written_layouts`."""
     imu = root / "mav0" / "imu0"
     imu.mkdir()
     (imu / "sensor.yaml").write_text(
@@ -172,7 +172,7 @@ def euroc(tmp_path: Path) -> Path:
 
 
 def test_what_euroc_s_imu_felt_levels_its_pictures(euroc: Path) -> None:
-    """A body whose x axis looks up, tilted by 0.02 and 0.03 rad, and an IMU turned on it."""
+    """The body's x axis points up; body and IMU are rotated against each other."""
     robot = at_rest(np.tile([[0.02, 0.03]], (400, 1)))
     T_body_robot = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0.0]])
     shaken = robot + np.random.default_rng(0).normal(0, 0.05, robot.shape)

@@ -1,4 +1,4 @@
-"""Where attitude comes from: the floor's plane, a trajectory that tilts, the pictures."""
+"""Attitude from the floor plane, a tilted trajectory or the pictures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +36,7 @@ def usual(_: FrontEndParameters) -> FrontEndParameters:
 
 
 def road(rng: np.random.Generator, value: np.ndarray, n: int, clutter: int) -> Observations:
-    """Floor points as a body at roll, pitch, height (3,) sees them, and what stands on it."""
+    """Return floor points and objects in the frame of a body at roll, pitch and height (3,)."""
     floor = np.c_[rng.uniform([3, -4], [20, 4], (n, 2)), np.zeros(n)]
     things = rng.uniform([3, -6, 0.1], [25, 6, 3], (clutter, 3))
     p = np.concatenate([floor, things]) - [0, 0, value[2]]
@@ -110,7 +110,7 @@ def test_where_no_floor_shows_there_is_none() -> None:
 
 
 def test_heights_of_a_trajectory_are_above_its_beginning() -> None:
-    """A trajectory may begin at any height, a map begins on its floor."""
+    """The height of a map is relative to the first frame of the trajectory."""
     odometry = se3.in_space(np.zeros((2, 3)), [[0.0, 0.0], [0.1, -0.2]])
     odometry[:, 2, 3] = [5.0, 5.25]
     levels = AttitudeMeasurements("odometry", StereoCamera(), np.eye(4), odometry)
@@ -140,7 +140,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> StereoRecording:
 def test_a_trajectory_that_tilts_levels_what_is_seen(
     recording: StereoRecording, tmp_path: Path
 ) -> None:
-    """A body that is said to look down has seen the same points lower; its way is the same."""
+    """A stated downward pitch lowers the observed points and keeps the path."""
     roll_pitch = [0.02, 0.05]
     T = se3.in_space(POSES, np.tile(roll_pitch, (len(POSES), 1)))
     tilted = replace(recording, odometry=TimedPoses(recording.time_ns, T))

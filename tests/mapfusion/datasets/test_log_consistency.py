@@ -1,4 +1,4 @@
-"""Logs that contradict themselves are told, with the cause; sound ones are left as they are."""
+"""Contradictory logs give findings with the cause; sound logs give none."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ def filtered(log: RobotLog, covariance: Float | None = None) -> Frame:
 
 
 def error_m(log: RobotLog, covariance: Float | None = None) -> float:
-    """RMS of all landmarks after the best rigid fit."""
+    """Return the RMS error of all landmarks after the best rigid fit."""
     landmarks = filtered(log, covariance).landmarks
     assert landmarks is not None
     assert landmarks.label is not None
@@ -74,7 +74,7 @@ def test_mistakes_are_named(name: str, sound: RobotLog) -> None:
 
 
 def test_observations_in_millimetres_are_named(sound: RobotLog) -> None:
-    """Whether their covariances are in millimetres, too, or not."""
+    """Covariances are in square millimetres or in square metres."""
     seen = sound.observations
     for share in (1e6, 1.0):
         larger = replace(
@@ -94,7 +94,7 @@ def test_odometry_of_another_run_is_told(sound: RobotLog) -> None:
 
 @pytest.mark.parametrize("noise", [0.0, 0.003, 0.015, 0.03])
 def test_sound_logs_are_left_as_they_are(noise: float) -> None:
-    """Of steps of 0.1 m and 0.05 rad."""
+    """The steps are 0.1 m and 0.05 rad."""
     for seed in range(3):
         log = circling_log(40, noise, seed)
         found = check_log(log, NOISE)
@@ -114,7 +114,7 @@ def test_robots_that_stand_turn_or_go_straight_are_sound() -> None:
 
 @pytest.mark.parametrize("name", JUMPS)
 def test_single_jumps_count_for_nothing(name: str, sound: RobotLog) -> None:
-    """The map is as good as without them; with them it is far off."""
+    """The map of the corrected log is as accurate as that of a sound log."""
     change, frames = JUMPS[name]
     log = replace(sound, odometry=change(sound.odometry))
     found = check_log(log, NOISE)
@@ -133,7 +133,7 @@ def test_a_jump_is_told_in_metres(sound: RobotLog) -> None:
 
 
 def test_the_filter_takes_one_increment_as_unsure_as_it_is(sound: RobotLog) -> None:
-    """NaN stands for the noise of the settings, as if nothing had been said."""
+    """NaN stands for the noise of the settings."""
     log = first_frames(sound, 20)
     paths = []
     for variance in (None, float("nan"), 1.0):
@@ -146,7 +146,7 @@ def test_the_filter_takes_one_increment_as_unsure_as_it_is(sound: RobotLog) -> N
 
 
 def test_encoders_with_a_coarse_resolution_are_sound(sound: RobotLog) -> None:
-    """Increments that are whole steps: 0 or 0.25 m, 0 or 0.1 rad, and right in the sum."""
+    """Increments are multiples of 0.25 m and 0.1 rad with correct sums."""
     resolution = np.array([0.25, 0.25, 0.1])
     whole = np.round(np.cumsum(circling_log(100, 0.0).odometry, axis=0) / resolution) * resolution
     log = circling_log(100, 0.0)
@@ -172,7 +172,7 @@ def test_the_smoother_gives_a_jump_no_weight(sound: RobotLog) -> None:
 
 
 def test_observations_that_jump_are_no_odometry_s_jump(sound: RobotLog) -> None:
-    """Barcodes that are taken for others move the robot by metres; the odometry is right."""
+    """Confused barcodes shift the observed robot by metres; the odometry is sound."""
     seen, frame = sound.observations, sound.iteration == 30
     position = seen.position_m.copy()
     position[frame, :2] += [4.0, 0.0]
@@ -197,7 +197,7 @@ def test_share_outside_the_gate(sound: RobotLog) -> None:
 
 
 def test_motions_in_space_by_tracks() -> None:
-    """Of a log with heights: a robot that goes ahead, and odometry in a camera's axes."""
+    """A robot drives straight ahead and observes points with heights."""
     rng, n = np.random.default_rng(5), 12
     world = np.column_stack([rng.uniform(2, 6, 30), rng.uniform(-3, 3, 30), rng.uniform(0, 2, 30)])
     path = np.column_stack([0.1 * np.arange(n), np.zeros((n, 2))])
@@ -248,7 +248,7 @@ def test_truth_against_odometry(name: str) -> None:
 
 @pytest.mark.parametrize("late", [-9, 9])
 def test_shifts_of_motions_that_repeat_are_named_from_the_smallest_on(late: int) -> None:
-    """Turns repeat every 25 frames, so that other shifts explain the truth as well."""
+    """Turns repeat every 25 frames, so several delays explain the truth."""
     turn = 0.15 * np.sin(2 * np.pi * np.arange(120) / 25)
     path = poses_from_increments(np.column_stack([np.full(120, 0.1), np.zeros(120), turn]))
     log = circling_log(120, poses=path)
@@ -260,7 +260,7 @@ def test_shifts_of_motions_that_repeat_are_named_from_the_smallest_on(late: int)
 
 
 def test_two_mistakes_explain_more_than_three() -> None:
-    """Observations as range and bearing in degrees are no sum of mistakes of the odometry."""
+    """No combination of odometry mistakes explains observations as range and bearing."""
     log = circling_log(60)
     x, y, _ = log.observations.position_m.T
     polar = np.column_stack([np.hypot(x, y), np.degrees(np.arctan2(y, x)), 0 * x])

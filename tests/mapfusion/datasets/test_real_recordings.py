@@ -1,4 +1,4 @@
-"""Extracts of KITTI and EuRoC: enough is seen of them, and the maps of their parts are one."""
+"""Extracts of KITTI and EuRoC: observations suffice and maps of parts agree."""
 
 import cv2
 import numpy as np

@@ -18,7 +18,7 @@ NOISE = MotionNoise()
 
 
 def test_planar_motions_and_their_covariance() -> None:
-    """Against the motion that was made, over a thousand draws; one false link changes nothing."""
+    """Errors agree with the covariance, also with a false link in half of the draws."""
     T, sigma = np.array([0.3, -0.1, 0.2]), 0.02
     rng, off = np.random.default_rng(3), []
     points = rng.uniform(-4, 4, (12, 2))

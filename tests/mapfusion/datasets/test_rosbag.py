@@ -1,4 +1,4 @@
-"""Bags of ROS 2 written here by hand, and bags of both kinds that are damaged or lack a topic."""
+"""ROS bags: handwritten ROS 2 bags, and damaged or incomplete bags of both versions."""
 
 from pathlib import Path
 from typing import Any
@@ -56,7 +56,7 @@ def tilted() -> np.ndarray:
 
 
 def messages(encoding: str) -> list[tuple[str, str, int, Any]]:
-    """Topic, type, frame and message of a short drive, in the order of time."""
+    """Return topic, type, frame and message of a short drive in the order of time."""
     found = []
     for k, pair in enumerate(drive()[:3]):
         for camera, image in enumerate(pair):

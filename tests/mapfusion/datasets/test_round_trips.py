@@ -1,4 +1,4 @@
-"""What is written in the layouts of others is read again as it was: pictures, times, points."""
+"""Exported drives are read again without change: pictures, times, points."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +47,7 @@ def written() -> StereoDrive:
 
 
 def every_frame(_: FrontEndParameters) -> FrontEndParameters:
-    """Settings of a simulation, with tracks that count at once."""
+    """Return simulation settings in which new tracks count at once."""
     usual = FrontEndParameters()
     return replace(usual, tracks=replace(usual.tracks, min_length=1))
 
@@ -84,7 +84,7 @@ def test_times_and_odometry_are_the_same(imported: tuple) -> None:
 
 
 def test_the_truth_is_the_same(imported: tuple) -> None:
-    """In the world where the layout knows one; KITTI begins at the first pose."""
+    """Truth is in the world frame, or relative to the first pose for KITTI."""
     name, _, one, _ = imported
     assert one.truth is not None
     wanted = se2.between(TRUTH[0], TRUTH) if name == "kitti" else TRUTH
@@ -135,7 +135,7 @@ def test_a_bag_of_ros_2_takes_the_place_of_a_bag_alone(
 def test_a_body_that_tilts_is_written_and_read(
     written: StereoDrive, name: str, tmp_path: Path
 ) -> None:
-    """The truth in space; what it measures of its tilt with the odometry, which stays the same."""
+    """The true tilt is part of the truth, the measured tilt part of the odometry."""
     tilt_rad = np.array([[0.05, -0.02], [0.01, 0.06], [-0.04, 0.03]])
     tilted = replace(written, tilt_rad=tilt_rad, measured_tilt_rad=tilt_rad + 0.004)
     (path,) = export_drive(name, tmp_path, tilted)

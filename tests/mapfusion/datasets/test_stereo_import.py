@@ -1,4 +1,4 @@
-"""Settings that follow from a camera: the same disparities, whatever its metres."""
+"""Front-end settings scale with the camera and keep their disparities."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Four layouts of one rendered drive give one log; what is wrong with any is one line."""
+"""Four layouts of one rendered drive give the same log."""
 
 import shutil
 from dataclasses import replace
@@ -40,7 +40,7 @@ def pairs() -> list[Pair]:
 
 @pytest.fixture(scope="module")
 def folders(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Layouts that tests only read."""
+    """Return layouts that tests only read."""
     return {name: write(tmp_path_factory.mktemp(name), pairs) for name, write in WRITERS.items()}
 
 
@@ -101,7 +101,7 @@ def test_observations_lie_on_the_walls(name: str, logs: dict[str, Imported]) -> 
 def test_the_truth_of_a_colour_pair_is_of_a_robot_that_carries_it(
     folders: dict[str, Path], tmp_path: Path
 ) -> None:
-    """The colour pair stands 0.06 m to the left of the grey one, and so does its robot."""
+    """The colour pair and its robot are 0.06 m to the left of the grey pair."""
     day = Path(shutil.copytree(folders["kitti_raw"].parent, tmp_path / "day"))
     drive, aside_m = day / folders["kitti_raw"].name, 0.06
     for grey, colour in ((0, 2), (1, 3)):
@@ -162,7 +162,7 @@ def test_a_tilted_mount_turns_the_points_back(folders: dict[str, Path]) -> None:
 def test_sixteen_bits_and_colour_are_the_same_pictures(
     pairs: list[Pair], folders: dict[str, Path], tmp_path: Path
 ) -> None:
-    """Ten bits stored in sixteen lose two; grey in three channels stays grey."""
+    """Ten bits in 16 are shifted by two; grey in three channels is unchanged."""
     deep = [tuple(4 * image.astype(np.uint16) for image in pair) for pair in pairs]
     coloured = [tuple(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in pair) for pair in pairs]
     for name, written in (("deep", deep), ("coloured", coloured)):
@@ -208,7 +208,7 @@ def test_a_list_of_pairs_stands_for_folders(pairs: list[Pair], tmp_path: Path) -
 
 
 def test_pictures_alone_tell_the_way(pairs: list[Pair], tmp_path: Path) -> None:
-    """Also over the pause, which is a step twice as long."""
+    """The pause is a step of twice the length."""
     sequence = write_kitti(tmp_path, pairs)
     (sequence / "odometry.tum").unlink()
     seen = imported("kitti", sequence)
@@ -255,7 +255,7 @@ def test_front_end_settings_can_be_replaced(folders: dict[str, Path]) -> None:
 
 
 def test_pictures_go_with_the_times_in_their_names(tmp_path: Path) -> None:
-    """By name 10.0.png comes before 9.5.png; each picture is one grey level, which tells it."""
+    """10.0.png precedes 9.5.png by name; a unique grey level identifies each picture."""
     seconds, size = ("9.0", "9.5", "10.0", "10.5"), (CAMERA.height_px, CAMERA.width_px)
     for side in ("left", "right"):
         (tmp_path / side).mkdir()
