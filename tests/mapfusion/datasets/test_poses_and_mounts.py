@@ -56,7 +56,7 @@ def test_times_that_run_back_are_refused() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_robot_looks_where_its_camera_does(seed: int) -> None:
-    """Any order of the body axes and any small camera rotation give the same mount."""
+    """The mount is recovered for any order of the body axes and a small camera rotation."""
     rng = np.random.default_rng(seed)
     axes = np.rint(Rotation.create_group("O").as_matrix())[rng.integers(24)]
     off = Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3)).as_matrix()
