@@ -11,7 +11,7 @@ import typer
 from experiments.cli import options
 from mapfusion.datasets.formats import (
     IMPORTERS,
-    Level,
+    AttitudeSource,
     import_recording,
     robot_name,
     settings_class,
@@ -19,7 +19,7 @@ from mapfusion.datasets.formats import (
 from mapfusion.errors import InputError
 
 if TYPE_CHECKING:
-    from mapfusion.datasets.stereo_import import Cut
+    from mapfusion.datasets.stereo_import import RecordingPart
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings in foreign formats into robot logs.")
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="The recording.")]
@@ -59,7 +59,7 @@ CalibrationOverrides = Annotated[
     ),
 ]
 LevelOf = Annotated[
-    Level,
+    AttitudeSource,
     typer.Option(
         help="Where the robot's roll, pitch and height are known from: the mount (a level body), "
         "odometry that tilts, the pictures' motions from a level beginning, or with the floor that "
@@ -159,12 +159,12 @@ def _with_options(command: Callable[..., None], own: Mapping[str, str]) -> Calla
     return command
 
 
-def _cuts(recording: str, frames: Sequence[str]) -> "list[Cut]":
+def _cuts(recording: str, frames: Sequence[str]) -> "list[RecordingPart]":
     """Robots by what `--frames` says; raises InputError."""
-    from mapfusion.datasets.stereo_import import Cut
+    from mapfusion.datasets.stereo_import import RecordingPart
 
     if not frames:
-        return [Cut(recording, slice(None))]
+        return [RecordingPart(recording, slice(None))]
     cuts = []
     for number, text in enumerate(frames, start=1):
         match = _CUT.fullmatch(text)
@@ -174,7 +174,7 @@ def _cuts(recording: str, frames: Sequence[str]) -> "list[Cut]":
             expected = "[NAME=]FROM:TO or FROM:TO:STEP, for example R1=0:500"
             raise InputError(f"--frames {text}: expected {expected}")
         bounds = [int(part) if part else None for part in match["rows"].split(":")]
-        cuts.append(Cut(name, slice(*bounds)))
+        cuts.append(RecordingPart(name, slice(*bounds)))
     return cuts
 
 

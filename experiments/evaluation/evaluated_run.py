@@ -30,13 +30,8 @@ from experiments.pipeline.store import StageFolder, Store, require_sound
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
 from experiments.scenario.settings import AnyScenario, Recording
-from mapfusion.datasets.log_consistency import (
-    Finding,
-    composed_spans,
-    observed_spans,
-    odometry_motions,
-    truth_finding,
-)
+from mapfusion.datasets.log_consistency import Finding, truth_finding
+from mapfusion.datasets.relative_motion import composed_spans, observed_spans, odometry_motions
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fusion.fusers import make_fuser

@@ -10,8 +10,14 @@ from experiments.scenario.loading import made_settings
 from experiments.scenario.settings import SimulatedScenario
 from experiments.scenario.suite import settings_of
 from experiments.scenario.yaml_files import read_calibration
-from mapfusion.datasets.formats import Level, read_recording
-from mapfusion.datasets.stereo_import import Cut, Imported, OnProgress, StereoImport, write_imported
+from mapfusion.datasets.formats import AttitudeSource, read_recording
+from mapfusion.datasets.stereo_import import (
+    Imported,
+    OnProgress,
+    RecordingPart,
+    StereoImport,
+    write_imported,
+)
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.datasets.tum import read_odometry, read_tum
 from mapfusion.errors import InputError
@@ -45,7 +51,7 @@ class Source:
     vision: FrontEndParameters | None = None
     vision_overrides: tuple[str, ...] = ()
     calibration: tuple[str, ...] = ()
-    level: Level = "auto"
+    level: AttitudeSource = "auto"
 
     def read(self) -> StereoRecording:
         """The recording with the trajectories that are given; raises InputError."""
@@ -88,7 +94,10 @@ class ImportedRecording:
 
 
 def imported(
-    source: Source, recording: StereoRecording, cuts: Sequence[Cut], on_progress: OnProgress
+    source: Source,
+    recording: StereoRecording,
+    cuts: Sequence[RecordingPart],
+    on_progress: OnProgress,
 ) -> ImportedRecording:
     """Make the logs of some robots of a recording that `source` read; raises InputError."""
     work = StereoImport(recording, source.adjusted, source.known)
@@ -106,7 +115,7 @@ def imported(
 def import_stereo(
     sources: Sequence[Source],
     destination: Path,
-    cuts_of: Callable[[StereoRecording], list[Cut]],
+    cuts_of: Callable[[StereoRecording], list[RecordingPart]],
     jobs: int,
     on_progress: OnProgress,
 ) -> tuple[list[ImportedRecording], list[Path]]:
@@ -139,7 +148,10 @@ def import_stereo(
 
 
 def _shared_out(
-    sources: Sequence[Source], robots: Sequence[list[Cut]], jobs: int, on_progress: OnProgress
+    sources: Sequence[Source],
+    robots: Sequence[list[RecordingPart]],
+    jobs: int,
+    on_progress: OnProgress,
 ) -> list[ImportedRecording]:
     """Each robot by a process, which reads its recording for itself."""
     tags = [(n, k) for n, cuts in enumerate(robots) for k in range(len(cuts))]
@@ -156,7 +168,7 @@ def _shared_out(
     ]
 
 
-def _one_robot(source: Source, cut: Cut) -> ImportedRecording:
+def _one_robot(source: Source, cut: RecordingPart) -> ImportedRecording:
     return imported(source, source.read(), [cut], lambda *_: None)
 
 

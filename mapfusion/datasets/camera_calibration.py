@@ -1,12 +1,12 @@
 """Camera calibration of a recording: lenses, calibration files, rectification.
 
-Optical axes: x to the right, y down, z ahead, as all calibrations have them. Pixels as in
-`camera.py`: the centre of the top left pixel is (0, 0).
+Optical axes are x to the right, y down, z ahead. The centre of the top left pixel is (0, 0), as in
+`camera.py`.
 
-A pair whose calibration says that it is rectified already keeps its grey levels: its images are
-cropped so that the principal point lies in the middle, to a quarter of a pixel, and the rest is a
-turn of the camera. Any other pair is drawn anew by OpenCV (bilinear), in the largest rectangle that
-both images fill.
+A pair that is rectified according to its calibration keeps its grey levels: its images are cropped
+so that the principal point lies in the middle, to a quarter of a pixel. The remaining offset is
+expressed as a rotation of the camera. Any other pair is resampled by OpenCV (bilinear) in the
+largest rectangle that both images fill.
 """
 
 import reprlib
@@ -23,29 +23,30 @@ from mapfusion.geometry.camera import MAX_IMAGE_SIDE_PX, StereoCamera
 from mapfusion.geometry.numerics import Float
 
 Distortion = Literal["none", "radial-tangential", "equidistant"]
-# k1 k2 p1 p2 and then k3 (Brown 1966), or four of the angle's odd powers (Kannala, Brandt 2006).
+# Numbers of coefficients: k1 k2 p1 p2 and optionally k3 (Brown 1966), or four of the odd powers of
+# the angle (Kannala, Brandt 2006).
 _COEFFICIENTS: dict[Distortion, tuple[int, ...]] = {
     "none": (0,),
     "radial-tangential": (4, 5),
     "equidistant": (4,),
 }
 _LARGEST_FOCAL_PX = 1e5
-_ROTATION_TOLERANCE = 1e-4  # calibrations are printed with six digits and more
-# Optical axes in the robot's: x ahead, y left, z up.
+_ROTATION_TOLERANCE = 1e-4  # calibrations are printed with at least six digits
+# Optical axes in the robot frame: x ahead, y left, z up.
 R_ROBOT_OPTICAL: Float = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 R_ROBOT_OPTICAL.setflags(write=False)
 
 
 @dataclass(frozen=True)
 class Lens:
-    """One camera.
+    """Pinhole camera with lens distortion.
 
     Attributes:
-        size_px: width and height of its images.
-        focal_px: along u and v.
+        size_px: width and height of the images.
+        focal_px: focal lengths along u and v.
         center_px: principal point, u and v.
-        distortion: what bends its rays: nothing, Brown's polynomial, or Kannala and Brandt's.
-        coefficients: of that, as OpenCV orders them.
+        distortion: none, or the polynomial model of Brown or of Kannala and Brandt.
+        coefficients: coefficients of the distortion in OpenCV's order.
     """
 
     size_px: tuple[int, int]
@@ -74,19 +75,19 @@ class Lens:
 
     @property
     def matrix(self) -> Float:
-        """K (3, 3)."""
+        """Camera matrix K, shape (3, 3)."""
         (fu, fv), (cu, cv) = self.focal_px, self.center_px
         return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
 
     @property
     def parameters(self) -> Float:
-        """The coefficients as OpenCV takes them."""
+        """Distortion coefficients for OpenCV."""
         return np.array(self.coefficients or (0.0,) * 4)
 
     def rays(self, uv_px: Float) -> Float:
-        """Where the rays (N, 3) of pixels (N, 2) meet the plane one metre ahead; z is 1.
+        """Return the rays of pixels, shape (N, 3), with z = 1, for pixels of shape (N, 2).
 
-        NaN for pixels that look sideways or back, whose rays never meet it.
+        Rays of pixels that look sideways or back are NaN; they do not meet the plane z = 1.
         """
         points = np.ascontiguousarray(uv_px, dtype=np.float64).reshape(-1, 1, 2)
         if self.distortion == "equidistant":
@@ -94,14 +95,14 @@ class Lens:
         else:
             flat = cv2.undistortPoints(points, self.matrix, self.parameters)
         flat = flat.reshape(-1, 2)
-        # beyond a right angle the inverse of the polynomial ends anywhere, as a rule mirrored
+        # Beyond a right angle the inverse of the polynomial is undefined, usually mirrored.
         ahead = np.sum(flat * (uv_px - np.array(self.center_px)), axis=1) >= 0
         return np.column_stack([np.where(ahead[:, None], flat, np.nan), np.ones(len(flat))])
 
 
 @dataclass(frozen=True)
 class StereoCalibration:
-    """A pair of cameras; `T_left_right` (4, 4) in optical axes, metres."""
+    """Calibration of a stereo pair; `T_left_right` (4, 4) is in optical axes and metres."""
 
     left: Lens
     right: Lens
@@ -117,7 +118,7 @@ class StereoCalibration:
 
 
 def require_rigid(name: str, T: Float) -> None:
-    """Raise InputError unless a matrix is a rigid motion of space (4, 4)."""
+    """Raise InputError unless T is a rigid motion in space, shape (4, 4)."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError(f"{name}: must be a 4x4 matrix of finite numbers")
     R, last = T[:3, :3], T[3]
@@ -136,16 +137,16 @@ _DISTORTIONS: dict[str, Distortion] = {
 _COEFFICIENT_KEYS = ("distortion_coefficients", "distortion_coeffs")
 
 
-def lens_of(where: str, camera: Mapping[str, Any]) -> Lens:
-    """A pinhole camera with its distortion.
+def parse_lens(where: str, camera: Mapping[str, Any]) -> Lens:
+    """Parse a pinhole camera with its distortion.
 
     Args:
-        where: file and place in it, for messages.
-        camera: its mapping, with `camera_model: pinhole`, `intrinsics: [fu, fv, cu, cv]`,
+        where: file and position in the file, for messages.
+        camera: mapping with `camera_model: pinhole`, `intrinsics: [fu, fv, cu, cv]`,
             `resolution: [width, height]`, `distortion_model` and `distortion_coefficients`.
 
     Raises:
-        InputError: one line that begins with `where`.
+        InputError: a value is missing or wrong; the message begins with `where`.
     """
     model = camera.get("camera_model", "pinhole")
     if model != "pinhole":
@@ -170,16 +171,16 @@ def lens_of(where: str, camera: Mapping[str, Any]) -> Lens:
         raise InputError(f"{where}: {error}") from error
 
 
-def motion_of(where: str, key: str, holder: Mapping[str, Any]) -> Float:
-    """A rigid motion (4, 4): rows of numbers, 16 numbers, or EuRoC's mapping with `data`.
+def parse_transform(where: str, key: str, holder: Mapping[str, Any]) -> Float:
+    """Parse a rigid motion (4, 4): rows of numbers, 16 numbers, or EuRoC's mapping with `data`.
 
     Args:
-        where: file and place in it, for messages.
-        key: of the motion.
-        holder: the mapping that holds it.
+        where: file and position in the file, for messages.
+        key: key of the motion.
+        holder: mapping that holds the motion.
 
     Raises:
-        InputError: one line that begins with `where`.
+        InputError: the value is missing or no rigid motion; the message begins with `where`.
     """
     value, wanted = holder.get(key), "4 rows of 4 numbers"
     if isinstance(value, Mapping):
@@ -198,18 +199,16 @@ def motion_of(where: str, key: str, holder: Mapping[str, Any]) -> Float:
 
 
 def _short(value: Any) -> str:
-    """A value as messages show it."""
-    flat = (
-        [each for row in value for each in (row if isinstance(row, list) else [row])]
-        if (isinstance(value, list))
-        else []
-    )
+    """Return a short text of a value for messages."""
+    flat = []
+    if isinstance(value, list):
+        flat = [each for row in value for each in (row if isinstance(row, list) else [row])]
     is_numbers = flat and all(isinstance(each, int | float) for each in flat)
     return f"{len(flat)} numbers" if is_numbers else reprlib.repr(value)
 
 
-def section(where: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """A mapping within a document; raises InputError where there is none."""
+def parse_section(where: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return a mapping within a document; raise InputError if it is missing."""
     found = document.get(key)
     if not isinstance(found, Mapping):
         what = "is missing" if found is None else f"is {_short(found)}"
@@ -220,6 +219,7 @@ def section(where: Path, document: Mapping[str, Any], key: str) -> Mapping[str, 
 def _numbers(
     where: str, camera: Mapping[str, Any], key: str, n: int | None, names: tuple[str, ...]
 ) -> list[float]:
+    """Parse a list of n numbers (any number for None); `names` describes them in messages."""
     value: Any = camera.get(key)
     is_list = isinstance(value, list) and all(
         isinstance(each, int | float) and not isinstance(each, bool) for each in value
@@ -231,24 +231,24 @@ def _numbers(
     return [float(each) for each in value]
 
 
-_SAME_PX = 0.01  # by which rows and focal lengths of a rectified pair may differ: a tenth of noise
-_WIDEST = 1.2  # tangent of half the angle of view; a pinhole's pixels beyond 50 degrees are smears
-_COS_APART = 0.7  # cosine of 45 degrees: cameras that both turn away further share no view
-_LEAST_SIDE_PX = 48  # corners keep 12 px from each border
-_BORDER_POINTS = 64  # of each edge of an image, to find what is inside both
+_SAME_PX = 0.01  # tolerance of rows and focal lengths of a rectified pair: a tenth of the noise
+_MAX_TANGENT = 1.2  # of half the angle of view; resolution is poor beyond 50 degrees
+_MIN_COS_ROTATION = 0.7  # cosine of 45 degrees: cameras rotated further have no common view
+_MIN_SIDE_PX = 48  # corners keep 12 px from each border
+_BORDER_POINTS = 64  # on each edge of an image, to find the common rectangle
 
 
 @dataclass(frozen=True)
 class Rectification:
-    """How raw images become rectified ones.
+    """Transformation of raw images to rectified images.
 
     Attributes:
-        camera: the rectified pair, with the default mount.
-        R_left_rectified: (3, 3) from the rectified camera's axes into the left camera's; both with
-            x ahead, y left, z up.
-        crops: of a pair that is rectified already: first column and row of each image.
-        maps: of any other: OpenCV's pair of maps for each image.
-        sizes_px: width and height that raw images must have.
+        camera: the rectified pair with the default mount.
+        R_left_rectified: rotation of the rectified camera's axes into those of the left camera,
+            shape (3, 3); both with x ahead, y left, z up.
+        crops: first column and row of each image of a pair that is rectified already, or None.
+        maps: OpenCV's pair of maps for each image of any other pair, or None.
+        sizes_px: required width and height of raw images.
     """
 
     camera: StereoCamera
@@ -259,15 +259,15 @@ class Rectification:
 
     @classmethod
     def of(cls, calibration: StereoCalibration) -> "Rectification":
-        """Raises InputError for a pair that cannot be rectified: there is no common view."""
-        made = _cropped(calibration)
-        return _drawn_anew(calibration) if made is None else made
+        """Return the rectification of a pair; raise InputError if there is no common view."""
+        cropping = _crop(calibration)
+        return _resample(calibration) if cropping is None else cropping
 
     def apply(self, raw: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The rectified pair of raw images (H, W) uint8.
+        """Rectify a pair of raw images (H, W) uint8.
 
         Raises:
-            InputError: an image has another size than the calibration.
+            InputError: the size of an image differs from that of the calibration.
         """
         for name, image, size in zip(("left", "right"), raw, self.sizes_px, strict=True):
             if image.shape[:2] != size[::-1]:
@@ -287,21 +287,19 @@ class Rectification:
         return left, right
 
 
-def _cropped(calibration: StereoCalibration) -> Rectification | None:
-    """For a pair that is rectified already; None where its pixels must be drawn anew."""
+def _crop(calibration: StereoCalibration) -> Rectification | None:
+    """Return the rectification by cropping; None if the pair is not rectified."""
     left, right, T = calibration.left, calibration.right, calibration.T_left_right
     f = float(left.focal_px[0])
-    off_px = f * np.abs(T[:3, :3] - np.eye(3)).max() + f * np.abs(T[1:3, 3]).max() / T[0, 3]
+    tilt_px = f * np.abs(T[:3, :3] - np.eye(3)).max() + f * np.abs(T[1:3, 3]).max() / T[0, 3]
     shift = right.center_px[0] - left.center_px[0]
     differences = [each - f for each in (*left.focal_px, *right.focal_px)]
-    differences += [right.center_px[1] - left.center_px[1], shift - round(shift), off_px]
+    differences += [right.center_px[1] - left.center_px[1], shift - round(shift), tilt_px]
     distorted = any(any(lens.coefficients) for lens in (left, right))
     if distorted or np.abs(differences).max() > _SAME_PX:
         return None
-    (width, column, du), (height, row, dv) = (
-        _central(_common(left, right, axis), left.center_px[axis]) for axis in (0, 1)
-    )
-    # The middle of the crop looks along (-du / f, -dv / f, 1), a turn of the camera.
+    (width, column, du), (height, row, dv) = (_centred_span(left, right, axis) for axis in (0, 1))
+    # The optical axis of the crop is (-du / f, -dv / f, 1): a rotation of the camera.
     turn, _ = cv2.Rodrigues(np.array([dv / f, -du / f, 0.0]))
     return Rectification(
         _camera(width, height, f, float(T[0, 3])),
@@ -312,15 +310,16 @@ def _cropped(calibration: StereoCalibration) -> Rectification | None:
     )
 
 
-def _common(left: Lens, right: Lens, axis: int) -> tuple[int, int]:
-    """First and last column (row) of the left image that has its like, by the centre, in both."""
-    shift = round(right.center_px[axis] - left.center_px[axis])
-    return max(0, -shift), min(left.size_px[axis], right.size_px[axis] - shift) - 1
+def _centred_span(left: Lens, right: Lens, axis: int) -> tuple[int, int, float]:
+    """Return the largest span of columns (rows) around the centre that both images cover.
 
-
-def _central(span: tuple[int, int], center: float) -> tuple[int, int, float]:
-    """Side and beginning of the largest crop around a centre, and by how much it is off (px)."""
-    first, last = span
+    Returns:
+        Length and first column (row) in the left image, and the remaining offset of the centre
+        from the middle of the span in px.
+    """
+    center = left.center_px[axis]
+    shift = round(right.center_px[axis] - center)
+    first, last = max(0, -shift), min(left.size_px[axis], right.size_px[axis] - shift) - 1
     side = int(np.floor(2 * min(center - first, last - center) + 0.5)) + 1
     side = min(side, last - first + 1)
     begin = round(center - (side - 1) / 2)
@@ -328,10 +327,11 @@ def _central(span: tuple[int, int], center: float) -> tuple[int, int, float]:
     return side, begin, center - begin - (side - 1) / 2
 
 
-def _drawn_anew(calibration: StereoCalibration) -> Rectification:
+def _resample(calibration: StereoCalibration) -> Rectification:
+    """Return the rectification by resampling in the largest rectangle that both images fill."""
     left, right = calibration.left, calibration.right
     T_right_left = np.linalg.inv(calibration.T_left_right)
-    # Only the rotations are taken; those do not depend on the lenses.
+    # Only the rotations are used; they do not depend on the lenses.
     found = cv2.stereoRectify(
         np.eye(3), np.zeros(4), np.eye(3), np.zeros(4), (1, 1), T_right_left[:3, :3],
         np.ascontiguousarray(T_right_left[:3, 3]),
@@ -341,13 +341,16 @@ def _drawn_anew(calibration: StereoCalibration) -> Rectification:
     reach = np.min([_reach(left, R_left), _reach(right, R_right)], axis=0)
     width, height = (int(np.floor(2 * f * each)) + 1 for each in reach)
     width, height = min(width, MAX_IMAGE_SIDE_PX), min(height, MAX_IMAGE_SIDE_PX)
-    baseline = float(np.linalg.norm(T_right_left[:3, 3]))
-    camera = _camera(width, height, f, baseline)
-    (cu, cv), K = camera.center_px, np.eye(3) * [f, f, 1.0]
-    K[:2, 2] = cu, cv
-    maps = tuple(
-        _maps(lens, R, K, (width, height)) for lens, R in ((left, R_left), (right, R_right))
-    )
+    camera = _camera(width, height, f, float(np.linalg.norm(T_right_left[:3, 3])))
+    K = np.eye(3) * [f, f, 1.0]
+    K[:2, 2] = camera.center_px
+    maps = []
+    for lens, R in ((left, R_left), (right, R_right)):
+        fisheye = lens.distortion == "equidistant"
+        make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+        size = (width, height)
+        columns, rows = make(lens.matrix, lens.parameters, R, K, size, cv2.CV_32FC1)
+        maps.append((columns, rows))
     return Rectification(
         camera,
         R_ROBOT_OPTICAL @ R_left.T @ R_ROBOT_OPTICAL.T,
@@ -358,39 +361,28 @@ def _drawn_anew(calibration: StereoCalibration) -> Rectification:
 
 
 def _reach(lens: Lens, R: Float) -> Float:
-    """Tangents (2,) of the half angles, across and down, that an image turned by R fills."""
+    """Return tangents (2,) of the half angles of view that an image rotated by R fills."""
     width, height = lens.size_px
     share = np.linspace(0, 1, _BORDER_POINTS)
     u, v = share * (width - 1), share * (height - 1)
     edges = [(0 * v, v), (0 * v + width - 1, v), (u, 0 * u), (u, 0 * u + height - 1)]
-    if R[2, 2] < _COS_APART:
+    if R[2, 2] < _MIN_COS_ROTATION:
         return np.zeros(2)
-    least = np.full(2, _WIDEST)
+    least = np.full(2, _MAX_TANGENT)
     for k, edge in enumerate(edges):
         rays = lens.rays(np.column_stack(edge)) @ R.T
-        axis, sign = divmod(k, 2)
-        met = _sign_of(sign) * rays[:, axis] / rays[:, 2]
+        axis, sign = divmod(k, 2)  # sign 0 for the low edge, 1 for the high edge
+        met = (2 * sign - 1) * rays[:, axis] / rays[:, 2]
         met = met[np.isfinite(met) & (rays[:, 2] > 0)]
-        least[axis] = min(least[axis], met.min(initial=_WIDEST))
+        least[axis] = min(least[axis], met.min(initial=_MAX_TANGENT))
     return np.maximum(least, 0.0)
 
 
-def _sign_of(side: int) -> int:
-    """-1 for the edge at the low end, 1 for that at the high one."""
-    return 2 * side - 1
-
-
-def _maps(lens: Lens, R: Float, K: Float, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    fisheye = lens.distortion == "equidistant"
-    make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
-    first, second = make(lens.matrix, lens.parameters, R, K, size, cv2.CV_32FC1)
-    return first, second
-
-
 def _camera(width: int, height: int, focal_px: float, baseline_m: float) -> StereoCamera:
-    if min(width, height) < _LEAST_SIDE_PX:
+    """Return the rectified camera; raise InputError if its images are too small."""
+    if min(width, height) < _MIN_SIDE_PX:
         small = f"what both cameras see has {width}x{height} px once rectified"
-        raise InputError(f"{small}, at least {_LEAST_SIDE_PX} each way are needed")
+        raise InputError(f"{small}, at least {_MIN_SIDE_PX} each way are needed")
     try:
         return StereoCamera(width, height, focal_px, baseline_m)
     except OutOfRangeError as error:

@@ -1,54 +1,62 @@
 """EuRoC MAV (ASL) layout of stereo recordings: importer and exporter.
 
-Burri et al. (2016), "The EuRoC micro aerial vehicle datasets". A folder `mav0`, or the one above:
+Burri et al. (2016), "The EuRoC micro aerial vehicle datasets". A recording is a
+folder `mav0`, or the folder above it:
 
 - `cam0` (left), `cam1` (right): `data.csv` (timestamp in ns, file name), the pictures in `data/`,
   and `sensor.yaml` with resolution, intrinsics, distortion and T_BS, which maps points of the
-  camera into the body's frame.
-- `state_groundtruth_estimate0/data.csv`: time in ns, position, quaternion (real part first) of the
-  body and more that is not read; optional.
+  camera into the body frame.
+- `state_groundtruth_estimate0/data.csv`: time in ns, position and quaternion (real part first) of
+  the body; further columns are ignored; optional.
 - `imu0`: `data.csv` (time in ns, angular velocity in rad/s, acceleration in m/s²) and
   `sensor.yaml` with T_BS; optional.
-- `odometry.tum`: dead reckoning of the robot's axes, which EuRoC has not; ours, optional.
+- `odometry.tum`: dead reckoning of the robot; an extension of this package, optional.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mapfusion.datasets.camera_calibration import StereoCalibration, lens_of, motion_of
+from mapfusion.datasets.camera_calibration import StereoCalibration, parse_lens, parse_transform
 from mapfusion.datasets.export import OnFrame, StereoDrive, write_picture, write_text
-from mapfusion.datasets.imu import Inertial
+from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.levelling import MountSettings, robot_in_body
-from mapfusion.datasets.stereo_recording import PictureFile, ReadYaml, Shot, StereoRecording, paired
+from mapfusion.datasets.stereo_recording import (
+    PictureFile,
+    ReadYaml,
+    Shot,
+    StereoRecording,
+    pair_shots,
+)
 from mapfusion.datasets.text_files import (
     POSES,
+    parse_time_ns,
+    read_rows,
+    read_time_series,
     require_columns,
     require_increasing,
-    rows_of,
-    time_in_ns,
-    timed_numbers,
 )
 from mapfusion.datasets.tum import ODOMETRY_FILE, TimedPoses, read_odometry, tum_text
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
-from mapfusion.geometry.numerics import Float
 
 STATES = "state_groundtruth_estimate0"
-_FELT_COLUMNS = "time wx wy wz ax ay az"
+_IMU_COLUMNS = "time wx wy wz ax ay az"
 _STATE_COLUMNS = "time x y z qw qx qy qz"  # speeds and biases follow
-_LEAST_PICTURES = 2  # of a camera, to make two pairs of
+_WRITTEN_STATE_COLUMNS = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], "
+    "q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+)
+_MIN_PICTURES = 2  # of a camera, for two pairs
 
 
 @dataclass(frozen=True)
 class EurocSettings:
-    """How EuRoC recordings are read.
+    """Settings of the EuRoC importer.
 
     Attributes:
-        mount: what replaces the mount that T_BS tells.
+        mount: replaces the mount of T_BS.
     """
 
     mount: MountSettings = field(default_factory=MountSettings)
@@ -58,62 +66,76 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
     """Read a recording; pictures are loaded later.
 
     Raises:
-        InputError: a file is missing, damaged or foreign; names file and field or line.
+        InputError: a file is missing, damaged or of another format; the message names file and
+            field or line.
     """
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     cameras = [root / "cam0", root / "cam1"]
     if not all((camera / "data.csv").is_file() for camera in cameras):
         raise InputError(f"{folder}: no cam0/data.csv and cam1/data.csv (a EuRoC recording's mav0)")
-    lenses, mounts = zip(
-        *(_camera(camera / "sensor.yaml", read_yaml) for camera in cameras), strict=True
-    )
-    T_left_right = se3.between(mounts[0], mounts[1])
+    sensors = [camera / "sensor.yaml" for camera in cameras]
+    lenses, mounts = [], []
+    for sensor in sensors:
+        document = read_yaml(sensor)
+        lenses.append(parse_lens(str(sensor), document))
+        mounts.append(parse_transform(str(sensor), "T_BS", document))
+    calibrated_by = f"{root}: sensor.yaml of cam0 and cam1"
     try:
+        T_left_right = se3.between(mounts[0], mounts[1])
         calibration = StereoCalibration(lenses[0], lenses[1], T_left_right)
     except InputError as error:
-        raise InputError(f"{root}: sensor.yaml of cam0 and cam1: {error}") from error
-    (left, lost_left), (right, lost_right) = (_shots(camera) for camera in cameras)
-    try:
-        time_ns, pictures, dropped = paired(left, right)
-    except InputError as error:
-        raise InputError(f"{root}: {error}") from error
+        raise InputError(f"{calibrated_by}: {error}") from error
+    (left, lost_left), (right, lost_right) = (_read_pictures(camera) for camera in cameras)
+    time_ns, pictures, dropped = pair_shots(root, left, right)
+
     T_body_robot, T_robot_left = robot_in_body(mounts[0])
+    imu, states = root / "imu0", root / STATES / "data.csv"
+    inertial, truth = None, None
+    if (imu / "data.csv").exists():
+        sensor, path = imu / "sensor.yaml", imu / "data.csv"
+        T_body_imu = parse_transform(str(sensor), "T_BS", read_yaml(sensor))
+        imu_ns, values = read_time_series(path, "accelerations", _IMU_COLUMNS, 1, ",")
+        R_imu_robot = se3.between(T_body_robot, T_body_imu)[:3, :3].T
+        try:
+            inertial = ImuData(imu_ns, values[:, 3:] @ R_imu_robot, values[:, :3] @ R_imu_robot)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+    if states.exists():
+        truth_ns, values = read_time_series(
+            states, "true states", _STATE_COLUMNS, 1, ",", POSES, more=True
+        )
+        if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):
+            raise InputError(f"{states}: holds a quaternion of length 0")
+        T_world_body = se3.from_quaternions(values[:, :3], values[:, [4, 5, 6, 3]])
+        truth = TimedPoses(truth_ns, T_world_body).moved(T_body_robot)
     odometry = root / ODOMETRY_FILE
-    states, imu = root / STATES / "data.csv", root / "imu0"
-    felt = _felt(imu, T_body_robot, read_yaml) if (imu / "data.csv").exists() else None
     return StereoRecording(
         (root.resolve().parent if root.name == "mav0" else root.resolve()).name,
         time_ns,
         pictures,
         calibration,
         settings.mount.applied(T_robot_left),
-        _states(states).moved(T_body_robot) if states.exists() else None,
+        truth,
         read_odometry(odometry) if odometry.exists() else None,
         (*lost_left, *lost_right, *dropped),
-        felt,
-        f"{root}: sensor.yaml of cam0 and cam1",
+        inertial,
+        calibrated_by,
     )
 
 
-def _camera(path: Path, read_yaml: ReadYaml) -> tuple[Any, Float]:
-    """The lens, and T_BS (4, 4)."""
-    found: Mapping[str, Any] = read_yaml(path)
-    return lens_of(str(path), found), motion_of(str(path), "T_BS", found)
-
-
-def _shots(camera: Path) -> tuple[list[Shot], list[str]]:
-    """The pictures of one camera that are there, and what is said of those that are not."""
+def _read_pictures(camera: Path) -> tuple[list[Shot], list[str]]:
+    """Return the pictures of one camera and a line for each missing picture."""
     path, shots, lines, missing = camera / "data.csv", list[Shot](), list[int](), list[str]()
-    for line, words in rows_of(path, "times and names of pictures", ","):
+    for line, words in read_rows(path, "times and names of pictures", ","):
         require_columns(path, line, words, "time file")
-        time_ns, picture = time_in_ns(path, line, words[0], 1), camera / "data" / words[1]
+        time_ns, picture = parse_time_ns(path, line, words[0], 1), camera / "data" / words[1]
         name = f"{camera.name}/data/{words[1]}"
         if picture.is_file():
             shots.append(Shot(time_ns, name, PictureFile(picture)))
             lines.append(line)
         else:
             missing.append(f"{name} (no such file)")
-    if missing and len(shots) < _LEAST_PICTURES:
+    if missing and len(shots) < _MIN_PICTURES:
         lost = f"{missing[0]}; {len(missing)} of the {len(missing) + len(shots)} listed are missing"
         held = next(
             (each.name for each in sorted((camera / "data").glob("*")) if each.is_file()), "none"
@@ -124,43 +146,31 @@ def _shots(camera: Path) -> tuple[list[Shot], list[str]]:
     return shots, missing
 
 
-def _felt(imu: Path, T_body_robot: Float, read_yaml: ReadYaml) -> Inertial:
-    """Accelerations and angular velocities in the robot's axes."""
-    sensor, path = imu / "sensor.yaml", imu / "data.csv"
-    T_body_imu = motion_of(str(sensor), "T_BS", read_yaml(sensor))
-    time_ns, own = timed_numbers(path, "accelerations", _FELT_COLUMNS, 1, ",")
-    turn = se3.between(T_body_robot, T_body_imu)[:3, :3].T
-    try:
-        return Inertial(time_ns, own[:, 3:] @ turn, own[:, :3] @ turn)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
-def _states(path: Path) -> TimedPoses:
-    """T_world_body of the true states."""
-    time_ns, values = timed_numbers(path, "true states", _STATE_COLUMNS, 1, ",", POSES, more=True)
-    if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):
-        raise InputError(f"{path}: holds a quaternion of length 0")
-    return TimedPoses(time_ns, se3.from_quaternions(values[:, :3], values[:, [4, 5, 6, 3]]))
-
-
-_WRITTEN_STATE_COLUMNS = (
-    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], "
-    "q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
-)
-
-
 def write_euroc(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Path]:
-    """Write a drive into `folder/ROBOT/mav0`; returns `folder/ROBOT`."""
+    """Write a drive into `folder/ROBOT/mav0` and return the path `folder/ROBOT`."""
     root, stamps = folder / drive.robot / "mav0", drive.time_ns.tolist()
     for k, stamp in enumerate(stamps):
         for camera, image in enumerate(drive.pair(k)):
             write_picture(root / f"cam{camera}" / "data" / f"{stamp}.png", image)
         on_frame(k + 1, len(drive))
+    pair, (cu, cv) = drive.camera, drive.camera.center_px
     for camera in (0, 1):
         rows = [f"{stamp},{stamp}.png" for stamp in stamps]
         write_text(root / f"cam{camera}" / "data.csv", ["#timestamp [ns],filename", *rows])
-        write_text(root / f"cam{camera}" / "sensor.yaml", _sensor(drive, camera))
+        sensor = [
+            "sensor_type: camera",
+            f"comment: camera {camera} of {drive.robot}, rectified",
+            "T_BS:",
+            "  cols: 4",
+            "  rows: 4",
+            f"  data: {drive.mount(camera).ravel().tolist()}",
+            f"resolution: [{pair.width_px}, {pair.height_px}]",
+            "camera_model: pinhole",
+            f"intrinsics: [{pair.focal_px}, {pair.focal_px}, {cu}, {cv}] # fu, fv, cu, cv",
+            "distortion_model: radial-tangential",
+            "distortion_coefficients: [0.0, 0.0, 0.0, 0.0]",
+        ]
+        write_text(root / f"cam{camera}" / "sensor.yaml", sensor)
     T = drive.true_bodies
     values = np.column_stack([T[:, :3, 3], np.roll(se3.quaternions(T), 1, axis=1)]).tolist()
     rows = [",".join(map(str, [s, *v])) for s, v in zip(stamps, values, strict=True)]
@@ -169,20 +179,3 @@ def write_euroc(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pat
     text = tum_text(drive.time_s, drive.reckoned_bodies, about)
     write_text(root / ODOMETRY_FILE, text.splitlines())
     return [folder / drive.robot]
-
-
-def _sensor(drive: StereoDrive, camera: int) -> list[str]:
-    pair, (cu, cv) = drive.camera, drive.camera.center_px
-    return [
-        "sensor_type: camera",
-        f"comment: camera {camera} of {drive.robot}, rectified",
-        "T_BS:",
-        "  cols: 4",
-        "  rows: 4",
-        f"  data: {drive.mount(camera).ravel().tolist()}",
-        f"resolution: [{pair.width_px}, {pair.height_px}]",
-        "camera_model: pinhole",
-        f"intrinsics: [{pair.focal_px}, {pair.focal_px}, {cu}, {cv}] # fu, fv, cu, cv",
-        "distortion_model: radial-tangential",
-        "distortion_coefficients: [0.0, 0.0, 0.0, 0.0]",
-    ]

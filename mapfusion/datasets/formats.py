@@ -14,27 +14,26 @@ if TYPE_CHECKING:
     from mapfusion.datasets.stereo_recording import ReadYaml, StereoRecording
 
 
-Level = Literal["auto", "mount", "pictures", "floor", "imu", "odometry"]
-
-
-_LONGEST_NAME = 40  # of a robot: names become parts of file names
+AttitudeSource = Literal["auto", "mount", "pictures", "floor", "imu", "odometry"]
+_MAX_NAME_LENGTH = 40  # of a robot: names are parts of file names
 
 
 @dataclass(frozen=True)
 class Importer:
-    """What reads recordings of one format.
+    """Importer of recordings of one format.
 
     Attributes:
-        target: `module:function` of it, imported when it is called. The function raises InputError
-            that names file and line. Of logs, it takes a recording's folder, where the logs go and
-            its settings, writes a log (with the truth, if there is any) for each robot, and returns
-            the logs' folders; it writes nothing where it raises. Of stereo pictures, it takes a
-            recording's folder, its settings and a `ReadYaml`, and returns a `StereoRecording`.
-        settings: name of the dataclass of its settings, in the same module.
-        what: the recordings, in a few words.
-        example: how such a recording's folder may be called.
-        stereo: whether pictures are recorded, of which observations are yet to be made.
-        options: settings that the command takes by their own names, and what they are.
+        target: `module:function` of the importer, which is imported when it is called. The function
+            raises an InputError that names file and line. A function for logs takes the folder of
+            the recording, the destination and the settings. It writes a log for each robot, with
+            the truth if it is recorded, and returns the folders of the logs; it writes nothing if
+            it raises an error. A function for stereo pictures takes the folder of the recording,
+            the settings and a `ReadYaml`, and returns a `StereoRecording`.
+        settings: name of the dataclass of the settings in the same module.
+        what: short description of the recordings.
+        example: example of the name of such a recording.
+        stereo: True if the recordings hold stereo pictures instead of observations.
+        options: settings that are options of the command, with their help texts.
     """
 
     target: str
@@ -88,15 +87,15 @@ IMPORTERS = {
         stereo=True,
         options={
             "left": "Topic of the left camera's pictures.",
-            "right": "Topic of the right camera's.",
-            "odom": "Topic of the robot's odometry; without it the pictures tell.",
-            "imu": "Topic of an IMU: its accelerations level the camera, and each frame.",
+            "right": "Topic of the right camera's pictures.",
+            "odom": "Topic of the robot's odometry; without it visual odometry is used.",
+            "imu": "Topic of an IMU: its accelerations level the camera and each frame.",
         },
     ),
 }
 
 
-# By name what writes a `StereoDrive` into a folder and returns the paths to import it from.
+# Functions that write a `StereoDrive` into a folder and return the paths to import, by format.
 EXPORTERS = {
     "euroc": "mapfusion.datasets.euroc:write_euroc",
     "kitti": "mapfusion.datasets.kitti:write_kitti",
@@ -106,8 +105,8 @@ EXPORTERS = {
 
 
 def settings_class(format_name: str) -> type[Any]:
-    """The dataclass of an importer's settings; raises InputError for an unknown name."""
-    importer, _ = _found(format_name)
+    """Return the dataclass of an importer's settings; raise InputError for an unknown name."""
+    importer, _ = _find_importer(format_name)
     module, _, _ = importer.target.partition(":")
     return getattr(importlib.import_module(module), importer.settings)
 
@@ -115,23 +114,27 @@ def settings_class(format_name: str) -> type[Any]:
 def read_recording(
     format_name: str, folder: Path, settings: Any = None, read_yaml: "ReadYaml | None" = None
 ) -> "StereoRecording":
-    """A stereo recording: a stream of pairs, with calibration, and truth where there is any.
+    """Read a stereo recording: pairs of pictures with calibration, and truth if it is recorded.
 
     Args:
-        format_name: of a stereo format of `IMPORTERS`.
-        folder: of the recording.
-        settings: of the format's `settings_class`, by default with all its defaults.
-        read_yaml: from a path to the mapping that a YAML file holds, for formats whose calibration
-            is one; raises InputError.
+        format_name: name of a stereo format of `IMPORTERS`.
+        folder: folder of the recording.
+        settings: instance of the format's `settings_class`; None for the defaults.
+        read_yaml: function that returns the mapping of a YAML file or raises InputError, for
+            formats with a YAML calibration.
 
     Raises:
-        InputError: no such format, or what it has to say against the recording.
+        InputError: the format is unknown, or the recording is incomplete or damaged.
     """
-    importer, function = _found(format_name)
+    importer, function = _find_importer(format_name)
     if not importer.stereo:
         raise InputError(f"recordings of {format_name!r}: hold no pictures")
     chosen = settings_class(format_name)() if settings is None else settings
-    return function(folder, chosen, read_yaml or _no_yaml)
+
+    def no_yaml(path: Path) -> Any:
+        raise InputError(f"{path}: give `read_yaml`, a function that reads YAML, to read it")
+
+    return function(folder, chosen, read_yaml or no_yaml)
 
 
 def import_recording(
@@ -141,20 +144,20 @@ def import_recording(
     settings: Any = None,
     read_yaml: "ReadYaml | None" = None,
 ) -> list[Path]:
-    """Write one log for each robot of a recording; returns the logs' folders.
+    """Write one log for each robot of a recording and return the folders of the logs.
 
-    Settings and `read_yaml` as `read_recording` has them. A stereo recording is one robot.
+    A stereo recording is one robot. Settings and `read_yaml` are those of `read_recording`.
 
     Raises:
-        InputError: no importer has that name, or what it has to say against the recording.
+        InputError: the format is unknown, or the recording is incomplete or damaged.
     """
-    importer, function = _found(format_name)
+    importer, function = _find_importer(format_name)
     if not importer.stereo:
         return function(folder, destination, settings)
-    from mapfusion.datasets.stereo_import import Cut, StereoImport, write_imported
+    from mapfusion.datasets.stereo_import import RecordingPart, StereoImport, write_imported
 
     recording = read_recording(format_name, folder, settings, read_yaml)
-    whole = Cut(robot_name(recording.name), slice(None))
+    whole = RecordingPart(robot_name(recording.name), slice(None))
     return write_imported(destination, [StereoImport(recording).log_of(whole)])
 
 
@@ -164,10 +167,10 @@ def export_drive(
     drive: "StereoDrive",
     on_frame: Callable[[int, int], None] = lambda *_: None,
 ) -> list[Path]:
-    """Write a drive in a format of `EXPORTERS`; returns the paths to import it from.
+    """Write a drive in a format of `EXPORTERS` and return the paths to import.
 
     Raises:
-        InputError: no exporter has that name.
+        InputError: the format is unknown.
     """
     if format_name not in EXPORTERS:
         raise InputError(f"--format {format_name}: unknown; known: {', '.join(EXPORTERS)}")
@@ -176,15 +179,12 @@ def export_drive(
 
 
 def robot_name(recording: str) -> str:
-    """The name of a recording as a robot may be called."""
-    return re.sub("[^A-Za-z0-9_-]+", "-", recording).strip("-_")[:_LONGEST_NAME] or "robot"
+    """Return a valid robot name made of the name of a recording."""
+    return re.sub("[^A-Za-z0-9_-]+", "-", recording).strip("-_")[:_MAX_NAME_LENGTH] or "robot"
 
 
-def _no_yaml(path: Path) -> Any:
-    raise InputError(f"{path}: give `read_yaml`, a function that reads YAML, to read it")
-
-
-def _found(format_name: str) -> tuple[Importer, Callable[..., Any]]:
+def _find_importer(format_name: str) -> tuple[Importer, Callable[..., Any]]:
+    """Return an importer and its function; raise InputError for an unknown name."""
     if format_name not in IMPORTERS:
         raise InputError(f"recordings of {format_name!r}: unknown; known: {', '.join(IMPORTERS)}")
     importer = IMPORTERS[format_name]

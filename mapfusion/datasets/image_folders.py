@@ -1,15 +1,15 @@
 """Stereo recordings in two image folders, or an image list, with a calibration file.
 
 - Two folders, `left` and `right` by default. Pictures are named by their time, in nanoseconds (15
-  digits or more) or in seconds (with a decimal point); or a file `times.txt` holds a time in
-  seconds for each picture of either folder, in the order of their names.
-- In place of folders a list: a CSV file, a line a pair: time in seconds, file of the left picture,
-  file of the right one; files are relative to the list.
-- The calibration is a YAML file as Kalibr writes it: `cam0` (left) and `cam1` (right) with
+  digits or more) or in seconds (with a decimal point). Alternatively, a file `times.txt` holds a
+  time in seconds for each picture of either folder, in the order of their names.
+- A list in place of the folders: a CSV file with one pair a line: time in seconds, left file, right
+  file. File names are relative to the list.
+- The calibration is a YAML file in Kalibr's format: `cam0` (left) and `cam1` (right) with
   `camera_model: pinhole`, `intrinsics`, `distortion_model` (`radtan`, `equidistant`, `none`),
   `distortion_coeffs`, `resolution`, and `T_cn_cnm1` of `cam1`, which maps points of the left
-  camera into the right one's frame. `T_BS` of `cam0`, where it is there, maps points of the left
-  camera into the robot's frame.
+  camera into the frame of the right camera. The optional `T_BS` of `cam0` maps points of the left
+  camera into the robot frame.
 """
 
 import re
@@ -19,22 +19,27 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.datasets.camera_calibration import StereoCalibration, lens_of, motion_of, section
+from mapfusion.datasets.camera_calibration import (
+    StereoCalibration,
+    parse_lens,
+    parse_section,
+    parse_transform,
+)
 from mapfusion.datasets.levelling import MountSettings, level_mount, robot_in_body
 from mapfusion.datasets.stereo_recording import (
-    MOST_APART_NS,
+    MAX_OFFSET_NS,
     PictureFile,
     ReadYaml,
     Shot,
     StereoRecording,
-    paired,
+    pair_shots,
 )
 from mapfusion.datasets.text_files import (
     NS,
+    parse_time_ns,
+    read_rows,
     require_columns,
     require_increasing,
-    rows_of,
-    time_in_ns,
 )
 from mapfusion.datasets.tum import ODOMETRY_FILE, TRUTH_FILE, read_odometry, read_tum
 from mapfusion.errors import InputError
@@ -45,21 +50,21 @@ from mapfusion.parameters import Range, require_in_range
 _KINDS = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 _IN_NS = re.compile(r"\d{15,19}")
 _IN_S = re.compile(r"\d+\.\d+")
-_HEIGHT_M = 0.5  # of a camera whose mount nobody tells; it moves all heights alike
+_HEIGHT_M = 0.5  # of a camera without a stated mount; an error shifts all heights equally
 
 
 @dataclass(frozen=True)
 class ImagesSettings:
-    """Where the parts of a recording are, relative to its folder.
+    """Files of a recording, relative to its folder.
 
     Attributes:
         left: folder of the left camera's pictures.
-        right: of the right one's.
-        times: file of their times, read if it is there.
-        list: of pairs in place of the folders, read if it is there.
-        calibration: of the pair.
-        most_apart_s: pictures of one pair, at most.
-        mount: what replaces the mount that the calibration tells, or a camera that looks level.
+        right: folder of the right camera's pictures.
+        times: file of their times, read if it exists.
+        list: list of pairs in place of the folders, read if it exists.
+        calibration: calibration file of the pair.
+        most_apart_s: largest time difference of the pictures of a pair.
+        mount: replaces the mount of the calibration file, or the default, a level camera.
     """
 
     left: str = "left"
@@ -67,7 +72,7 @@ class ImagesSettings:
     times: str = "times.txt"
     list: str = "pairs.csv"
     calibration: str = "calibration.yaml"
-    most_apart_s: Annotated[float, Range(0, 1, "s")] = MOST_APART_NS / NS
+    most_apart_s: Annotated[float, Range(0, 1, "s")] = MAX_OFFSET_NS / NS
     mount: MountSettings = field(default_factory=MountSettings)
 
     def __post_init__(self) -> None:
@@ -75,53 +80,47 @@ class ImagesSettings:
 
 
 def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> StereoRecording:
-    """Read a recording; pictures are loaded later. `odometry.tum` and `truth.tum` are read, too.
+    """Read a recording with its `odometry.tum` and `truth.tum`; pictures are loaded later.
 
     Raises:
-        InputError: a file is missing, damaged or foreign; names file and field or line.
+        InputError: a file is missing, damaged or of another format; the message names file and
+            field or line.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (a recording of images)")
-    calibration, T_robot_left = _calibration(folder / settings.calibration, read_yaml)
-    listed = folder / settings.list
-    if listed.is_file():
-        left, right = _listed(listed)
+    calibration_file = folder / settings.calibration
+    calibration, T_robot_left = _read_calibration(calibration_file, read_yaml)
+    pair_list = folder / settings.list
+    if pair_list.is_file():
+        left, right = _read_pair_list(pair_list)
     else:
         left, right = (
-            _named(folder / name, folder / settings.times)
+            _read_folder(folder / name, folder / settings.times)
             for name in (settings.left, settings.right)
         )
-    try:
-        made = paired(left, right, round(settings.most_apart_s * NS))
-    except InputError as error:
-        raise InputError(f"{folder}: {error}") from error
-    time_ns, pictures, dropped = made
-    odometry, truth = (
-        read(path) if path.exists() else None
-        for read, path in ((read_odometry, folder / ODOMETRY_FILE), (read_tum, folder / TRUTH_FILE))
-    )
-    T_robot_left = settings.mount.applied(T_robot_left)
-    name = folder.resolve().name
+    max_offset_ns = round(settings.most_apart_s * NS)
+    time_ns, pictures, dropped = pair_shots(folder, left, right, max_offset_ns)
+    odometry, truth = folder / ODOMETRY_FILE, folder / TRUTH_FILE
     return StereoRecording(
-        name,
+        folder.resolve().name,
         time_ns,
         pictures,
         calibration,
-        T_robot_left,
-        truth,
-        odometry,
-        dropped,
-        calibrated_by=str(folder / settings.calibration),
+        settings.mount.applied(T_robot_left),
+        truth=read_tum(truth) if truth.exists() else None,
+        odometry=read_odometry(odometry) if odometry.exists() else None,
+        dropped=dropped,
+        calibrated_by=str(calibration_file),
     )
 
 
-def _calibration(path: Path, read_yaml: ReadYaml) -> tuple[StereoCalibration, Float]:
-    """The pair, and T_robot_left (4, 4)."""
+def _read_calibration(path: Path, read_yaml: ReadYaml) -> tuple[StereoCalibration, Float]:
+    """Return the calibration of the pair and T_robot_left (4, 4)."""
     document = read_yaml(path)
-    left, right = (section(path, document, name) for name in ("cam0", "cam1"))
-    T_right_left = motion_of(f"{path}: cam1", "T_cn_cnm1", right)
+    left, right = (parse_section(path, document, name) for name in ("cam0", "cam1"))
+    T_right_left = parse_transform(f"{path}: cam1", "T_cn_cnm1", right)
     try:
-        lenses = lens_of(f"{path}: cam0", left), lens_of(f"{path}: cam1", right)
+        lenses = parse_lens(f"{path}: cam0", left), parse_lens(f"{path}: cam1", right)
         calibration = StereoCalibration(*lenses, se3.inverse(T_right_left))
     except InputError as error:
         where = "" if str(error).startswith(str(path)) else f"{path}: cam1: "
@@ -129,12 +128,12 @@ def _calibration(path: Path, read_yaml: ReadYaml) -> tuple[StereoCalibration, Fl
     if "T_BS" not in left:
         baseline_m = float(calibration.T_left_right[0, 3])
         return calibration, level_mount(baseline_m, 0.0, _HEIGHT_M)
-    T_body_left = motion_of(f"{path}: cam0", "T_BS", left)
+    T_body_left = parse_transform(f"{path}: cam0", "T_BS", left)
     return calibration, robot_in_body(T_body_left)[1]
 
 
-def _named(folder: Path, times: Path) -> list[Shot]:
-    """The pictures of a folder, with the times that their names, or a file, tell."""
+def _read_folder(folder: Path, times: Path) -> list[Shot]:
+    """Return the pictures of a folder with the times of the file `times`, or of their names."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (pictures of one camera)")
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in _KINDS)
@@ -142,16 +141,24 @@ def _named(folder: Path, times: Path) -> list[Shot]:
         kinds = ", ".join(sorted(_KINDS))
         raise InputError(f"{folder}: holds no picture of one camera ({kinds})")
     if times.is_file():
-        rows = list(rows_of(times, "times of pictures"))
+        rows = list(read_rows(times, "times of pictures"))
         if len(rows) != len(paths):
             raise InputError(
                 f"{times}: has {len(rows)} times for {len(paths)} pictures of {folder}"
             )
-        time_ns = [time_in_ns(times, line, words[0], NS) for line, words in rows]
+        time_ns = [parse_time_ns(times, line, words[0], NS) for line, words in rows]
         require_increasing(times, [line for line, _ in rows], np.array(time_ns, dtype=np.int64))
     else:
-        time_ns = [_time_of(path, times) for path in paths]
-        order = np.argsort(time_ns, kind="stable").tolist()  # 9.5.png is before 10.0.png
+        time_ns = list[int]()
+        for path in paths:
+            if _IN_NS.fullmatch(path.stem):
+                time_ns.append(parse_time_ns(path, 1, path.stem, 1))
+            elif _IN_S.fullmatch(path.stem):
+                time_ns.append(parse_time_ns(path, 1, path.stem, NS))
+            else:
+                reason = "is named by no time (nanoseconds, or seconds with a decimal point)"
+                raise InputError(f"{path}: {reason}; give the times in {times.name}")
+        order = np.argsort(time_ns, kind="stable").tolist()  # 9.5.png precedes 10.0.png
         paths, time_ns = [paths[k] for k in order], [time_ns[k] for k in order]
         require_increasing(folder, list(range(1, len(paths) + 1)), np.array(time_ns, np.int64))
     return [
@@ -160,20 +167,12 @@ def _named(folder: Path, times: Path) -> list[Shot]:
     ]
 
 
-def _time_of(path: Path, times: Path) -> int:
-    if _IN_NS.fullmatch(path.stem):
-        return time_in_ns(path, 1, path.stem, 1)
-    if _IN_S.fullmatch(path.stem):
-        return time_in_ns(path, 1, path.stem, NS)
-    told = "is named by no time (nanoseconds, or seconds with a decimal point)"
-    raise InputError(f"{path}: {told}; give the times in {times.name}")
-
-
-def _listed(path: Path) -> tuple[list[Shot], list[Shot]]:
+def _read_pair_list(path: Path) -> tuple[list[Shot], list[Shot]]:
+    """Return the left and the right pictures of a list of pairs."""
     left, right, lines = list[Shot](), list[Shot](), list[int]()
-    for line, words in rows_of(path, "pairs of pictures", ","):
+    for line, words in read_rows(path, "pairs of pictures", ","):
         require_columns(path, line, words, "time left_file right_file")
-        time_ns = time_in_ns(path, line, words[0], NS)
+        time_ns = parse_time_ns(path, line, words[0], NS)
         for name, shots in zip(words[1:], (left, right), strict=True):
             picture = path.parent / name
             if not picture.is_file():

@@ -1,10 +1,10 @@
 """IMU of a recording: direction of gravity from the accelerometer, for each frame.
 
-An accelerometer feels gravity and how the body speeds up, sways and shakes. Gravity alone stays, so
-its direction is right in the long run and turns from frame to frame are not: those come from the
-pictures, as a complementary filter takes them from gyroscopes (Mahony, Hamel, Pflimlin 2008,
-"Nonlinear complementary filters on the special orthogonal group"). `AttitudeEstimator` filters;
-here is what it takes for measured, and how far that strays.
+An accelerometer measures gravity plus the accelerations and vibrations of the body. Gravity
+dominates the mean over a long time, but not the change from frame to frame. Rotations between
+frames are therefore estimated from the pictures, as a complementary filter uses gyroscopes (Mahony,
+Hamel, Pflimlin 2008, "Nonlinear complementary filters on the special orthogonal group"). The filter
+is `AttitudeEstimator`; this module provides its measurements and their standard deviations.
 """
 
 import functools
@@ -17,21 +17,21 @@ from mapfusion.datasets.text_files import NS
 from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
 
-_LONGEST_SILENCE_NS = NS // 20  # of gyroscopes; a body that sways turns about in half a second
-LEAST_GRAVITY = 5.0  # m/s²: of a mean acceleration that is to say where up is
-# Of all frames alike: an accelerometer of a phone's or drone's kind is 0.05 m/s² off from one start
-# to the next.
+_MAX_GAP_NS = NS // 20  # between gyroscope samples; a swaying body reverses in half a second
+_MIN_GRAVITY = 5.0  # m/s²: smallest mean acceleration that defines the vertical
+# Tilt error that all frames share: the bias of a consumer accelerometer changes by 0.05 m/s² from
+# one start to the next.
 SHARED_RAD = 0.005
 
 
 @dataclass(frozen=True)
-class Inertial:
-    """What an accelerometer and gyroscopes felt, in the robot's axes.
+class ImuData:
+    """Measurements of an accelerometer and gyroscopes in the robot's axes (x ahead, y left, z up).
 
     Attributes:
-        time_ns: (M,) int64, increasing.
-        acceleration: (M, 3) in m/s², upwards at rest; x ahead, y left, z up of the robot.
-        rate: (M, 3) angular velocity in rad/s; None: it was not recorded.
+        time_ns: increasing times, shape (M,), int64.
+        acceleration: specific force in m/s², shape (M, 3); points up at rest.
+        rate: angular velocity in rad/s, shape (M, 3); None if it was not recorded.
     """
 
     time_ns: np.ndarray
@@ -40,16 +40,16 @@ class Inertial:
 
     def __post_init__(self) -> None:
         mean = float(np.linalg.norm(self.acceleration.mean(axis=0))) if len(self.time_ns) else 0.0
-        if not mean >= LEAST_GRAVITY:
+        if not mean >= _MIN_GRAVITY:
             raise InputError(f"mean acceleration is {mean:.2g} m/s², too little for gravity")
 
     def tilts(self, time_ns: np.ndarray) -> tuple[Float, Float]:
-        """Roll and pitch at T frames, (T, 2), and (2,) their standard deviations.
+        """Return roll and pitch at T frames, shape (T, 2), and their two standard deviations.
 
-        A frame has the mean over the time until halfway to its neighbours; NaN where nothing was
-        felt then. Deviations are the spread about the mean of all, the body's own tilts included,
-        so rather too large, as much larger as neighbours repeat each other: by the sum of their
-        correlations, until it turns negative (Geyer 1992, "Practical Markov chain Monte Carlo").
+        The tilt of a frame is computed from the mean acceleration until halfway to the neighbouring
+        frames; it is NaN if no sample lies in this interval. The standard deviations are the spread
+        about the mean of all frames. They include the tilts of the body and are conservative. They
+        are enlarged by the correlation of consecutive frames (`_effective_sigma`).
         """
         middle = (time_ns[1:] + time_ns[:-1]) // 2
         edges = np.concatenate(
@@ -62,16 +62,18 @@ class Inertial:
         up[n > 0] = (np.diff(summed[bounds], axis=0)[n > 0].T / n[n > 0]).T
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         tilt = np.column_stack([np.arctan2(up[:, 1], up[:, 2]), -np.arcsin(up[:, 0])])
-        felt = tilt[n > 0]
-        if len(felt) < 2:
-            raise InputError("felt nothing while the pictures were taken")
-        return tilt, np.array([_as_if_independent(values) for values in felt.T])
+        measured = tilt[n > 0]
+        if len(measured) < 2:
+            raise InputError("holds no measurement while the pictures were taken")
+        return tilt, np.array([_effective_sigma(values) for values in measured.T])
 
     def turns(self, time_ns: np.ndarray) -> Float | None:
-        """Turns (T, 3) at T frames since the one before, in its axes; None without gyroscopes.
+        """Return the rotation vectors (T, 3) between frames; None without gyroscopes.
 
-        Rotation vectors; NaN for the first frame and where the gyroscopes were silent. Rates
-        between two samples lie between theirs.
+        A vector is the rotation since the frame before, in the axes of that frame.
+
+        Vectors are NaN for the first frame and for frames with a gap in the gyroscope samples.
+        Angular velocities are interpolated linearly between samples.
         """
         from scipy.spatial.transform import Rotation
 
@@ -83,33 +85,36 @@ class Inertial:
         middle = (when[1:] + when[:-1]) / 2 - when[0]
         rates = [np.interp(middle, self.time_ns - when[0], axis) for axis in self.rate.T]
         small = Rotation.from_rotvec(np.stack(rates, -1) * seconds[:, None]).as_matrix()
-        place = np.searchsorted(when, time_ns)
+        index = np.searchsorted(when, time_ns)
+        # Samples around each interval, which must enclose it without a gap.
+        before = np.searchsorted(self.time_ns, time_ns[:-1], side="right") - 1
+        after = np.searchsorted(self.time_ns, time_ns[1:])
         turns = np.full((len(time_ns), 3), np.nan)
-        for k, (first, stop) in enumerate(itertools.pairwise(place), start=1):
-            if self._felt_between(time_ns[k - 1], time_ns[k]):
+        for k, (first, stop) in enumerate(itertools.pairwise(index), start=1):
+            i, j = int(before[k - 1]), int(after[k - 1])
+            if i < 0 or j == len(self.time_ns):
+                continue
+            if int(np.diff(self.time_ns[i : j + 1]).max()) <= _MAX_GAP_NS:
                 R = functools.reduce(np.matmul, small[first:stop])
                 turns[k] = Rotation.from_matrix(R).as_rotvec()
         return turns
 
-    def _felt_between(self, first_ns: int, last_ns: int) -> bool:
-        """Whether samples span the time, and none is far from the next."""
-        first = int(np.searchsorted(self.time_ns, first_ns, side="right")) - 1
-        last = int(np.searchsorted(self.time_ns, last_ns))
-        if first < 0 or last == len(self.time_ns):
-            return False
-        return int(np.diff(self.time_ns[first : last + 1]).max()) <= _LONGEST_SILENCE_NS
 
+def _effective_sigma(values: Float) -> float:
+    """Return the standard deviation of values (N,), enlarged for their autocorrelation.
 
-def _as_if_independent(values: Float) -> float:
-    """Standard deviation of values (N,) that would average out no faster than these do."""
+    The mean of N independent values with this deviation has the same error as the mean of the
+    correlated ones. Autocorrelations are summed until they become negative (Geyer 1992, "Practical
+    Markov chain Monte Carlo").
+    """
     off = values - values.mean()
     square = float(off @ off)
     if square == 0:
         return 0.0
-    together = 1.0
+    correlation_time = 1.0
     for lag in range(1, len(off)):
         correlation = float(off[lag:] @ off[:-lag]) / square
         if correlation <= 0:
             break
-        together += 2 * correlation
-    return float(np.sqrt(square / len(off) * together))
+        correlation_time += 2 * correlation
+    return float(np.sqrt(square / len(off) * correlation_time))

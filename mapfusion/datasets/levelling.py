@@ -1,4 +1,4 @@
-"""Levelling of a recording: camera mount, floor plane, and the attitude of each frame."""
+"""Levelling of a recording: camera mount, floor plane and attitude of each frame."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -7,8 +7,8 @@ import numpy as np
 
 from mapfusion.attitude import Attitude, moved
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
-from mapfusion.datasets.formats import Level
-from mapfusion.datasets.imu import SHARED_RAD, Inertial
+from mapfusion.datasets.formats import AttitudeSource
+from mapfusion.datasets.imu import SHARED_RAD, ImuData
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, chi_square_bound
@@ -20,63 +20,62 @@ from mapfusion.vision.front_end import FrontEndParameters, Observer
 from mapfusion.vision.tracking import Features
 from mapfusion.vision.visual_odometry import RigidMotion
 
-_UP_TO_A_QUARTER = Range(-1.5, 1.5, "rad")  # a camera that looks straight up sees no walls
+_MOUNT_ANGLE = Range(-1.5, 1.5, "rad")  # a camera that looks straight up sees no walls
 
 
 @dataclass(frozen=True)
 class MountSettings:
-    """Where the left camera is on the robot; what is None is as the recording has it.
+    """Mount of the left camera on the robot; None keeps the value of the recording.
 
     Attributes:
-        x_m: ahead of the robot's middle.
-        y_m: to its left.
-        z_m: above the floor.
-        roll_rad: about the axis ahead, the right side down.
-        pitch_rad: about the axis to the left, looking down.
-        yaw_rad: about the upright axis, looking to the left.
+        x_m: position ahead of the robot's centre.
+        y_m: position to the left.
+        z_m: height above the floor.
+        roll_rad: angle about the forward axis; positive with the right side down.
+        pitch_rad: angle about the left axis; positive for a camera that looks down.
+        yaw_rad: angle about the vertical axis; positive for a camera that looks left.
     """
 
     x_m: Annotated[float, Range(-10, 10, "m")] | None = None
     y_m: Annotated[float, Range(-10, 10, "m")] | None = None
     z_m: Annotated[float, Range(-10, 100, "m")] | None = None
-    roll_rad: Annotated[float, _UP_TO_A_QUARTER] | None = None
-    pitch_rad: Annotated[float, _UP_TO_A_QUARTER] | None = None
-    yaw_rad: Annotated[float, _UP_TO_A_QUARTER] | None = None
+    roll_rad: Annotated[float, _MOUNT_ANGLE] | None = None
+    pitch_rad: Annotated[float, _MOUNT_ANGLE] | None = None
+    yaw_rad: Annotated[float, _MOUNT_ANGLE] | None = None
 
     def __post_init__(self) -> None:
         require_in_range(self)
 
     def applied(self, T_robot_left: Float) -> Float:
-        """A mount (4, 4) with what these settings replace; axes x ahead, y left, z up."""
+        """Return a mount (4, 4) with the values of these settings; axes x ahead, y left, z up."""
         from scipy.spatial.transform import Rotation
 
         angles = Rotation.from_matrix(T_robot_left[:3, :3]).as_euler("ZYX")
-        own = zip((self.yaw_rad, self.pitch_rad, self.roll_rad), angles, strict=True)
-        turned = [theirs if ours is None else ours for ours, theirs in own]
-        moved = [
-            theirs if ours is None else ours
-            for ours, theirs in zip(
-                (self.x_m, self.y_m, self.z_m), T_robot_left[:3, 3], strict=True
+        rotated, shifted = (
+            [old if new is None else new for new, old in zip(settings, recorded, strict=True)]
+            for settings, recorded in (
+                ((self.yaw_rad, self.pitch_rad, self.roll_rad), angles),
+                ((self.x_m, self.y_m, self.z_m), T_robot_left[:3, 3]),
             )
-        ]
-        if turned == angles.tolist():
-            return pose(T_robot_left[:3, :3], moved)
-        return pose(Rotation.from_euler("ZYX", turned).as_matrix(), moved)
+        )
+        if rotated == angles.tolist():
+            return pose(T_robot_left[:3, :3], shifted)
+        return pose(Rotation.from_euler("ZYX", rotated).as_matrix(), shifted)
 
 
 def level_mount(baseline_m: float, x_m: float, z_m: float) -> Float:
-    """T_robot_left (4, 4) of a pair that looks level ahead, its middle above the robot's axis."""
+    """Return T_robot_left (4, 4) of a pair that looks level ahead and is centred at y = 0."""
     return pose(np.eye(3), [x_m, baseline_m / 2, z_m])
 
 
 def robot_in_body(T_body_camera: Float) -> tuple[Float, Float]:
-    """The robot's frame where a recording has a body's, whose axes may lie in any order.
+    """Return the robot frame for a body frame whose axes may be in any order.
 
-    The body's axes are renamed so that the camera looks ahead and stands upright, as nearly as the
-    24 ways to name them allow; what remains is the mount.
+    The robot axes are the permutation of the body axes (one of 24) in which the camera looks ahead
+    and stands upright most closely. The remaining rotation is part of the mount.
 
     Args:
-        T_body_camera: (4, 4) of the left camera in optical axes.
+        T_body_camera: pose of the left camera in optical axes, shape (4, 4).
 
     Returns:
         T_body_robot (4, 4), and T_robot_left (4, 4) with x ahead, y left, z up.
@@ -84,14 +83,17 @@ def robot_in_body(T_body_camera: Float) -> tuple[Float, Float]:
     from scipy.spatial.transform import Rotation
 
     ahead = T_body_camera @ inverse(pose(R_ROBOT_OPTICAL, np.zeros(3)))
-    ways = np.rint(Rotation.create_group("O").as_matrix())
-    nearest = ways[np.argmax(np.einsum("nij,ij->n", ways, ahead[:3, :3]))]
+    permutations = np.rint(Rotation.create_group("O").as_matrix())
+    similarity = np.einsum("nij,ij->n", permutations, ahead[:3, :3])
+    nearest = permutations[np.argmax(similarity)]
     T_body_robot = pose(nearest, np.zeros(3))
     return T_body_robot, inverse(T_body_robot) @ ahead
 
 
-def levelled(observed: Observations, camera: StereoCamera, T_robot_left: Float) -> Observations:
-    """Observations of a camera that was taken for a level one, where the mount truly has them."""
+def level_observations(
+    observed: Observations, camera: StereoCamera, T_robot_left: Float
+) -> Observations:
+    """Move observations from the level mount of `camera` to the true mount."""
     R, t = T_robot_left[:3, :3], T_robot_left[:3, 3]
     if np.array_equal(R, np.eye(3)) and np.array_equal(t, camera.p_robot_left):
         return observed
@@ -99,7 +101,7 @@ def levelled(observed: Observations, camera: StereoCamera, T_robot_left: Float) 
 
 
 def upright(T_robot_left: Float, up_left: Float) -> Float:
-    """A mount whose roll and pitch are such that a direction (3,) of the left camera is up."""
+    """Correct roll and pitch of a mount so that a direction (3,) of the left camera points up."""
     from scipy.spatial.transform import Rotation
 
     up = T_robot_left[:3, :3] @ (up_left / np.linalg.norm(up_left))
@@ -111,23 +113,23 @@ def upright(T_robot_left: Float, up_left: Float) -> Float:
     return pose(turn @ T_robot_left[:3, :3], T_robot_left[:3, 3])
 
 
-_LEAST_POINTS = 12  # four times as many as a plane has parameters
-# Added to the points' own noise, in heights of the camera: from all below its middle to none.
+_MIN_POINTS = 12  # four times the number of parameters of a plane
+# Tolerances added to the noise of the points, relative to the height of the camera.
 _TOLERANCES = (0.3, 0.1, 0.03, 0.01, 0.0)
-_STEPS = 3  # of the gate and the fit at each
-_MOST_TILT = 0.35  # slope against the level, rad: what lies steeper is a wall
+_STEPS = 3  # iterations of gate and fit at each tolerance
+_MAX_SLOPE_RAD = 0.35  # steeper planes are walls
 _MEDIAN_SQUARE = chi_square_bound(0.5, 1)  # of squared distances in standard deviations
 
 
 @dataclass(frozen=True)
 class Floor:
-    """The plane z = slope_x x + slope_y y + height in the frame of the points.
+    """Plane z = slope_x x + slope_y y + height in the frame of the points.
 
     Attributes:
-        plane: (3,) slope_x, slope_y, height in metres.
-        covariance: (3, 3) of its error; as large as the residuals say, where these exceed what is
-            stated of the points.
-        n_points: that lie on it.
+        plane: slope_x, slope_y, height in metres, shape (3,).
+        covariance: error covariance, shape (3, 3); scaled by the residuals if they exceed the
+            stated noise of the points.
+        n_points: number of points on the plane.
     """
 
     plane: Float
@@ -136,7 +138,7 @@ class Floor:
 
     @property
     def attitude(self) -> tuple[Float, Float]:
-        """Roll, pitch, height (3,) of the points' frame above the floor, and its sigma (3,)."""
+        """Roll, pitch and height of the points' frame above the floor (3,), and sigma (3,)."""
         slope_x, slope_y, height_m = self.plane
         length = np.sqrt(1 + slope_x**2 + slope_y**2)
         value = [np.arctan(-slope_y), np.arcsin(slope_x / length), -height_m / length]
@@ -144,25 +146,25 @@ class Floor:
         return np.array(value), sigma[[1, 0, 2]]
 
 
-def floor_of(points: Observations, camera_height_m: float, probability: float) -> Floor | None:
-    """The floor among points (N, 3), z up from where it about is.
+def fit_floor(points: Observations, camera_height_m: float, probability: float) -> Floor | None:
+    """Fit the floor plane to points (N, 3) whose heights are above the approximate floor.
 
-    Weighted least squares of the points' heights over those inside a gate, again and again, while a
-    tolerance that is added to their noise falls from a third of the camera's height to nothing:
-    what stands on the floor drops out on the way.
+    Weighted least-squares fits of the points inside a gate are iterated. A tolerance that is added
+    to the noise decreases from a third of the camera height to zero. Points of objects on the floor
+    leave the gate during the iteration.
 
     Args:
-        points: whatever is seen, with covariances.
-        camera_height_m: above the floor; points above half of it are no floor.
-        probability: of the gate.
+        points: observed points with covariances.
+        camera_height_m: height of the camera; points above half of this height are ignored.
+        probability: probability of the gate.
 
     Returns:
-        None where fewer than a dozen points lie on one plane that is about level.
+        The floor, or None if fewer than a dozen points lie on a nearly level plane.
     """
     position, covariance = points.position_m, points.covariance_m2
     low = position[:, 2] < camera_height_m / 2
     position, covariance = position[low], covariance[low]
-    if len(position) < _LEAST_POINTS:
+    if len(position) < _MIN_POINTS:
         return None
     design = np.column_stack([position[:, :2], np.ones(len(position))])
     plane, normal, square = np.zeros(3), np.eye(3), np.zeros(len(position))
@@ -175,161 +177,160 @@ def floor_of(points: Observations, camera_height_m: float, probability: float) -
             variance = own + (tolerance * camera_height_m) ** 2
             square = (position[:, 2] - design @ plane) ** 2 / variance
             inside = square <= gate
-            if inside.sum() < _LEAST_POINTS:
+            if inside.sum() < _MIN_POINTS:
                 return None
             weighted = design[inside] / variance[inside, None]
             normal = weighted.T @ design[inside]
-            if np.linalg.matrix_rank(normal) < len(plane):  # all on one line
+            if np.linalg.matrix_rank(normal) < len(plane):  # collinear points
                 return None
             plane = np.linalg.solve(normal, weighted.T @ position[inside, 2])
-    if np.hypot(plane[0], plane[1]) > np.tan(_MOST_TILT):
+    if np.hypot(plane[0], plane[1]) > np.tan(_MAX_SLOPE_RAD):
         return None
     excess = max(float(np.median(square[inside])) / _MEDIAN_SQUARE, 1.0)
     covariance = np.array(excess * np.linalg.inv(normal), dtype=np.float64)
     return Floor(plane, covariance, int(inside.sum()))
 
 
-# Standard deviations of a first frame's roll, pitch (rad) and height (m): a car on its springs
-# stands within half a degree of the road, and its height is the map's.
+# Standard deviations of roll, pitch (rad) and height (m) of the first frame: the suspension of a
+# car tilts it by less than half a degree, and the height defines the height of the map.
 _FIRST_SIGMA = np.array([0.01, 0.01, 0.0])
-# Of an attitude that a trajectory tells, of which nobody says how good it is: an inclinometer's.
-_TOLD_SIGMA_RAD, _TOLD_SIGMA_M = 0.0052, 0.02
-_LEVEL_RAD = 1e-6  # a trajectory that tilts by less is one in the plane
-_ON_THE_FLOOR = 0.99  # share of the floor's own points that its gate keeps
-# Of a floor against the level, in all frames alike: roads fall off to their sides by 2 %, so that
-# rain runs off.
-_ROAD_RAD = 0.02
+# Standard deviations of an attitude from a trajectory without stated noise, as of an inclinometer.
+_TRAJECTORY_SIGMA_RAD, _TRAJECTORY_SIGMA_M = 0.0052, 0.02
+_PLANAR_RAD = 1e-6  # largest tilt of a planar trajectory
+_FLOOR_PROBABILITY = 0.99  # that a point of the floor lies inside the gate
+_ROAD_RAD = 0.02  # slope of the floor that all frames share: roads have a cross slope of 2 %
 
 
-def known_from(wanted: Level, odometry: Float | None, inertial: Inertial | None = None) -> Level:
-    """What `auto` stands for, by what was recorded of dead reckoning (T, 4, 4) and acceleration."""
+def choose_attitude_source(
+    wanted: AttitudeSource, odometry: Float | None, inertial: ImuData | None = None
+) -> AttitudeSource:
+    """Resolve `auto` by the recorded data: dead-reckoned poses (T, 4, 4) and IMU measurements."""
     if wanted != "auto":
         return wanted
     if odometry is None:
         return "pictures" if inertial is None else "imu"
-    tilts = np.abs(roll_pitch(odometry[:, :3, :3])).max() > _LEVEL_RAD
+    tilts = np.abs(roll_pitch(odometry[:, :3, :3])).max() > _PLANAR_RAD
     return "odometry" if tilts else "mount"
 
 
-class Levels:
-    """What is measured of the attitude in each frame of a log.
+class AttitudeMeasurements:
+    """Measurements of the attitude in each frame of a log.
 
     Args:
-        known: where from; not `auto`.
-        camera: the rectified pair, which was taken for level.
-        T_robot_left: (4, 4) its mount.
-        odometry: (T, 4, 4) dead reckoning at the frames, or None.
-        tilts: (T, 2) roll and pitch by the accelerometer, NaN where it tells none, and (2,) their
-            deviations; or None.
-        counted: (T, 3) turns since the frame before by gyroscopes, NaN where they tell none, and
-            (T,) the seconds since; or None.
+        source: source of the measurements; not `auto`.
+        camera: the rectified pair with a level mount.
+        T_robot_left: true mount, shape (4, 4).
+        odometry: dead-reckoned poses of the frames, shape (T, 4, 4), or None.
+        tilts: roll and pitch from the accelerometer, shape (T, 2), NaN where unknown, and their two
+            standard deviations; or None.
+        rotations: rotation vectors since the frame before from gyroscopes, shape (T, 3), NaN where
+            unknown, and the durations in s, shape (T,); or None.
 
     Attributes:
-        camera, T_robot_left: as given.
+        camera: as given.
+        T_robot_left: as given.
     """
 
     def __init__(
         self,
-        known: Level,
+        source: AttitudeSource,
         camera: StereoCamera,
         T_robot_left: Float,
         odometry: Float | None,
         tilts: tuple[Float, Float] | None = None,
-        counted: tuple[Float, Float] | None = None,
+        rotations: tuple[Float, Float] | None = None,
     ) -> None:
         self.camera, self.T_robot_left = camera, T_robot_left
-        self._counted = counted
-        self._known: Level = known
-        self._odometry, self._tilts = odometry, tilts
+        self._source: AttitudeSource = source
+        self._odometry, self._tilts, self._rotations = odometry, tilts, rotations
 
     @property
     def measures(self) -> bool:
-        """Whether the attitude is followed frame by frame; else the body is level."""
-        return self._known != "mount"
+        """True if the attitude is estimated in each frame; False for a level body."""
+        return self._source != "mount"
 
     @property
     def shared_rad(self) -> float:
-        """Standard deviation of what all measured tilts err by alike."""
-        return {"imu": SHARED_RAD, "floor": _ROAD_RAD}.get(self._known, 0.0)
+        """Standard deviation of the tilt error that all frames share."""
+        return {"imu": SHARED_RAD, "floor": _ROAD_RAD}.get(self._source, 0.0)
 
-    def counted(self, k: int) -> tuple[Float, float] | None:
-        """The turn (3,) since frame k - 1 by gyroscopes, and the seconds since; None: unknown."""
-        if self._counted is None or np.isnan(self._counted[0][k]).any():
+    def rotation(self, k: int) -> tuple[Float, float] | None:
+        """Return the gyroscopes' rotation (3,) since frame k - 1 and its duration in s, or None."""
+        if self._rotations is None or np.isnan(self._rotations[0][k]).any():
             return None
-        return self._counted[0][k], float(self._counted[1][k])
+        return self._rotations[0][k], float(self._rotations[1][k])
 
     def measured(self, k: int, found: Features, sigma_uv_px: float) -> AttitudeMeasurement:
-        """Of frame k, in which these features were found."""
-        if self._known == "odometry":
+        """Return the measured attitude of frame k; its features are used to find the floor."""
+        if self._source == "odometry":
             assert self._odometry is not None
             T = self._odometry[k]
-            told = [*roll_pitch(T[:3, :3]), T[2, 3] - self._odometry[0, 2, 3]]
-            return AttitudeMeasurement(
-                np.array(told), np.array([_TOLD_SIGMA_RAD] * 2 + [_TOLD_SIGMA_M])
-            )
-        if self._known == "imu":
+            value = [*roll_pitch(T[:3, :3]), T[2, 3] - self._odometry[0, 2, 3]]
+            sigma = [_TRAJECTORY_SIGMA_RAD] * 2 + [_TRAJECTORY_SIGMA_M]
+            return AttitudeMeasurement(np.array(value), np.array(sigma))
+        if self._source == "imu":
             assert self._tilts is not None
-            value, sigma = self._tilts
-            height = np.nan if k else 0.0  # the map's, and carried on
-            return AttitudeMeasurement(np.array([*value[k], height]), np.array([*sigma, 0.0]))
-        seen = self._floor(found, sigma_uv_px) if self._known == "floor" else None
-        if seen is not None:
-            return seen
-        # what the first frame takes for level is, but for how the body stands, the map's plane
+            tilt, sigma_tilt = self._tilts
+            height = np.nan if k else 0.0  # defined by the first frame, then estimated
+            return AttitudeMeasurement(np.array([*tilt[k], height]), np.array([*sigma_tilt, 0.0]))
+        if self._source == "floor":
+            noise = (sigma_uv_px, found.sigma_disparity_px)
+            points = Observations(*self.camera.triangulate(found.uv_px, found.disparity_px, *noise))
+            points = level_observations(points, self.camera, self.T_robot_left)
+            floor = fit_floor(points, float(self.T_robot_left[2, 3]), _FLOOR_PROBABILITY)
+            if floor is not None:
+                return AttitudeMeasurement(*floor.attitude)
+        # The first frame defines the plane of the map, up to the tilt of the body.
         return AttitudeMeasurement(np.full(3, np.nan if k else 0.0), _FIRST_SIGMA)
 
-    def _floor(self, found: Features, sigma_uv_px: float) -> AttitudeMeasurement | None:
-        noise = (sigma_uv_px, found.sigma_disparity_px)
-        points = Observations(*self.camera.triangulate(found.uv_px, found.disparity_px, *noise))
-        points = levelled(points, self.camera, self.T_robot_left)
-        floor = floor_of(points, float(self.T_robot_left[2, 3]), _ON_THE_FLOOR)
-        return None if floor is None else AttitudeMeasurement(*floor.attitude)
 
-
-class LevelFrames:
-    """What became of the frames so far.
+class LevelledFrames:
+    """Levelled observations of the frames of a log.
 
     Args:
         vision: settings of the front end.
-        levels: how the camera is mounted, and what is measured of its robot's attitude.
+        measurements: camera mount and measurements of the robot's attitude.
 
     Attributes:
-        observed: each frame's observations in the level frame.
-        motions: of the camera that was taken for level, since the frame before.
-        linked: share of the features of the frame before that were found again; NaN at first.
+        observed: observations of each frame in the level frame.
+        motions: motions of the level camera since the frame before.
+        linked: share of the features of the frame before that were found again; NaN for the first
+            frame.
     """
 
-    def __init__(self, vision: FrontEndParameters, levels: Levels) -> None:
+    def __init__(self, vision: FrontEndParameters, measurements: AttitudeMeasurements) -> None:
         self.observed: list[Observations] = []
         self.motions: list[RigidMotion | None] = []
         self.linked: list[float] = []
-        self._levels, self._sigma_uv_px = levels, vision.sigma_uv_px
-        camera = levels.camera
-        taken = se3.pose(camera.camera_axes, camera.p_robot_left)
+        self._measurements, self._sigma_uv_px = measurements, vision.sigma_uv_px
+        camera = measurements.camera
+        T_robot_level = se3.pose(camera.camera_axes, camera.p_robot_left)
         self._levelling = AttitudeEstimator(
-            levels.T_robot_left @ se3.inverse(taken), levels.shared_rad
+            measurements.T_robot_left @ se3.inverse(T_robot_level), measurements.shared_rad
         )
         self._observer = Observer.of(camera, vision)
         self._before = 0
 
     @property
     def attitude(self) -> Attitude | None:
-        """By which they were levelled; None for a body that is level."""
-        return self._levelling.attitude if self._levels.measures else None
+        """Estimated attitude of the frames; None for a level body."""
+        return self._levelling.attitude if self._measurements.measures else None
 
     def add(self, found: Features, steps: float) -> None:
-        """The next frame; `steps` are usual steps of time since the one before."""
-        levels = self._levels
-        if levels.measures:
+        """Add a frame; `steps` is the time since the frame before in usual time steps."""
+        measurements = self._measurements
+        if measurements.measures:
             k = len(self.observed)
-            measured = levels.measured(k, found, self._sigma_uv_px)
-            turn = self._levelling.expected_turn(measured)
+            attitude = measurements.measured(k, found, self._sigma_uv_px)
+            turn = self._levelling.expected_turn(attitude)
             frame = self._observer.observe(found, steps, turn)
-            self._levelling.add(frame.tracks.motion, measured, levels.counted(k))
-            own = self._levelling.to_level_frame(frame.observations)
+            self._levelling.add(frame.tracks.motion, attitude, measurements.rotation(k))
+            own = self._levelling.applied(frame.observations)
         else:
             frame = self._observer.observe(found, steps)
-            own = levelled(frame.observations, levels.camera, levels.T_robot_left)
+            own = level_observations(
+                frame.observations, measurements.camera, measurements.T_robot_left
+            )
         again = float(np.sum(frame.tracks.length > 1)) / max(self._before, 1)
         self.linked.append(again if self.observed else np.nan)
         self._before = len(found)

@@ -1,10 +1,10 @@
 """Stereo recordings in ROS 1 and ROS 2 bags.
 
-Two topics of pictures (Image or CompressedImage) with a CameraInfo each, in the namespace of the
-pictures as usual; optionally odometry (Odometry), an IMU (Imu) and true poses (Odometry,
-PoseStamped and others). The static transforms of `/tf_static` tell how the left camera is mounted,
-where they connect its frame to the robot's; measured gravity takes the place of their roll and
-pitch.
+A bag holds two topics of pictures (Image or CompressedImage) with a CameraInfo each, by default in
+the namespace of the pictures. Odometry (Odometry), an IMU (Imu) and true poses (Odometry,
+PoseStamped and others) are optional. The mount of the left camera is read from the static
+transforms of `/tf_static` if they connect the frames of camera and robot. Measured gravity replaces
+the roll and pitch of these transforms.
 """
 
 from collections.abc import Iterator
@@ -21,9 +21,9 @@ from mapfusion.datasets.camera_calibration import (
     Lens,
     StereoCalibration,
 )
-from mapfusion.datasets.imu import Inertial
+from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.levelling import MountSettings, level_mount, upright
-from mapfusion.datasets.stereo_recording import ReadYaml, Shot, StereoRecording, paired
+from mapfusion.datasets.stereo_recording import ReadYaml, Shot, StereoRecording, pair_shots
 from mapfusion.datasets.text_files import NS
 from mapfusion.datasets.tum import TimedPoses
 from mapfusion.errors import InputError, did_you_mean, one_line
@@ -34,11 +34,14 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 
-_MOST_TOPICS = 12  # of a bag, named in a message
+_SHOWN_TOPICS = 12  # of a bag, in a message
+_IMAGE_TYPES = ("Image", "CompressedImage")
+_POSE_TYPES = ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
+_HEIGHT_M = 0.5  # of a camera without a stated mount; an error shifts all heights equally
 
 
 class Bag:
-    """An open bag. Whatever is wrong with its bytes is an InputError that names it."""
+    """Open bag; damaged contents raise an InputError that names the bag."""
 
     def __init__(self, path: Path) -> None:
         from rosbags.highlevel import AnyReader
@@ -48,10 +51,10 @@ class Bag:
             raise InputError(f"{path}: no such file or folder (a ROS bag)")
         self.path = path
         try:
-            # bags of ROS 2 that carry no definitions have those that have been there since Humble
+            # For bags of ROS 2 without definitions of the message types.
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
-        except Exception as error:  # the readers of several formats leave by any door
+        except Exception as error:  # readers of several formats raise exceptions of many types
             raise self._damaged(error) from error
 
     def _damaged(self, error: Exception) -> InputError:
@@ -64,14 +67,15 @@ class Bag:
         return {each.topic: each.msgtype for each in self._reader.connections}
 
     def require(self, option: str, topic: str, *types: str) -> str:
-        """The type of a topic.
+        """Return the message type of a topic.
 
         Raises:
-            InputError: there is no such topic, or its type is none of these; names the option.
+            InputError: the topic does not exist, or its type is none of `types`; the message names
+                the option.
         """
         known = self.topics
         if topic not in known:
-            named = ", ".join(sorted(known)[:_MOST_TOPICS]) or "none"
+            named = ", ".join(sorted(known)[:_SHOWN_TOPICS]) or "none"
             meant = did_you_mean(topic, known)
             raise InputError(f"{self.path}: {option} {topic}: no such topic{meant}; there: {named}")
         if known[topic].rsplit("/", 1)[-1] not in types:
@@ -81,7 +85,7 @@ class Bag:
         return known[topic]
 
     def messages(self, topic: str, at_ns: int | None = None) -> Iterator[tuple[int, Any]]:
-        """When each message of a topic was recorded (ns), and the message; only those of a time."""
+        """Yield recording time (ns) and message of a topic, only those of time `at_ns` if given."""
         own: list[Connection] = [each for each in self._reader.connections if each.topic == topic]
         stop = None if at_ns is None else at_ns + 1
         try:
@@ -93,19 +97,19 @@ class Bag:
             raise self._damaged(error) from error
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic; raises InputError where there is none."""
+        """Return the first message of a topic; raise InputError if there is none."""
         for _, message in self.messages(topic):
             return message
         raise InputError(f"{self.path}: topic {topic} holds no message")
 
 
 def stamp_ns(message: Any) -> int:
-    """When a message says that it was measured."""
+    """Return the time stamp of a message in ns."""
     stamp = message.header.stamp
     return int(stamp.sec) * NS + int(stamp.nanosec)
 
 
-# Encoding: type of a channel, channels, and how OpenCV makes grey of it.
+# Encoding: type of a channel, number of channels, OpenCV conversion to grey.
 _ENCODINGS: dict[str, tuple[type, int, int | None]] = {
     "mono8": (np.uint8, 1, None),
     "8UC1": (np.uint8, 1, None),
@@ -132,11 +136,11 @@ _DISTORTIONS: dict[str, Distortion] = {
 }
 
 
-def picture(message: Any) -> np.ndarray:
-    """Grey levels (H, W), uint8 or uint16, of an Image or a CompressedImage.
+def decode_image(message: Any) -> np.ndarray:
+    """Return the grey levels of an Image or a CompressedImage, shape (H, W), uint8 or uint16.
 
     Raises:
-        InputError: an encoding that is not read, or too few bytes.
+        InputError: the encoding is not supported, or bytes are missing.
     """
     if not hasattr(message, "encoding"):
         image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_ANYDEPTH)
@@ -159,29 +163,29 @@ def picture(message: Any) -> np.ndarray:
     return levels if conversion is None else cv2.cvtColor(levels, conversion)
 
 
-def calibration(left: Any, right: Any, rectified: bool) -> StereoCalibration:
-    """The pair that two CameraInfo messages tell, of raw pictures or of rectified ones.
+def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibration:
+    """Return the calibration of two CameraInfo messages, for raw or for rectified pictures.
 
     Raises:
-        InputError: no stereo pair, or a lens that is not read.
+        InputError: the messages describe no stereo pair, or a lens model is not supported.
     """
     P_right = _matrix(right, "P", (3, 4))
     if not P_right[0, 0] > 0:
         raise InputError("camera_info: the right camera's P holds no focal length")
     baseline_m = -P_right[0, 3] / P_right[0, 0]
     if not baseline_m > 0:
-        told = "the right camera's P holds no baseline"
-        raise InputError(f"camera_info: {told}; are the cameras a pair, and not exchanged?")
+        found = "the right camera's P holds no baseline"
+        raise InputError(f"camera_info: {found}; are the cameras a pair, and not exchanged?")
     apart = se3.pose(np.eye(3), [baseline_m, 0.0, 0.0])
     if rectified:
-        return StereoCalibration(_rectified(left), _rectified(right), apart)
+        return StereoCalibration(_rectified_lens(left), _rectified_lens(right), apart)
     turned = [se3.pose(_matrix(info, "R", (3, 3)), np.zeros(3)) for info in (left, right)]
     T_left_right = se3.inverse(turned[0]) @ apart @ turned[1]
-    return StereoCalibration(_raw(left), _raw(right), T_left_right)
+    return StereoCalibration(_raw_lens(left), _raw_lens(right), T_left_right)
 
 
-def pose(message: Any) -> Float:
-    """A pose (4, 4) of an Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped."""
+def pose_of_message(message: Any) -> Float:
+    """Return the pose (4, 4) of a message of one of the types `_POSE_TYPES`."""
     if hasattr(message, "transform"):
         t, q = message.transform.translation, message.transform.rotation
     else:
@@ -193,84 +197,79 @@ def pose(message: Any) -> Float:
     return se3.from_quaternions([t.x, t.y, t.z], xyzw)
 
 
-def chained(transforms: list[Any], target: str, source: str) -> Float | None:
-    """T_target_source (4, 4) through a tree of TransformStamped; None where it leads nowhere."""
-    parent = {_frame(t.child_frame_id): (_frame(t.header.frame_id), pose(t)) for t in transforms}
-    up, lines = [_line(parent, _frame(name)) for name in (target, source)], None
-    for frame, T_frame_source in up[1].items():
-        if frame in up[0]:
-            lines = se3.inverse(up[0][frame]) @ T_frame_source
-            break
-    return lines
-
-
-def _line(parent: dict[str, tuple[str, Float]], frame: str) -> dict[str, Float]:
-    """Of each frame above one, nearest first, T_above_frame."""
-    found, T = {frame: np.eye(4)}, np.eye(4)
-    while frame in parent and parent[frame][0] not in found:
-        frame, T_above = parent[frame]
-        T = T_above @ T
-        found[frame] = T
-    return found
+def lookup_transform(transforms: list[Any], target: str, source: str) -> Float | None:
+    """Return T_target_source (4, 4) from a tree of TransformStamped; None if unconnected."""
+    parent = {
+        _frame(t.child_frame_id): (_frame(t.header.frame_id), pose_of_message(t))
+        for t in transforms
+    }
+    # T_ancestor_frame of all ancestors of target and source, the nearest ancestor first.
+    ancestors = []
+    for name in (target, source):
+        frame, T = _frame(name), np.eye(4)
+        found = {frame: T}
+        while frame in parent and parent[frame][0] not in found:
+            frame, T_parent_frame = parent[frame]
+            T = T_parent_frame @ T
+            found[frame] = T
+        ancestors.append(found)
+    for frame, T_frame_source in ancestors[1].items():
+        if frame in ancestors[0]:
+            return se3.inverse(ancestors[0][frame]) @ T_frame_source
+    return None
 
 
 def _frame(name: str) -> str:
+    """Return the name of a frame without the slash of ROS 1."""
     return name.removeprefix("/")
 
 
-def _matrix(info: Any, name: str, shape: tuple[int, int]) -> Float:
-    """K, D, R and P, which ROS 2 writes small."""
-    return _numbers(info, name).reshape(shape)
-
-
-def _numbers(info: Any, name: str) -> Float:
+def _matrix(info: Any, name: str, shape: tuple[int, ...]) -> Float:
+    """Return K, D, R or P of a CameraInfo; ROS 2 writes these names in lower case."""
     values = getattr(info, name, None)
-    return np.asarray(getattr(info, name.lower()) if values is None else values, np.float64)
+    values = getattr(info, name.lower()) if values is None else values
+    return np.asarray(values, np.float64).reshape(shape)
 
 
-def _size(info: Any) -> tuple[int, int]:
-    return int(info.width), int(info.height)
-
-
-def _rectified(info: Any) -> Lens:
+def _rectified_lens(info: Any) -> Lens:
+    """Return the camera of rectified pictures."""
     P = _matrix(info, "P", (3, 4))
-    return Lens(_size(info), (P[0, 0], P[1, 1]), (P[0, 2], P[1, 2]))
+    size = (int(info.width), int(info.height))
+    return Lens(size, (P[0, 0], P[1, 1]), (P[0, 2], P[1, 2]))
 
 
-def _raw(info: Any) -> Lens:
+def _raw_lens(info: Any) -> Lens:
+    """Return the camera of raw pictures."""
     K, model = _matrix(info, "K", (3, 3)), str(info.distortion_model)
     if model not in _DISTORTIONS:
         known = ", ".join(name for name in _DISTORTIONS if name)
         raise InputError(f"camera_info: distortion_model {model!r} is unknown; known: {known}")
-    coefficients = _numbers(info, "D")
+    coefficients = _matrix(info, "D", (-1,))
     if model == "rational_polynomial" and not coefficients[5:].any():
         coefficients = coefficients[:5]
     distortion = _DISTORTIONS[model] if coefficients.any() else "none"
     own = tuple(coefficients.tolist()) if distortion != "none" else ()
-    return Lens(_size(info), (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own)
-
-
-_PICTURES = ("Image", "CompressedImage")
-_POSES = ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")
-_HEIGHT_M = 0.5  # of a camera whose mount nobody tells; it moves all heights alike
+    size = (int(info.width), int(info.height))
+    return Lens(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own)
 
 
 @dataclass(frozen=True)
 class RosbagSettings:
-    """Which topics of a bag are what.
+    """Topics of a bag.
 
     Attributes:
         left: pictures of the left camera.
-        right: of the right one.
-        odom: dead reckoning of the robot; none: the pictures tell.
-        imu: accelerations, whose mean over the recording is up, and which level each frame; none:
-            the mount is as transforms tell.
-        truth: true poses of the robot; none: unknown.
+        right: pictures of the right camera.
+        odom: dead reckoning of the robot; if empty, visual odometry is used.
+        imu: accelerations, which level each frame and whose mean over the recording points up; if
+            empty, the mount of the static transforms is used.
+        truth: true poses of the robot; if empty, they are unknown.
         left_info: calibration of the left camera; by default `camera_info` beside its pictures.
-        right_info: of the right one.
-        rectified: whether the pictures are; by default when their topics' names hold `rect`.
-        base: the robot's frame, x ahead and z up, in `/tf_static`.
-        mount: what replaces the mount that is recorded.
+        right_info: calibration of the right camera.
+        rectified: True if the pictures are rectified; by default if the names of both topics
+            contain `rect`.
+        base: robot frame (x ahead, z up) in `/tf_static`.
+        mount: replaces the recorded mount.
     """
 
     left: str = "/left/image_raw"
@@ -286,8 +285,8 @@ class RosbagSettings:
 
 
 @dataclass(frozen=True)
-class _Message:
-    """A picture in a bag; calling it reads it."""
+class _BagPicture:
+    """Picture in a bag, which is read when it is called."""
 
     bag: Bag
     topic: str
@@ -298,7 +297,7 @@ class _Message:
         for _, message in self.bag.messages(self.topic, self.recorded_ns):
             if stamp_ns(message) == self.stamp_ns:
                 try:
-                    return picture(message)
+                    return decode_image(message)
                 except InputError as error:
                     raise InputError(
                         f"{self.bag.path}: {self.topic} at {self.stamp_ns} ns: {error}"
@@ -310,27 +309,39 @@ def read_rosbag(path: Path, settings: RosbagSettings, _: ReadYaml) -> StereoReco
     """Read a bag; pictures are loaded later.
 
     Raises:
-        InputError: the bag is damaged, or lacks a topic; names bag and topic.
+        InputError: the bag is damaged or lacks a topic; the message names bag and topic.
     """
     bag = Bag(path)
     topics = (settings.left, settings.right)
     for option, topic in zip(("--left", "--right"), topics, strict=True):
-        bag.require(option, topic, *_PICTURES)
+        bag.require(option, topic, *_IMAGE_TYPES)
     for option, topic in (("--odom", settings.odom), ("truth", settings.truth)):
         if topic:
-            bag.require(option, topic, *_POSES)
+            bag.require(option, topic, *_POSE_TYPES)
     if settings.imu:
         bag.require("--imu", settings.imu, "Imu")
-    pair = _calibration(bag, settings)
-    left, right = (_shots(bag, topic) for topic in topics)
+
+    # Calibration of the pair.
+    info_topics = (settings.left_info, settings.right_info)
+    infos = []
+    for option, topic, own in zip(("left_info", "right_info"), topics, info_topics, strict=True):
+        info_topic = own or f"{topic.rsplit('/', 1)[0]}/camera_info"
+        bag.require(option, info_topic, "CameraInfo")
+        infos.append(bag.first(info_topic))
+    rectified = settings.rectified
+    if rectified is None:
+        rectified = all("rect" in topic for topic in topics)
     try:
-        time_ns, pictures, dropped = paired(left, right)
-    except InputError as error:
+        pair = stereo_calibration(infos[0], infos[1], rectified)
+    except (InputError, ValueError) as error:
         raise InputError(f"{path}: {error}") from error
-    T_robot_left, felt = _mount(bag, settings, pair)
+
+    left, right = (_read_pictures(bag, topic) for topic in topics)
+    time_ns, pictures, dropped = pair_shots(path, left, right)
+    T_robot_left, inertial = _read_mount(bag, settings, pair)
     T_robot_left = settings.mount.applied(T_robot_left)
     odometry, truth = (
-        _poses(bag, topic) if topic else None for topic in (settings.odom, settings.truth)
+        _read_poses(bag, topic) if topic else None for topic in (settings.odom, settings.truth)
     )
     return StereoRecording(
         path.resolve().stem,
@@ -341,47 +352,32 @@ def read_rosbag(path: Path, settings: RosbagSettings, _: ReadYaml) -> StereoReco
         truth,
         odometry,
         dropped,
-        felt,
+        inertial,
         f"{path}: camera_info of {settings.left} and {settings.right}",
     )
 
 
-def _calibration(bag: Bag, settings: RosbagSettings) -> StereoCalibration:
-    pictures = (settings.left, settings.right)
-    given = (settings.left_info, settings.right_info)
-    infos = []
-    for option, topic, own in zip(("left_info", "right_info"), pictures, given, strict=True):
-        beside = own or f"{topic.rsplit('/', 1)[0]}/camera_info"
-        bag.require(option, beside, "CameraInfo")
-        infos.append(bag.first(beside))
-    rectified = settings.rectified
-    if rectified is None:
-        rectified = all("rect" in topic for topic in pictures)
-    try:
-        return calibration(infos[0], infos[1], rectified)
-    except (InputError, ValueError) as error:
-        raise InputError(f"{bag.path}: {error}") from error
-
-
-def _shots(bag: Bag, topic: str) -> list[Shot]:
+def _read_pictures(bag: Bag, topic: str) -> list[Shot]:
+    """Return the pictures of a topic; their times must increase."""
     shots, last_ns = list[Shot](), None
     for recorded_ns, message in bag.messages(topic):
         own_ns = stamp_ns(message)
         if last_ns is not None and own_ns <= last_ns:
             back = f"{(last_ns - own_ns) / 1e9:g} s"
-            told = f"the picture recorded at {recorded_ns} ns runs back by {back}"
-            raise InputError(f"{bag.path}: {topic}: {told}; times must increase")
+            found = f"the picture recorded at {recorded_ns} ns runs back by {back}"
+            raise InputError(f"{bag.path}: {topic}: {found}; times must increase")
         last_ns = own_ns
-        load = _Message(bag, topic, recorded_ns, own_ns)
+        load = _BagPicture(bag, topic, recorded_ns, own_ns)
         shots.append(Shot(own_ns, f"{topic} at {own_ns} ns", load))
     if not shots:
         raise InputError(f"{bag.path}: topic {topic} holds no message")
     return shots
 
 
-def _poses(bag: Bag, topic: str) -> TimedPoses:
+def _read_poses(bag: Bag, topic: str) -> TimedPoses:
+    """Return the poses of a topic in the order of time."""
     try:
-        found = {stamp_ns(message): pose(message) for _, message in bag.messages(topic)}
+        found = {stamp_ns(message): pose_of_message(message) for _, message in bag.messages(topic)}
     except InputError as error:
         raise InputError(f"{bag.path}: {topic}: {error}") from error
     if not found:
@@ -393,16 +389,16 @@ def _poses(bag: Bag, topic: str) -> TimedPoses:
         raise InputError(f"{bag.path}: {topic}: {error}") from error
 
 
-def _mount(
+def _read_mount(
     bag: Bag, settings: RosbagSettings, pair: StereoCalibration
-) -> tuple[Float, Inertial | None]:
-    """T_robot_left (4, 4), x ahead, y left, z up, and what `imu` felt in the robot's axes."""
+) -> tuple[Float, ImuData | None]:
+    """Return T_robot_left (4, 4), x ahead, y left, z up, and the IMU data in the robot's axes."""
     transforms: list[Any] = []
     if "/tf_static" in bag.topics:
         transforms = [t for _, m in bag.messages("/tf_static") for t in m.transforms]
     camera = bag.first(settings.left).header.frame_id
     optical = se3.pose(R_ROBOT_OPTICAL, np.zeros(3))
-    T_base_left = chained(transforms, settings.base, camera)
+    T_base_left = lookup_transform(transforms, settings.base, camera)
     baseline_m = float(np.linalg.norm(pair.T_left_right[:3, 3]))
     T_robot_left = (
         level_mount(baseline_m, 0.0, _HEIGHT_M)
@@ -412,14 +408,14 @@ def _mount(
     if not settings.imu:
         return T_robot_left, None
     imu = bag.first(settings.imu).header.frame_id
-    T_left_imu = chained(transforms, camera, imu)
+    T_left_imu = lookup_transform(transforms, camera, imu)
     if T_left_imu is None:
         lost = f"/tf_static leads from {imu!r} to no camera {camera!r}"
         raise InputError(f"{bag.path}: --imu {settings.imu}: {lost}")
     T_camera_imu = (optical @ T_left_imu)[:3, :3]
-    felt = {stamp_ns(m): m for _, m in bag.messages(settings.imu)}
-    time_ns = np.array(sorted(felt), dtype=np.int64)
-    messages = [felt[t] for t in time_ns.tolist()]
+    measured = {stamp_ns(m): m for _, m in bag.messages(settings.imu)}
+    time_ns = np.array(sorted(measured), dtype=np.int64)
+    messages = [measured[t] for t in time_ns.tolist()]
     forces, rates = (
         np.array([[each.x, each.y, each.z] for each in own]).reshape(-1, 3) @ T_camera_imu.T
         for own in (
@@ -427,12 +423,12 @@ def _mount(
             [m.angular_velocity for m in messages],
         )
     )
-    # a covariance that begins with -1 says that nothing was measured (sensor_msgs/Imu)
-    counts = all(m.angular_velocity_covariance[0] != -1 for m in messages)
+    # A covariance that begins with -1 marks missing angular velocities (sensor_msgs/Imu).
+    has_rates = all(m.angular_velocity_covariance[0] != -1 for m in messages)
     try:
-        Inertial(time_ns, forces)  # is there gravity at all?
+        ImuData(time_ns, forces)  # checks that gravity is present
         T_robot_left = upright(T_robot_left, forces.mean(axis=0))
         turn = T_robot_left[:3, :3].T
-        return T_robot_left, Inertial(time_ns, forces @ turn, rates @ turn if counts else None)
+        return T_robot_left, ImuData(time_ns, forces @ turn, rates @ turn if has_rates else None)
     except InputError as error:
         raise InputError(f"{bag.path}: --imu {settings.imu}: {error}") from error

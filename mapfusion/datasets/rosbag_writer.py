@@ -1,4 +1,4 @@
-"""A drive as a bag of ROS 1, or of ROS 2.
+"""Exporter of stereo drives as bags of ROS 1 and ROS 2.
 
 Topics: `/left/image_rect`, `/right/image_rect` (Image, mono8), `/left/camera_info`,
 `/right/camera_info`, `/odom` (Odometry in the frame `odom`), `/truth` (PoseStamped in the frame
@@ -21,7 +21,7 @@ from mapfusion.geometry.numerics import Float
 
 _SIDES = ("left", "right")
 _BASE = "base_link"
-_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"  # tf2_msgs/TFMessage, whole
+_TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"  # definition of tf2_msgs/TFMessage
 _TYPES = {
     "image_rect": "sensor_msgs/msg/Image",
     "camera_info": "sensor_msgs/msg/CameraInfo",
@@ -29,20 +29,20 @@ _TYPES = {
     "truth": "geometry_msgs/msg/PoseStamped",
     "tf_static": "tf2_msgs/msg/TFMessage",
 }
-_METADATA = "metadata.yaml"  # what makes a folder a bag of ROS 2
-_BAG_VERSION = 8  # of its layout, which ROS 2 Humble and later read
-_QUEUE = 10  # messages that a subscriber may be late by, ROS 2's default
-_FIRST_NS = NS  # added to times: a time of 0 is none in ROS
+_METADATA = "metadata.yaml"  # file that identifies a folder as a bag of ROS 2
+_BAG_VERSION = 8  # of the layout, supported by ROS 2 Humble and later
+_QUEUE = 10  # length of the queue of a subscriber, the default of ROS 2
+_FIRST_NS = NS  # added to all times, because 0 means no time in ROS
 
 
 def write_rosbag(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Path]:
-    """Write a drive to `folder/ROBOT.bag`; returns that."""
+    """Write a drive to the bag `folder/ROBOT.bag` and return its path."""
     path = folder / f"{drive.robot}.bag"
 
     def fill(temporary: Path) -> None:
         from rosbags.rosbag1 import Writer
 
-        temporary.unlink()  # the writer wants to make it
+        temporary.unlink()  # the writer creates the file
         with Writer(temporary) as bag:
             _Messages(drive, _Ros1()).put_all(bag, on_frame)
 
@@ -51,10 +51,10 @@ def write_rosbag(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pa
 
 
 def write_rosbag2(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Path]:
-    """Write a drive to the folder `folder/ROBOT.ros2`; returns that.
+    """Write a drive to the bag `folder/ROBOT.ros2` and return its path.
 
     Raises:
-        InputError: there is such a folder, and it is no bag.
+        InputError: a folder of this name exists and is no bag.
     """
     from rosbags.rosbag2 import Writer
 
@@ -62,7 +62,7 @@ def write_rosbag2(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[P
     if path.exists() and not (path / _METADATA).is_file():
         raise InputError(f"{path}: is there, and no bag of ROS 2; it is left as it is")
     folder.mkdir(parents=True, exist_ok=True)
-    # files within a bag are named by its folder, so that stands in a temporary one until it is full
+    # Files of a bag are named after its folder: write a folder of this name in a temporary one.
     around = Path(tempfile.mkdtemp(PART, temporary_prefix(path.name), folder))
     try:
         with Writer(around / path.name, version=_BAG_VERSION) as bag:
@@ -75,9 +75,9 @@ def write_rosbag2(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[P
 
 
 class _Ros1:
-    """How ROS 1 has messages."""
+    """Serialisation of ROS 1."""
 
-    header_begins = (0,)  # number of the message, which none needs
+    header_begins = (0,)  # sequence number of the message, which is not used
 
     def __init__(self) -> None:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -87,13 +87,13 @@ class _Ros1:
         self.serialized = self.store.serialize_ros1
 
     def connection(self, bag: Any, topic: str, kind: str, keeps: bool) -> Any:
-        """A topic in an open bag; one that keeps its message hands it to whoever comes later."""
+        """Add a topic to an open bag; `keeps` sends the last message to late subscribers."""
         latching = 1 if keeps else None
         return bag.add_connection(topic, kind, typestore=self.store, latching=latching)
 
 
 class _Ros2:
-    """How ROS 2 has messages."""
+    """Serialisation of ROS 2."""
 
     header_begins = ()
 
@@ -106,7 +106,7 @@ class _Ros2:
         self.serialized = self.store.serialize_cdr
 
     def connection(self, bag: Any, topic: str, kind: str, keeps: bool) -> Any:
-        """As of ROS 1."""
+        """Add a topic to an open bag; see `_Ros1.connection`."""
         from rosbags.interfaces import (
             Qos,
             QosDurability,
@@ -126,13 +126,13 @@ class _Ros2:
 
 
 class _Messages:
-    """The messages of a drive."""
+    """Messages of a drive."""
 
     def __init__(self, drive: StereoDrive, ros: _Ros1 | _Ros2) -> None:
         self._drive, self._ros, self._store = drive, ros, ros.store
 
     def put_all(self, bag: Any, on_frame: OnFrame) -> None:
-        """Write all into an open bag, in the order of time."""
+        """Write all messages into an open bag in the order of time."""
         drive = self._drive
         topics = [f"/{side}/{kind}" for side in _SIDES for kind in ("image_rect", "camera_info")]
         topics += ["/odom", "/truth", "/tf_static"]
@@ -146,32 +146,40 @@ class _Messages:
             bag.write(connections[topic], time_ns, data)
 
         times = (drive.time_ns + _FIRST_NS).tolist()
-        put("/tf_static", times[0], self._mounts(times[0]))
+        put("/tf_static", times[0], self._static_transforms(times[0]))
         reckoned, true = drive.reckoned_bodies, drive.true_bodies
         reckoned = reckoned if reckoned.ndim == 3 else se3.from_planar(reckoned)
         for k, time_ns in enumerate(times):
             for camera, image in enumerate(drive.pair(k)):
                 side = _SIDES[camera]
-                put(f"/{side}/image_rect", time_ns, self._image(time_ns, side, image))
-                put(f"/{side}/camera_info", time_ns, self._info(time_ns, camera))
+                height, width = image.shape
+                header = self._header(time_ns, f"{side}_optical")
+                data = np.ascontiguousarray(image).ravel()
+                picture = self._new(
+                    "sensor_msgs/Image", header, height, width, "mono8", 0, width, data
+                )
+                put(f"/{side}/image_rect", time_ns, picture)
+                put(f"/{side}/camera_info", time_ns, self._camera_info(time_ns, camera))
             put("/odom", time_ns, self._odometry(time_ns, reckoned[k]))
-            put("/truth", time_ns, self._stamped(time_ns, true[k]))
+            header = self._header(time_ns, "world")
+            put(
+                "/truth",
+                time_ns,
+                self._new("geometry_msgs/PoseStamped", header, self._pose(true[k])),
+            )
             on_frame(k + 1, len(drive))
 
     def _new(self, name: str, *values: Any) -> Any:
+        """Return a new message of a type."""
         return self._store.types[name.replace("/", "/msg/")](*values)
 
     def _header(self, time_ns: int, frame: str) -> Any:
+        """Return a header with time stamp and frame."""
         stamp = self._new("builtin_interfaces/Time", *divmod(time_ns, NS))
         return self._new("std_msgs/Header", *self._ros.header_begins, stamp, frame)
 
-    def _image(self, time_ns: int, side: str, image: np.ndarray) -> Any:
-        height, width = image.shape
-        header = self._header(time_ns, f"{side}_optical")
-        data = np.ascontiguousarray(image).ravel()
-        return self._new("sensor_msgs/Image", header, height, width, "mono8", 0, width, data)
-
-    def _info(self, time_ns: int, camera: int) -> Any:
+    def _camera_info(self, time_ns: int, camera: int) -> Any:
+        """Return the CameraInfo of the left (0) or the right camera (1)."""
         pair, (cu, cv) = self._drive.camera, self._drive.camera.center_px
         f = pair.focal_px
         K = np.array([f, 0, cu, 0, f, cv, 0, 0, 1])
@@ -184,15 +192,13 @@ class _Messages:
         )  # fmt: skip
 
     def _pose(self, T: Float) -> Any:
+        """Return a Pose message."""
         q = se3.quaternions(T[None])[0].tolist()
         point = self._new("geometry_msgs/Point", *T[:3, 3].tolist())
         return self._new("geometry_msgs/Pose", point, self._new("geometry_msgs/Quaternion", *q))
 
-    def _stamped(self, time_ns: int, pose: Float) -> Any:
-        header = self._header(time_ns, "world")
-        return self._new("geometry_msgs/PoseStamped", header, self._pose(pose))
-
     def _odometry(self, time_ns: int, pose: Float) -> Any:
+        """Return an Odometry message with unknown covariances and zero velocities."""
         unknown, still = np.zeros(36), self._new("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
         own = self._pose(pose)
         return self._new(
@@ -207,7 +213,8 @@ class _Messages:
             ),
         )
 
-    def _mounts(self, time_ns: int) -> Any:
+    def _static_transforms(self, time_ns: int) -> Any:
+        """Return the TFMessage of the camera mounts."""
         found = []
         for camera, side in enumerate(_SIDES):
             T = self._drive.mount(camera)

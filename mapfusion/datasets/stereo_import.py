@@ -1,9 +1,9 @@
-"""Import of stereo recordings: rectify, track, level, and split into robot logs.
+"""Import of stereo recordings: rectification, tracking, levelling, robot logs.
 
-What the defaults of `FrontEndParameters` say in metres was chosen for one head: what is meant are
-disparities and shares of the image, and these are turned into metres of another camera. All else is
-measured on the recording's own pictures: depths, what true surfaces differ by in two pictures
-(`noise_model.py`), how many corners it takes, and how far true points stray from frame to frame.
+The defaults of `FrontEndParameters` are lengths in metres for one stereo head. They stand for
+disparities and shares of the image and are converted for other cameras. Further settings are
+estimated from the pictures of the recording: depths, stereo noise (`stereo_noise.py`), number of
+corners, and reprojection errors from frame to frame.
 """
 
 import itertools
@@ -15,18 +15,16 @@ import numpy as np
 
 from mapfusion.attitude import Attitude, write_attitude
 from mapfusion.datasets.camera_calibration import Rectification
-from mapfusion.datasets.formats import Level
-from mapfusion.datasets.levelling import LevelFrames, Levels, known_from
-from mapfusion.datasets.log_consistency import (
-    Finding,
-    Stated,
-    composed_spans,
-    disagreement,
-    motions_between_frames,
-    pose_mistakes,
-    truth_finding,
+from mapfusion.datasets.formats import AttitudeSource
+from mapfusion.datasets.levelling import (
+    AttitudeMeasurements,
+    LevelledFrames,
+    choose_attitude_source,
 )
-from mapfusion.datasets.stereo_recording import StereoRecording, sampled
+from mapfusion.datasets.log_consistency import Finding, disagreement, truth_finding
+from mapfusion.datasets.motion_agreement import Stated, pose_mistakes
+from mapfusion.datasets.relative_motion import composed_spans, motions_between_frames
+from mapfusion.datasets.stereo_recording import StereoRecording, sample_indices
 from mapfusion.datasets.text_files import NS
 from mapfusion.datasets.tum import TimedPoses
 from mapfusion.errors import InputError, OutOfRangeError
@@ -57,44 +55,66 @@ from mapfusion.vision.visual_odometry import RigidMotion, robot_motions, visual_
 
 Pair = tuple[np.ndarray, np.ndarray]
 
-_USUAL = StereoCamera()  # the head that the defaults are for
-_USUAL_DEPTH_M = 3.5  # where that head's robots see walls, median
-# By how much farther others go between two pictures, as a share of the depth, than robots that see
-# walls at 3.5 m in steps of 0.1 m: a car's 1.2 m at a median of 21 m is twice as much, and the
-# nearer half of what it sees another two times.
-_ROBOT_STEP = 4.0
-_AREA_PX = 300  # of the image for one corner at most: they keep 10 px apart, on texture
-_MOST_CORNERS = 5000  # that the setting allows
-# Share of true surfaces that keep all limits: a choice of how many to give up for those near edges,
-# whose two pictures differ for another reason than noise. What passes is held against SGBM on KITTI
-# (tests/mapfusion/datasets/test_real_recordings.py: 97 % within a pixel, 300 a frame).
+_DEFAULT_CAMERA = StereoCamera()  # the stereo head of the default settings
+_DEFAULT_DEPTH_M = 3.5  # median distance of walls from robots with this head
+# Ratio of step length to depth, relative to robots that see walls at 3.5 m in steps of 0.1 m. The
+# ratio of a car (1.2 m at a median depth of 21 m) is twice as large, and four times as large for
+# the nearer half of the visible points.
+_STEP_RATIO = 4.0
+_AREA_PX = 300  # of the image per corner: textured corners keep a distance of 10 px
+_MAX_CORNERS = 5000  # limit of the setting
+# Share of true surface points that pass all stereo checks. A larger share admits more points near
+# edges, whose two views differ by more than noise.
 _TRUE_SHARE = 0.8
-_WANTED = 100  # observations a frame: a filter's step takes as long as it has of them
-_MEDIAN_ERROR = 0.6745  # of a normal variable, in standard deviations
-_SIDE_M = (0.01, 10.0)  # of the described window, what the setting allows
+_MAX_OBSERVATIONS = 100  # of a frame; the time of a filter step is proportional to their number
+_MEDIAN_ERROR = 0.6745  # median absolute error of a normal variable, in standard deviations
+_SIDE_M = (0.01, 10.0)  # limits of the setting for the descriptor window
+# The search window for rows is 17 px high, so features with an offset of one row are still found.
+# An offset of two rows loses half of the matches.
+_MAX_ROW_OFFSET = 1.0
+_MAX_NEGATIVE_DISPARITY = 2.0  # distant points have no disparity, up to calibration errors
+_RUN = 8  # number of consecutive pairs for estimates from tracks
+_MIN_MATCHES = 20  # for a reliable median of the row offsets
+_LONGEST_ODOMETRY_GAP_S = 1.0  # of interpolation: wheel odometry is frequent and smooth
+_LONGEST_TRUTH_GAP_S = 0.1  # of interpolation, as for MRCLAM
+_MIN_OBSERVATIONS = 4  # of a frame; three determine a motion
+_MAX_EXTRAPOLATED = 0.1  # share of all motions
+
+OnProgress = Callable[[str, int, int], None]
+Vision = Callable[[FrontEndParameters], FrontEndParameters]
+Calibration = Callable[[CalibrationError], CalibrationError]
 
 
-def derived_vision(camera: StereoCamera) -> FrontEndParameters:
-    """Settings by the camera alone: depths by disparity, shifts and corners by the image's size."""
+def front_end_for_camera(camera: StereoCamera) -> FrontEndParameters:
+    """Return settings scaled to a camera: depths by disparity, shifts and corners by image size."""
     usual = FrontEndParameters()
-    scale = camera.focal_px * camera.baseline_m / (_USUAL.focal_px * _USUAL.baseline_m)
-    wide, high = camera.width_px / _USUAL.width_px, camera.height_px / _USUAL.height_px
+    scale = (
+        camera.focal_px
+        * camera.baseline_m
+        / (_DEFAULT_CAMERA.focal_px * _DEFAULT_CAMERA.baseline_m)
+    )
+    wide, high = (
+        camera.width_px / _DEFAULT_CAMERA.width_px,
+        camera.height_px / _DEFAULT_CAMERA.height_px,
+    )
     corners = camera.width_px * camera.height_px // _AREA_PX
     stereo = replace(
         usual.stereo,
         min_depth_m=usual.stereo.min_depth_m * scale / max(wide, 1.0),
         max_depth_m=usual.stereo.max_depth_m * scale,
-        nearest_plane_m=usual.stereo.nearest_plane_m * camera.baseline_m / _USUAL.baseline_m,
+        nearest_plane_m=usual.stereo.nearest_plane_m
+        * camera.baseline_m
+        / _DEFAULT_CAMERA.baseline_m,
     )
     tracks = replace(
         usual.tracks,
         max_shift_u_px=usual.tracks.max_shift_u_px * wide,
-        max_shift_v_px=usual.tracks.max_shift_v_px * _ROBOT_STEP * high,
-        max_disparity_ratio=usual.tracks.max_disparity_ratio**_ROBOT_STEP,
+        max_shift_v_px=usual.tracks.max_shift_v_px * _STEP_RATIO * high,
+        max_disparity_ratio=usual.tracks.max_disparity_ratio**_STEP_RATIO,
     )
     return replace(
         usual,
-        harris=replace(usual.harris, max_corners=min(max(corners, 1), _MOST_CORNERS)),
+        harris=replace(usual.harris, max_corners=min(max(corners, 1), _MAX_CORNERS)),
         stereo=stereo,
         tracks=tracks,
         max_depth_m=usual.max_depth_m * scale,
@@ -102,18 +122,18 @@ def derived_vision(camera: StereoCamera) -> FrontEndParameters:
     )
 
 
-def measured_vision(
-    camera: StereoCamera, apart: Sequence[Pair], run: Sequence[Pair]
+def front_end_for_recording(
+    camera: StereoCamera, samples: Sequence[Pair], run: Sequence[Pair]
 ) -> FrontEndParameters:
-    """Settings by the camera and by what a recording shows.
+    """Return settings for a camera and the pictures of a recording.
 
     Args:
         camera: the rectified pair.
-        apart: pairs (H, W) uint8 from all over the recording.
-        run: pairs that follow one another, for what tracks do.
+        samples: pairs (H, W) uint8 from the whole recording.
+        run: consecutive pairs, for estimates from tracks.
     """
-    vision = derived_vision(camera)
-    noise = estimate_noise(apart, camera, vision.harris, vision.stereo)
+    vision = front_end_for_camera(camera)
+    noise = estimate_noise(samples, camera, vision.harris, vision.stereo)
     if noise is not None:
         stereo = parameters_for_noise(vision.stereo, noise, _TRUE_SHARE)
         tracks = replace(
@@ -125,57 +145,57 @@ def measured_vision(
     front_end = FrontEnd(camera, vision)
     depth_m = [
         camera.focal_px * camera.baseline_m / front_end.extract(*pair).disparity_px
-        for pair in apart
+        for pair in samples
     ]
-    vision = with_window_for(vision, camera, np.concatenate([*depth_m, np.empty(0)]))
+    vision = scale_descriptor_window(vision, camera, np.concatenate([*depth_m, np.empty(0)]))
     front_end = FrontEnd(camera, vision)
-    return _by_tracks(camera, vision, [front_end.extract(*pair) for pair in run])
+    return _tune_to_tracks(camera, vision, [front_end.extract(*pair) for pair in run])
 
 
-def with_window_for(
+def scale_descriptor_window(
     vision: FrontEndParameters, camera: StereoCamera, depth_m: Float
 ) -> FrontEndParameters:
-    """With a described window that suits depths (N,) that were seen; as it is where none were.
+    """Scale the descriptor window to observed depths (N,); no depths leave it unchanged.
 
-    The side is the default's times a power of two, so that robots of one kind in like places
-    describe alike.
+    The factor is a power of two, so that similar robots in similar places use the same window and
+    their descriptors can be compared.
     """
     if not len(depth_m):
         return vision
     usual_m = vision.usurf.side_m
-    fits = np.median(depth_m) / _USUAL_DEPTH_M * _USUAL.focal_px / camera.focal_px
+    fits = np.median(depth_m) / _DEFAULT_DEPTH_M * _DEFAULT_CAMERA.focal_px / camera.focal_px
     side_m = usual_m * 2.0 ** float(np.round(np.log2(fits)))
     return replace(vision, usurf=replace(vision.usurf, side_m=float(np.clip(side_m, *_SIDE_M))))
 
 
-def _by_tracks(
+def _tune_to_tracks(
     camera: StereoCamera, vision: FrontEndParameters, frames: Sequence[Features]
 ) -> FrontEndParameters:
-    """With as many corners as give the observations wanted, and noise as tracks have it."""
+    """Set the pixel noise by reprojection errors and the number of corners by observations."""
     observer = Observer.of(camera, vision)
     seen = [observer.observe(found).tracks for found in frames]
-    strays = [
-        strays_px(camera, before, after)
+    errors = [
+        reprojection_errors_px(camera, before, after)
         for before, after in itertools.pairwise(seen)
         if after.motion is not None
     ]
-    if strays:
-        # half of the errors lie within 0.67 deviations; two frames have a share in each
-        sigma_px = float(np.median(np.abs(np.concatenate(strays)))) / _MEDIAN_ERROR / np.sqrt(2)
+    if errors:
+        # Both frames contribute to an error.
+        sigma_px = float(np.median(np.abs(np.concatenate(errors)))) / _MEDIAN_ERROR / np.sqrt(2)
         vision = replace(vision, sigma_uv_px=float(max(vision.sigma_uv_px, sigma_px)))
     observer = Observer.of(camera, vision)
     lasting = [len(observer.observe(found).rows) for found in frames]
     usual = np.median(lasting[vision.tracks.min_length - 1 :] or [0])
-    if usual > _WANTED:
-        corners = int(vision.harris.max_corners * _WANTED / usual)
+    if usual > _MAX_OBSERVATIONS:
+        corners = int(vision.harris.max_corners * _MAX_OBSERVATIONS / usual)
         vision = replace(vision, harris=replace(vision.harris, max_corners=corners))
     return vision
 
 
-def strays_px(camera: StereoCamera, before: Tracks, after: Tracks) -> Float:
-    """By how much points of the tracks lie beside where the motion takes them (2N,), u and v.
+def reprojection_errors_px(camera: StereoCamera, before: Tracks, after: Tracks) -> Float:
+    """Return reprojection errors of tracked points after the motion, u and v, shape (2N,).
 
-    Only where a motion is known.
+    The motion of the frame `after` must be known.
     """
     assert after.motion is not None
     _, old, new = np.intersect1d(before.track_id, after.track_id, return_indices=True)
@@ -185,25 +205,14 @@ def strays_px(camera: StereoCamera, before: Tracks, after: Tracks) -> Float:
     return (moved[:, :2] - before.uv_px[old]).ravel()
 
 
-# Windows of the row search are 17 px: what lies a row off is found there still, two rows cost
-# half of the matches.
-_MOST_ROWS_OFF = 1.0
-_MOST_COLUMNS_AHEAD = 2.0  # what is far has no disparity, but for what calibration leaves open
-_RUN = 8  # pairs that follow one another, on which tracks are tried
-_LEAST_MATCHES = 20  # corners whose median row error is worth a refusal
-_LONGEST_ODOMETRY_GAP_S = 1.0  # over which a trajectory is interpolated: wheels report often
-_LONGEST_TRUTH_GAP_S = 0.1  # as in MRCLAM's recordings: the truth must not be guessed
-_LEAST_OBSERVATIONS = 4  # a frame: one more than fix a motion
-_MOST_GUESSED = 0.1  # of all motions: what lies between guesses must be longer than they are
-
-OnProgress = Callable[[str, int, int], None]
-Vision = Callable[[FrontEndParameters], FrontEndParameters]
-Calibration = Callable[[CalibrationError], CalibrationError]
-
-
 @dataclass(frozen=True)
-class Cut:
-    """A robot, and which pairs of the recording are its frames."""
+class RecordingPart:
+    """Part of a recording that becomes the log of one robot.
+
+    Attributes:
+        robot: name of the robot.
+        rows: pairs of the recording.
+    """
 
     robot: str
     rows: slice
@@ -214,14 +223,15 @@ class Imported:
     """Import of one robot's frames.
 
     Attributes:
-        log: as written.
-        truth: (T, 3) T_world_robot, or None.
-        linked: (T,) share of the features of the frame before that were found again; NaN for the
-            first frame.
-        odometry_covariance: (T, 3, 3) of odometry that the pictures told; None: it was recorded.
-        attitude: by which the observations were levelled; None: the body was taken for level.
-        guessed: frames whose motion too few links told.
-        findings: what recorded odometry and truth contradict.
+        log: the robot log.
+        truth: T_world_robot, shape (T, 3), or None.
+        linked: share of the features of the frame before that were found again, shape (T,); NaN
+            for the first frame.
+        odometry_covariance: covariance of visual odometry, shape (T, 3, 3); None for recorded
+            odometry.
+        attitude: attitude for levelling the observations; None for a level body.
+        guessed: number of frames whose motion was extrapolated because too few features matched.
+        findings: contradictions of recorded odometry and truth.
     """
 
     log: RobotLog
@@ -234,33 +244,33 @@ class Imported:
 
     @property
     def observations(self) -> np.ndarray:
-        """(T,) how many each frame has."""
+        """Number of observations of each frame, shape (T,)."""
         return np.diff(self.log.frame_starts())
 
     @property
     def too_little(self) -> str:
-        """Why nothing can be mapped with it; empty where it can."""
+        """Reason why the log cannot be mapped; empty if it can."""
         usual, n = float(np.median(self.observations)), len(self.log)
-        if usual < _LEAST_OBSERVATIONS:
-            seen = f"{usual:g} observations a frame (median), {_LEAST_OBSERVATIONS} are the least"
+        if usual < _MIN_OBSERVATIONS:
+            seen = f"{usual:g} observations a frame (median), {_MIN_OBSERVATIONS} are the least"
             return f"{self.log.robot}: too little to map: {seen}"
-        if self.guessed > _MOST_GUESSED * n:
+        if self.guessed > _MAX_EXTRAPOLATED * n:
             lost = f"{self.guessed} of {n} motions could not be told from the pictures"
             return f"{self.log.robot}: too little to map: {lost}"
         return ""
 
 
 class StereoImport:
-    """One recording on its way into logs: its camera, and the settings of the front end.
+    """Import of one recording, with its rectified camera and front-end settings.
 
     Args:
-        recording: what was read.
-        adjust: from settings that follow from the camera and what it sees to those to be used.
-        calibration: from what is usually left open of a camera and its mount to what is of this.
+        recording: recording that was read.
+        adjust: function that changes the settings that were derived from camera and pictures.
+        calibration: function that changes the usual calibration error of camera and mount.
 
     Raises:
-        InputError: no camera can be made of the calibration, pictures have another size, or their
-            rows do not fit.
+        InputError: the calibration cannot be rectified, pictures have another size, or their rows
+            do not fit.
     """
 
     def __init__(
@@ -270,118 +280,131 @@ class StereoImport:
         calibration: Calibration = lambda usual: usual,
     ) -> None:
         self._recording = recording
+        calibrated_by = recording.calibrated_by or recording.name
         try:
             self._rectification = Rectification.of(recording.calibration)
         except InputError as error:
-            raise InputError(f"{recording.calibrated_by or recording.name}: {error}") from error
+            raise InputError(f"{calibrated_by}: {error}") from error
         self.camera: StereoCamera = self._rectification.camera
-        by_camera = self._vision_of_camera()
-        self.calibration_error = calibration(default_calibration_error(self.camera))
-        pairs = [self.rectified(k) for k in sampled(len(recording))]
-        self._require_rows(pairs, by_camera)
-        middle = max((len(recording) - _RUN) // 2, 0)
-        run = [self.rectified(k) for k in range(len(recording))[middle : middle + _RUN]]
-        self.vision = adjust(measured_vision(self.camera, pairs, run))
-        turn = se3.pose(self._rectification.R_left_rectified, np.zeros(3))
-        self.T_robot_camera: Float = recording.T_robot_left @ turn
-
-    def _vision_of_camera(self) -> FrontEndParameters:
-        """Derive front-end settings from the calibration; raises InputError that names it."""
         try:
-            return derived_vision(self.camera)
+            scaled = front_end_for_camera(self.camera)
         except OutOfRangeError as error:
-            told = self._recording.calibrated_by or self._recording.name
             pair = f"the baseline is {self.camera.baseline_m:g} m"
             pair += f" and the focal length {self.camera.focal_px:g} px"
             beyond = f"no setting fits such a pair ({error}); are they in metres and pixels?"
-            raise InputError(f"{told}: {pair}; {beyond}") from error
+            raise InputError(f"{calibrated_by}: {pair}; {beyond}") from error
+        self.calibration_error = calibration(default_calibration_error(self.camera))
+        samples = [self.rectified(k) for k in sample_indices(len(recording))]
+        self._require_row_alignment(samples, scaled)
+        middle = max((len(recording) - _RUN) // 2, 0)
+        run = [self.rectified(k) for k in range(len(recording))[middle : middle + _RUN]]
+        self.vision = adjust(front_end_for_recording(self.camera, samples, run))
+        turn = se3.pose(self._rectification.R_left_rectified, np.zeros(3))
+        self.T_robot_camera: Float = recording.T_robot_left @ turn
 
     def rectified(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """The pair k of the recording, rectified; raises InputError."""
+        """Return the rectified pair k of the recording; raise InputError for another size."""
         raw = self._recording.pair(k)
         try:
             return self._rectification.apply(raw)
         except InputError as error:
             raise InputError(f"{self._recording.name}, pair {k}: {error}") from error
 
-    def _require_rows(
-        self, pairs: Sequence[tuple[np.ndarray, np.ndarray]], vision: FrontEndParameters
-    ) -> None:
+    def _require_row_alignment(self, pairs: Sequence[Pair], vision: FrontEndParameters) -> None:
+        """Raise InputError if matched corners have a row offset or a negative disparity."""
         off = np.concatenate([rectification_offsets(*pair, vision.harris) for pair in pairs])
-        if len(off) < _LEAST_MATCHES:
+        if len(off) < _MIN_MATCHES:
             return
         rows = float(np.median(np.abs(off[:, 1])))
-        if rows > _MOST_ROWS_OFF:
+        if rows > _MAX_ROW_OFFSET:
             found = f"points lie {rows:.1f} rows apart in the two images (median of {len(off)})"
             remedy = "the pair is not rectified, or its calibration is another's"
             raise InputError(f"{self._recording.name}: {found}; {remedy}")
         columns = float(np.median(off[:, 0]))
-        if columns > _MOST_COLUMNS_AHEAD:
+        if columns > _MAX_NEGATIVE_DISPARITY:
             found = f"points lie {columns:.1f} px farther right in the right image than in the left"
             remedy = "are the cameras the other way round?"
             raise InputError(f"{self._recording.name}: {found} (median of {len(off)}); {remedy}")
 
     def log_of(
-        self, cut: Cut, on_progress: OnProgress = lambda *_: None, level: Level = "auto"
+        self,
+        part: RecordingPart,
+        on_progress: OnProgress = lambda *_: None,
+        level: AttitudeSource = "auto",
     ) -> Imported:
-        """The log of one robot, with its truth; `level` is where its attitude is known from.
+        """Make the log of one robot, with its truth.
+
+        Args:
+            part: part of the recording.
+            on_progress: called with a text, the number of processed frames and that of all frames.
+            level: source of the attitude.
 
         Raises:
-            InputError: fewer than two frames, or recorded odometry that lacks one of them.
+            InputError: the part has fewer than two frames, or recorded odometry lacks a frame.
         """
-        rows = range(len(self._recording))[cut.rows]
+        recording, name = self._recording, self._recording.name
+        rows = range(len(recording))[part.rows]
         if len(rows) < 2:
-            found = f"frames of {cut.robot} are {len(rows)} of {len(self._recording)} pairs"
-            raise InputError(f"{self._recording.name}: {found}; 2 are the least")
-        time_ns = self._recording.time_ns[rows]
-        reckoned, T_world_robot = self._odometry(time_ns), self._truth(time_ns)
-        truth = None if T_world_robot is None else se3.planar(T_world_robot)
-        known = known_from(level, reckoned, self._recording.inertial)
-        if known == "odometry" and reckoned is None:
-            raise InputError(f"--level odometry: {self._recording.name} has no odometry")
-        tilts, counted = self._felt(time_ns) if known == "imu" else (None, None)
-        usual_ns = np.median(np.diff(self._recording.time_ns))
+            found = f"frames of {part.robot} are {len(rows)} of {len(recording)} pairs"
+            raise InputError(f"{name}: {found}; 2 are the least")
+        time_ns = recording.time_ns[rows]
+        reckoned, T_world_robot = self._odometry_at(time_ns), self._truth_at(time_ns)
+
+        # Measurements of the attitude.
+        source = choose_attitude_source(level, reckoned, recording.inertial)
+        if source == "odometry" and reckoned is None:
+            raise InputError(f"--level odometry: {name} has no odometry")
+        tilts, turns = None, None
+        if source == "imu":
+            if recording.inertial is None:
+                raise InputError(f"--level imu: {name} has no accelerations that are read")
+            try:
+                tilts = recording.inertial.tilts(time_ns)
+                turns = recording.inertial.turns(time_ns)
+            except InputError as error:
+                raise InputError(f"--level imu: {name}: {error}") from error
+        rotations = None if turns is None else (turns, np.diff(time_ns, prepend=time_ns[0]) / NS)
+        measurements = AttitudeMeasurements(
+            source, self.camera, self.T_robot_camera, reckoned, tilts, rotations
+        )
+
+        # Features, tracks and levelled observations of each frame.
+        usual_ns = np.median(np.diff(recording.time_ns))
         steps = np.diff(time_ns, prepend=time_ns[0]) / usual_ns
         front_end = FrontEnd(self.camera, self.vision)
-        levels = Levels(known, self.camera, self.T_robot_camera, reckoned, tilts, counted)
-        frames = LevelFrames(self.vision, levels)
+        frames = LevelledFrames(self.vision, measurements)
         for n, k in enumerate(rows):
             frames.add(front_end.extract(*self.rectified(k)), float(steps[n]))
-            on_progress(f"{cut.robot}: track features", n + 1, len(rows))
-        time_s = (time_ns - self._recording.time_ns[0]) / 1e9
-        attitude, linked = self._attitude(frames, known), np.array(frames.linked)
-        seen = visual_odometry(frames.motions, steps, self.camera, self.T_robot_camera, attitude)
-        odometry = seen.increments if reckoned is None else _increments(reckoned)
-        observed = concatenate_observations(frames.observed)
-        log = RobotLog(cut.robot, False, time_s, odometry, *observed, self.calibration_error)
-        shown = robot_motions(frames.motions, self.camera, self.T_robot_camera)
-        findings = _findings(shown, reckoned, T_world_robot)
-        if reckoned is not None:
-            return Imported(log, truth, linked, attitude=attitude, findings=findings)
-        told = seen.covariance, attitude, int(seen.guessed.sum())
-        return Imported(log, truth, linked, *told, findings=findings)
-
-    def _attitude(self, frames: LevelFrames, known: Level) -> Attitude | None:
-        """By which the frames were levelled; raises InputError."""
+            on_progress(f"{part.robot}: track features", n + 1, len(rows))
         try:
-            return frames.attitude
+            attitude = frames.attitude
         except ValueError as error:
-            reason = f"{error}; by --level {known} the robot's attitude is no robot's"
-            raise InputError(f"{self._recording.name}: {reason}") from error
+            reason = f"{error}; by --level {source} the robot's attitude is no robot's"
+            raise InputError(f"{name}: {reason}") from error
 
-    def _felt(self, time_ns: np.ndarray) -> tuple[tuple[Float, Float], tuple[Float, Float] | None]:
-        """Tilts by the accelerometer, and turns by the gyroscopes, as `Levels` has them."""
-        felt, name = self._recording.inertial, self._recording.name
-        if felt is None:
-            raise InputError(f"--level imu: {name} has no accelerations that are read")
-        try:
-            tilts, turns = felt.tilts(time_ns), felt.turns(time_ns)
-        except InputError as error:
-            raise InputError(f"--level imu: {name}: {error}") from error
-        return tilts, None if turns is None else (turns, np.diff(time_ns, prepend=time_ns[0]) / NS)
+        # Odometry: recorded, or visual odometry without it.
+        seen = visual_odometry(frames.motions, steps, self.camera, self.T_robot_camera, attitude)
+        odometry = seen.increments
+        if reckoned is not None:
+            planar = se3.from_planar(se3.planar(reckoned))
+            odometry = np.zeros((len(reckoned), 3))
+            odometry[1:] = se3.planar(se3.between(planar[:-1], planar[1:]))
+        time_s = (time_ns - self._recording.time_ns[0]) / 1e9
+        observed = concatenate_observations(frames.observed)
+        log = RobotLog(part.robot, False, time_s, odometry, *observed, self.calibration_error)
+        motions = robot_motions(frames.motions, self.camera, self.T_robot_camera)
+        return Imported(
+            log,
+            None if T_world_robot is None else se3.planar(T_world_robot),
+            np.array(frames.linked),
+            seen.covariance if reckoned is None else None,
+            attitude,
+            int(seen.guessed.sum()) if reckoned is None else 0,
+            _find_contradictions(motions, reckoned, T_world_robot),
+        )
 
-    def _odometry(self, time_ns: np.ndarray) -> Float | None:
-        """Poses (T, 4, 4) at the frames, by the recorded dead reckoning; None without it."""
+    def _odometry_at(self, time_ns: np.ndarray) -> Float | None:
+        """Return dead-reckoned poses (T, 4, 4) at the frames; None without recorded odometry."""
         recorded = self._recording.odometry
         if recorded is None:
             return None
@@ -389,7 +412,8 @@ class StereoImport:
         unknown = np.flatnonzero(np.isnan(T[:, 0, 0]))
         if len(unknown):
             if len(unknown) == len(T):
-                raise InputError(f"{self._recording.name}: {_apart('odometry', recorded, time_ns)}")
+                spans = _time_spans_text("odometry", recorded, time_ns)
+                raise InputError(f"{self._recording.name}: {spans}")
             when = f"{(int(time_ns[unknown[0]]) - int(self._recording.time_ns[0])) / 1e9:g} s"
             missing = f"at {len(unknown)} of {len(T)} frames, the first {when} after the beginning"
             raise InputError(f"{self._recording.name}: no odometry {missing}")
@@ -399,26 +423,26 @@ class StereoImport:
             raise InputError(f"{self._recording.name}: {found}; is its quaternion x y z w?")
         return T
 
-    def _truth(self, time_ns: np.ndarray) -> Float | None:
-        """True poses (T, 4, 4) at the frames, NaN where unknown; raises InputError without any."""
+    def _truth_at(self, time_ns: np.ndarray) -> Float | None:
+        """Return true poses (T, 4, 4) at the frames, NaN where unknown; None without truth.
+
+        Raises:
+            InputError: the truth is of another time than the recording.
+        """
         truth = self._recording.truth
         if truth is None:
             return None
         T = truth.at(time_ns, _LONGEST_TRUTH_GAP_S)
-        if np.isnan(T[:, 0, 0]).all() and not _overlap(truth, self._recording.time_ns):
-            raise InputError(f"{self._recording.name}: {_apart('truth', truth, time_ns)}")
+        times, own = self._recording.time_ns, truth.time_ns
+        overlap = len(own) and own[0] <= times[-1] and times[0] <= own[-1]
+        if np.isnan(T[:, 0, 0]).all() and not overlap:
+            spans = _time_spans_text("truth", truth, time_ns)
+            raise InputError(f"{self._recording.name}: {spans}")
         return T
 
 
-def _overlap(poses: TimedPoses, time_ns: np.ndarray) -> bool:
-    """Return True if any time of the poses lies within the times of a recording."""
-    return bool(len(poses.time_ns)) and bool(
-        poses.time_ns[0] <= time_ns[-1] and time_ns[0] <= poses.time_ns[-1]
-    )
-
-
-def _apart(what: str, poses: TimedPoses, time_ns: np.ndarray) -> str:
-    """Words for poses that lie at other times than frames."""
+def _time_spans_text(what: str, poses: TimedPoses, time_ns: np.ndarray) -> str:
+    """Return a message about poses and frames whose times do not overlap."""
     if not len(poses.time_ns):
         return f"the {what} holds no pose"
     spans = [
@@ -429,19 +453,19 @@ def _apart(what: str, poses: TimedPoses, time_ns: np.ndarray) -> str:
     return f"{reason}: it has no pose at any of them; is it another recording's, or another clock?"
 
 
-def _findings(
-    shown: Sequence[RigidMotion | None],
+def _find_contradictions(
+    motions: Sequence[RigidMotion | None],
     reckoned: Float | None,
     T_world_robot: Float | None,
 ) -> tuple[Finding, ...]:
-    """Return findings about odometry and truth (T, 4, 4) that contradict the pictures' motions."""
-    known = [(k, motion) for k, motion in enumerate(shown) if k and motion is not None]
-    spans = composed_spans(motions_between_frames(known), len(shown))
+    """Return findings about odometry and truth (T, 4, 4) that contradict the visual motions."""
+    known = [(k, motion) for k, motion in enumerate(motions) if k and motion is not None]
+    spans = composed_spans(motions_between_frames(known), len(motions))
     found = []
     if reckoned is not None:
-        what = "the odometry contradicts the motion that the pictures show"
-        given = Stated(reckoned, MotionNoise()), pose_mistakes(reckoned)
-        found.append(disagreement("odometry", what, spans, *given))
+        subject = "the odometry contradicts the motion that the pictures show"
+        stated = Stated(reckoned, MotionNoise())
+        found.append(disagreement("odometry", subject, spans, stated, pose_mistakes(reckoned)))
     if T_world_robot is not None and np.isnan(T_world_robot[:, 0, 0]).all():
         gap = f"over gaps longer than {_LONGEST_TRUTH_GAP_S:g} s it is not interpolated"
         found.append(Finding("truth", -1, f"the truth is known at none of the frames: {gap}"))
@@ -451,20 +475,12 @@ def _findings(
     return tuple(one for one in found if one is not None)
 
 
-def _increments(T_start_robot: Float) -> Float:
-    """Motions (T, 3) between the poses (T, 4, 4) in the plane; the first is zero."""
-    increments = np.zeros((len(T_start_robot), 3))
-    planar = se3.from_planar(se3.planar(T_start_robot))
-    increments[1:] = se3.planar(se3.between(planar[:-1], planar[1:]))
-    return increments
-
-
 def write_imported(destination: Path, imported: Sequence[Imported]) -> list[Path]:
-    """Write the logs, with the truth beside them, to folders named by robot; returns these."""
+    """Write logs and their truth to folders named by robot and return the folders."""
     folders = [destination / one.log.robot for one in imported]
     for folder, one in zip(folders, imported, strict=True):
         write_log(folder, one.log)
-        for outdated in TRUTH_FILES:  # of an import into the same folder
+        for outdated in TRUTH_FILES:  # of an earlier import into the same folder
             (folder / outdated).unlink(missing_ok=True)
         write_odometry_covariance(folder, one.odometry_covariance)
         write_attitude(folder, one.attitude)

@@ -1,4 +1,4 @@
-"""Text files of recordings: rows of numbers and times; errors name file and line."""
+"""Text files of recordings: rows of numbers and times. Errors name file and line."""
 
 from collections.abc import Iterator, Mapping
 from decimal import Decimal, InvalidOperation
@@ -9,19 +9,26 @@ import numpy as np
 from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
 
-NS = 1_000_000_000  # in a second
-_LATEST_NS = 2**62  # the year 2116, from 1970; sums of two fit 64 bits
-_LARGEST = 1e12  # any number
-# Formats of poses by their number of columns: a file of one is often given for another.
+NS = 1_000_000_000  # nanoseconds in a second
+_LATEST_NS = 2**62  # the year 2116, from 1970; the sum of two times fits 64 bits
+_MAX_VALUE = 1e12  # of any number
+# Pose formats by their number of columns, which are often confused.
 POSES = {8: "TUM's poses have 8", 12: "KITTI's poses have 12", 17: "EuRoC's true states have 17"}
 _SEPARATORS = {",": "commas", ";": "semicolons", None: "spaces"}
 
 
-def rows_of(path: Path, what: str, separator: str | None = None) -> Iterator[tuple[int, list[str]]]:
-    """Line number and words of each line that is neither empty nor a comment (#).
+def read_rows(
+    path: Path, what: str, separator: str | None = None
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield line number and words of each line that is neither empty nor a comment (#).
+
+    Args:
+        path: text file.
+        what: contents of the file, for messages.
+        separator: separator of the words; None for white space.
 
     Raises:
-        InputError: there is no such file (`what` it is), or it is no text.
+        InputError: the file is missing or no text file.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -43,14 +50,14 @@ def require_columns(
     formats: Mapping[int, str] | None = None,
     more: bool = False,
 ) -> None:
-    """Raise InputError for a line with another number of columns.
+    """Raise InputError if a line has a wrong number of columns.
 
     Args:
-        path: of the file.
-        line: its number.
+        path: text file, for messages.
+        line: line number, for messages.
         words: all words of the line.
         columns: names of the columns, separated by spaces.
-        formats: other formats by their number of columns, told where the line has as many.
+        formats: hints at other formats by their number of columns.
         more: further columns may follow.
     """
     n, wanted = len(words), len(columns.split())
@@ -67,19 +74,19 @@ def require_columns(
     )
 
 
-def numbers(path: Path, line: int, words: list[str]) -> list[float]:
-    """The numbers that the words of a line are; raises InputError for other words or huge ones."""
+def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
+    """Parse the numbers of a line; raise InputError for other words or huge numbers."""
     try:
         found = [float(word) for word in words]
     except ValueError:
         raise InputError(f"{path}, line {line}: not a number in {' '.join(words)!r}") from None
-    if not all(abs(each) <= _LARGEST for each in found):  # NaN is not
-        raise InputError(f"{path}, line {line}: not finite, or above {_LARGEST:g}")
+    if not all(abs(each) <= _MAX_VALUE for each in found):  # NaN is not
+        raise InputError(f"{path}, line {line}: not finite, or above {_MAX_VALUE:g}")
     return found
 
 
-def time_in_ns(path: Path, line: int, word: str, unit_ns: int) -> int:
-    """A time as written, in whole nanoseconds; `unit_ns` of its unit. Raises InputError."""
+def parse_time_ns(path: Path, line: int, word: str, unit_ns: int) -> int:
+    """Parse a time in units of `unit_ns` nanoseconds; return nanoseconds or raise InputError."""
     try:
         exact = Decimal(word) * unit_ns
         time_ns = int(exact.to_integral_value())
@@ -88,13 +95,13 @@ def time_in_ns(path: Path, line: int, word: str, unit_ns: int) -> int:
     if abs(time_ns) > _LATEST_NS:
         raise InputError(f"{path}, line {line}: {word} is beyond all clocks; another unit?")
     if unit_ns == 1 and exact != time_ns:
-        told = "must be a whole number of nanoseconds; is it in seconds or another unit?"
-        raise InputError(f"{path}, line {line}: time {word} {told}")
+        reason = "must be a whole number of nanoseconds; is it in seconds or another unit?"
+        raise InputError(f"{path}, line {line}: time {word} {reason}")
     return time_ns
 
 
 def require_increasing(path: Path, lines: list[int], time_ns: np.ndarray) -> None:
-    """Raise InputError for the first line whose time is not after that of the line before."""
+    """Raise InputError for the first line whose time does not increase."""
     wrong = np.flatnonzero(np.diff(time_ns) <= 0)
     if len(wrong):
         k = int(wrong[0]) + 1
@@ -104,7 +111,7 @@ def require_increasing(path: Path, lines: list[int], time_ns: np.ndarray) -> Non
         raise InputError(f"{path}, line {lines[k]}: {back}; times must increase{unit}")
 
 
-def timed_numbers(
+def read_time_series(
     path: Path,
     what: str,
     columns: str,
@@ -113,21 +120,30 @@ def timed_numbers(
     formats: Mapping[int, str] | None = None,
     more: bool = False,
 ) -> tuple[np.ndarray, Float]:
-    """Times (N,) int64 ns and the n numbers (N, n) behind them, of lines in the order of time.
+    """Read a table of times and numbers; the times must increase.
 
-    The first of the `columns` is the time, in units of `unit_ns` nanoseconds; they, `formats` and
-    `more` are those of `require_columns`.
+    Args:
+        path: text file.
+        what: contents of the file, for messages.
+        columns: names of the columns, separated by spaces; the first one is the time.
+        unit_ns: unit of the time in nanoseconds.
+        separator: separator of the columns; None for white space.
+        formats: hints at other formats by their number of columns.
+        more: further columns may follow, which are ignored.
+
+    Returns:
+        Times in ns, shape (N,), int64, and the other columns, shape (N, n).
 
     Raises:
-        InputError: names file and line.
+        InputError: the file is missing or damaged; the message names file and line.
     """
     wanted = len(columns.split())
     lines, times, values = [], [], []
-    for line, words in rows_of(path, what, separator):
+    for line, words in read_rows(path, what, separator):
         require_columns(path, line, words, columns, formats, more)
         lines.append(line)
-        times.append(time_in_ns(path, line, words[0], unit_ns))
-        values.append(numbers(path, line, words[1:wanted]))
+        times.append(parse_time_ns(path, line, words[0], unit_ns))
+        values.append(parse_numbers(path, line, words[1:wanted]))
     time_ns = np.array(times, dtype=np.int64)
     require_increasing(path, lines, time_ns)
     return time_ns, np.array(values, dtype=np.float64).reshape(-1, wanted - 1)

@@ -1,22 +1,24 @@
-"""TUM trajectory files, and interpolation of timed poses.
+"""TUM trajectory files and interpolation of timed poses.
 
-One pose a line: time in seconds, position in metres, orientation as a quaternion with its real part
-last (Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems").
+A line holds one pose: time in seconds, position in metres, orientation as a quaternion with the
+real part last (Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems").
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mapfusion.datasets.text_files import NS, POSES, rows_of, timed_numbers
+from mapfusion.datasets.text_files import NS, POSES, read_rows, read_time_series
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import require_finite, require_shape
 
-_SAME_TIME_NS = 1_000  # a pose this near in time is the frame's own: what clocks are printed with
+_SAME_TIME_NS = 1_000  # resolution of printed times: a pose this close is not interpolated
+# Files of these names beside the pictures of a recording are read automatically.
+ODOMETRY_FILE, TRUTH_FILE = "odometry.tum", "truth.tum"
+_COLUMNS = "# timestamp_s tx_m ty_m tz_m qx qy qz qw"
 
 
 @dataclass(frozen=True)
@@ -24,8 +26,8 @@ class TimedPoses:
     """Poses of one body in one frame.
 
     Attributes:
-        time_ns: (N,) int64, increasing.
-        T: (N, 4, 4).
+        time_ns: increasing times, shape (N,), int64.
+        T: poses, shape (N, 4, 4).
     """
 
     time_ns: np.ndarray
@@ -38,14 +40,15 @@ class TimedPoses:
             raise ValueError("time_ns: must increase")
 
     def moved(self, T_body_other: Float) -> "TimedPoses":
-        """The poses of another body that is fixed to this one."""
+        """Return the poses of another body that is fixed to this one."""
         return TimedPoses(self.time_ns, self.T @ T_body_other)
 
     def at(self, time_ns: np.ndarray, longest_gap_s: float) -> Float:
-        """Poses (T, 4, 4) at other times: the nearest within a microsecond, else between two.
+        """Return poses at other times, shape (T, 4, 4).
 
-        Between two the position is interpolated straight and the rotation at constant speed. NaN
-        before the first, after the last and in gaps longer than `longest_gap_s`.
+        A pose within a microsecond is returned as it is. Other poses are interpolated: positions
+        linearly, rotations at constant angular velocity. Poses are NaN before the first time, after
+        the last time and in gaps longer than `longest_gap_s`.
         """
         found = np.full((len(time_ns), 4, 4), np.nan)
         if not len(self.time_ns):
@@ -64,61 +67,53 @@ class TimedPoses:
         inside = (self.time_ns[before] <= time_ns) & (time_ns <= self.time_ns[after])
         rest = np.flatnonzero(~same & inside & (gap_ns <= 1e9 * longest_gap_s))
         if len(rest):
+            from scipy.spatial.transform import Rotation
+
             share = (time_ns - self.time_ns[before])[rest] / gap_ns[rest]
-            found[rest] = _between(self.T[before[rest]], self.T[after[rest]], share)
+            first, second = self.T[before[rest]], self.T[after[rest]]
+            between = np.array(first)
+            between[:, :3, 3] += share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+            turn = Rotation.from_matrix(first[:, :3, :3].swapaxes(1, 2) @ second[:, :3, :3])
+            part = Rotation.from_rotvec(share[:, None] * turn.as_rotvec())
+            between[:, :3, :3] = first[:, :3, :3] @ part.as_matrix()
+            found[rest] = between
         return found
 
 
-def _between(first: Float, second: Float, share: Float) -> Float:
-    """Poses (N, 4, 4) at shares (N,) of the way from one to another."""
-    from scipy.spatial.transform import Rotation
-
-    made = np.array(first)
-    made[:, :3, 3] += share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-    turn = Rotation.from_matrix(first[:, :3, :3].swapaxes(1, 2) @ second[:, :3, :3])
-    part = Rotation.from_rotvec(share[:, None] * turn.as_rotvec())
-    made[:, :3, :3] = first[:, :3, :3] @ part.as_matrix()
-    return made
-
-
-# What lies under these names beside the pictures of a recording is read without being asked for.
-ODOMETRY_FILE, TRUTH_FILE = "odometry.tum", "truth.tum"
-_COLUMNS = "# timestamp_s tx_m ty_m tz_m qx qy qz qw"
-
-
 def tum_text(time_s: Float, T_frame_robot: Float, about: str) -> str:
-    """Poses (T, 3) in the plane or (T, 4, 4) at times (T,); unknown ones (NaN) are left out.
+    """Return poses (T, 3) or (T, 4, 4) at times (T,) in the TUM format.
 
-    Every number is written so that it is read back exactly.
+    Unknown poses (NaN) are left out. Reading the text restores every number exactly.
+
+    Args:
+        time_s: times, shape (T,).
+        T_frame_robot: planar poses, shape (T, 3), or poses in space, shape (T, 4, 4).
+        about: comment in the first line.
     """
-    in_space = T_frame_robot.ndim == 3
-    require_shape("T_frame_robot", T_frame_robot, (len(time_s), *((4, 4) if in_space else (3,))))
-    lines = (_lines_in_space if in_space else _lines)(time_s, T_frame_robot)
+    if T_frame_robot.ndim == 3:
+        require_shape("T_frame_robot", T_frame_robot, (len(time_s), 4, 4))
+        known = np.isfinite(T_frame_robot).all(axis=(1, 2))
+        T = T_frame_robot[known]
+        values = np.column_stack([time_s[known], T[:, :3, 3], se3.quaternions(T)])
+        lines = [" ".join(map(str, row)) for row in values.tolist()]
+    else:
+        require_shape("T_frame_robot", T_frame_robot, (len(time_s), 3))
+        known = np.isfinite(T_frame_robot).all(axis=1)
+        lines = []
+        for when, (x, y, theta) in zip(time_s[known].tolist(), T_frame_robot[known], strict=True):
+            qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
+            lines.append(f"{when} {float(x)} {float(y)} 0 0 0 {qz} {qw}")
     return "\n".join([f"# {about}", _COLUMNS, *lines, ""])
 
 
-def _lines(time_s: Float, T_frame_robot: Float) -> Iterator[str]:
-    known = np.isfinite(T_frame_robot).all(axis=1)
-    for when, (x, y, theta) in zip(time_s[known].tolist(), T_frame_robot[known], strict=True):
-        qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
-        yield f"{when} {float(x)} {float(y)} 0 0 0 {qz} {qw}"
-
-
-def _lines_in_space(time_s: Float, T_frame_robot: Float) -> Iterator[str]:
-    known = np.isfinite(T_frame_robot).all(axis=(1, 2))
-    T = T_frame_robot[known]
-    values = np.column_stack([time_s[known], T[:, :3, 3], se3.quaternions(T)])
-    yield from (" ".join(map(str, row)) for row in values.tolist())
-
-
 def read_tum(path: Path) -> TimedPoses:
-    """A trajectory of the robot (x ahead, y left, z up) in whatever frame.
+    """Read a trajectory of the robot (x ahead, y left, z up) in any frame.
 
     Raises:
-        InputError: the file is missing, damaged or foreign; names the line.
+        InputError: the file is missing, damaged or of another format; the message names the line.
     """
     what, columns = "a trajectory in the TUM format", "time x y z qx qy qz qw"
-    time_ns, values = timed_numbers(path, what, columns, NS, formats=POSES)
+    time_ns, values = read_time_series(path, what, columns, NS, formats=POSES)
     if not len(values):
         raise InputError(f"{path}: holds no pose")
     if not np.all(np.linalg.norm(values[:, 3:], axis=1) > 0):
@@ -127,15 +122,15 @@ def read_tum(path: Path) -> TimedPoses:
 
 
 def read_odometry(path: Path) -> TimedPoses:
-    """A trajectory by dead reckoning, of a robot that stands on a floor.
+    """Read a dead-reckoned trajectory of a robot on a floor.
 
     Raises:
-        InputError: as `read_tum`, or a pose stands on end or on its head; names the line.
+        InputError: as `read_tum`, or the robot is upside down; the message names the line.
     """
     poses = read_tum(path)
     fallen = np.flatnonzero(poses.T[:, 2, 2] <= 0)
     if len(fallen):
-        lines = [line for line, _ in rows_of(path, "a trajectory in the TUM format")]
+        lines = [line for line, _ in read_rows(path, "a trajectory in the TUM format")]
         line = lines[int(fallen[0])]
         remedy = "is the quaternion x y z w?"
         raise InputError(f"{path}, line {line}: the robot stands on its head; {remedy}")

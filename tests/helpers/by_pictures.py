@@ -11,7 +11,7 @@ from experiments.pipeline.store import Store
 from experiments.scenario.settings import Simulation
 from experiments.scenario.yaml_files import read_calibration
 from mapfusion.datasets.formats import read_recording
-from mapfusion.datasets.stereo_import import Cut, StereoImport
+from mapfusion.datasets.stereo_import import RecordingPart, StereoImport
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.geometry.camera import EXACT
 from mapfusion.geometry.numerics import Float
@@ -45,7 +45,7 @@ def _mapped(path: Path, log: Path, scenario: Simulation) -> Mapped:
     assert recording.odometry is not None
     alone = type(recording)(**{**vars(recording), "odometry": None})
     work = StereoImport(alone, lambda _: scenario.vision, lambda _: EXACT)
-    one, truth = work.log_of(Cut("R", slice(None))), read_truth(log)
+    one, truth = work.log_of(RecordingPart("R", slice(None))), read_truth(log)
     told, parameters = one.odometry_covariance, scenario.slam.filter
     assert told is not None
     *_, last = run_log(one.log, parameters, np.random.default_rng(0), odometry_covariance=told)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mapfusion.datasets.log_consistency import chained
+from mapfusion.datasets.relative_motion import poses_from_increments
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, inverse, rotation
 from mapfusion.robot_log import Observations, RobotLog
@@ -15,7 +15,7 @@ LANDMARKS = np.random.default_rng(0).uniform(-6, 6, (25, 2))
 
 
 def true_poses(n: int) -> Float:
-    return chained(np.concatenate([np.zeros((1, 3)), np.tile(STEP, (n - 1, 1))]))
+    return poses_from_increments(np.concatenate([np.zeros((1, 3)), np.tile(STEP, (n - 1, 1))]))
 
 
 def circling_log(
@@ -55,7 +55,7 @@ def _set(frame: int, axis: int, value: float) -> Callable[[Float], Float]:
 
 # What was done to the odometry, and words that name it.
 MISTAKES: dict[str, tuple[Callable[[Float], Float], tuple[str, ...]]] = {
-    "absolute poses": (chained, ("poses since the start, not increments",)),
+    "absolute poses": (poses_from_increments, ("poses since the start, not increments",)),
     "degrees": (lambda u: u * [1, 1, 180 / np.pi], ("odometry_theta_rad", "degrees", "57.3")),
     "millimetres": (lambda u: u * [1000, 1000, 1], ("millimetres",)),
     "centimetres": (lambda u: u * [100, 100, 1], ("centimetres",)),

@@ -1,4 +1,4 @@
-"""What tests of the KITTI extract share."""
+"""Shared fixtures for tests with the KITTI extract."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Extracts of public recordings, where MAPFUSION_RECORDINGS names the folder that holds them."""
+"""Extracts of public recordings in the folder MAPFUSION_RECORDINGS."""
 
 import itertools
 import os
@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapfusion.datasets.stereo_import import Cut
+from mapfusion.datasets.stereo_import import RecordingPart
 from mapfusion.geometry import se2
 
 RECORDINGS = Path(os.environ.get("MAPFUSION_RECORDINGS", "none"))
-WHOLE = Cut("R1", slice(None))
+WHOLE = RecordingPart("R1", slice(None))
 needs_recordings = pytest.mark.skipif(
     not RECORDINGS.is_dir(), reason="MAPFUSION_RECORDINGS is not set"
 )
 
 
 def laid_out_as_kitti(root: Path) -> Path:
-    """`kitti_extract` laid out as KITTI publishes its sequences; returns the sequence."""
+    """Lay out `kitti_extract` as a KITTI sequence and return its folder."""
     extract, sequence = RECORDINGS / "kitti_extract", root / "sequences" / "06"
     sequence.mkdir(parents=True)
     for camera, name in enumerate(("image_l", "image_r")):
@@ -32,5 +32,5 @@ def laid_out_as_kitti(root: Path) -> Path:
 
 
 def dead_reckoned(odometry: np.ndarray) -> np.ndarray:
-    """Poses (T, 3) from the first on."""
+    """Return poses (T, 3) in the first frame."""
     return np.array(list(itertools.accumulate(odometry, se2.compose)))

@@ -1,4 +1,4 @@
-"""Stereo visual odometry by OpenCV: corners followed by Lucas and Kanade, motions by PnP."""
+"""Stereo visual odometry by OpenCV: Lucas-Kanade tracking and PnP."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def _followed(
 
 
 def correspondences(work: StereoImport, n_frames: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Points (N, 3) of each left camera in optical axes, and their pixels (N, 2) one frame on."""
+    """Return points (N, 3) of each left camera and their pixels (N, 2) in the next frame."""
     camera, made = work.camera, []
     for k in range(n_frames - 1):
         left, right = work.rectified(k)
@@ -46,7 +46,7 @@ def correspondences(work: StereoImport, n_frames: int) -> list[tuple[np.ndarray,
 def motions(
     work: StereoImport, pairs: list[tuple[np.ndarray, np.ndarray]], seed: int
 ) -> np.ndarray:
-    """T_before_after (T - 1, 4, 4) of the robot; `seed` of RANSAC."""
+    """Return T_before_after (T - 1, 4, 4) of the robot for a seed of RANSAC."""
     camera = work.camera
     K = np.array(
         [[camera.focal_px, 0, camera.center_px[0]], [0, camera.focal_px, camera.center_px[1]],

@@ -1,4 +1,4 @@
-"""Points projected with published lens models lie, rectified, where the library has them."""
+"""Camera calibration against the published lens models."""
 
 from math import atan, hypot
 
@@ -19,7 +19,7 @@ KANNALA = (-0.01, 0.02, -0.01, 0.002)
 
 
 def distorted(kind: str, x: float, y: float) -> tuple[float, float]:
-    """One point of the plane one metre ahead, by the formulas as published."""
+    """Project a point of the plane z = 1 with the published formulas."""
     r = hypot(x, y)
     if kind == "equidistant":
         theta = atan(r)
@@ -35,7 +35,7 @@ def distorted(kind: str, x: float, y: float) -> tuple[float, float]:
 
 
 def head(kind: str) -> StereoCalibration:
-    """Two cameras that squint by a degree or two and stand a little apart in all directions."""
+    """Return two cameras rotated by one or two degrees and displaced in all directions."""
     coefficients = {"radial-tangential": BROWN, "equidistant": KANNALA, "none": ()}[kind]
     lenses = [
         Lens((640, 400), focal, center, kind, coefficients)
@@ -102,7 +102,7 @@ def test_all_of_a_rectified_picture_is_filled(kind: str) -> None:
 @pytest.mark.parametrize("center", [(319.5, 199.5), (300.0, 180.0), (301.4, 190.2), (331.9, 215.7)])
 @pytest.mark.parametrize("shift", [0, 12])
 def test_a_rectified_pair_keeps_its_grey_levels(center: tuple[float, float], shift: int) -> None:
-    """And its points their places, though the crop's middle is off by parts of a pixel."""
+    """Points keep their positions although the centre of the crop has a subpixel offset."""
     sizes, f, baseline = (640, 400), 500.0, 0.2
     T = np.eye(4)
     T[0, 3] = baseline

@@ -1,4 +1,4 @@
-"""Recordings that are damaged, foreign or contradict themselves: one line each, nothing written."""
+"""Damaged or contradictory recordings raise a one-line error and write nothing."""
 
 import json
 from collections.abc import Callable
@@ -47,7 +47,7 @@ def _rows(path: Path, change: Callable[[list[str]], list[str]]) -> None:
 
 
 def _edit_motion(path: Path) -> None:
-    """Leave the last row of the motion out."""
+    """Remove the last row of the motion."""
     document = read_yaml(path)
     document["cam1"]["T_cn_cnm1"] = document["cam1"]["T_cn_cnm1"][:3]
     path.write_text(json.dumps(document))  # JSON is YAML

@@ -1,4 +1,4 @@
-"""Pictures that are named by number have the time of that number, also where some are missing."""
+"""Numbered pictures get the times of their numbers even if some are missing."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Where attitude comes from: the floor's plane, a trajectory that tilts, the pictures."""
+"""Attitude from the floor plane, a tilted trajectory or the pictures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,9 +8,14 @@ import pytest
 
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.formats import read_recording
-from mapfusion.datasets.imu import Inertial
-from mapfusion.datasets.levelling import Floor, Levels, floor_of, known_from
-from mapfusion.datasets.stereo_import import Cut, StereoImport, write_imported
+from mapfusion.datasets.imu import ImuData
+from mapfusion.datasets.levelling import (
+    AttitudeMeasurements,
+    Floor,
+    choose_attitude_source,
+    fit_floor,
+)
+from mapfusion.datasets.stereo_import import RecordingPart, StereoImport, write_imported
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.datasets.tum import TimedPoses
 from mapfusion.errors import InputError
@@ -23,7 +28,7 @@ from tests.mapfusion.datasets.written_layouts import POSES, drive, write_kitti
 
 HEIGHT_M = 1.65
 SIGMA_M = 0.02
-WHOLE = Cut("R1", slice(None))
+WHOLE = RecordingPart("R1", slice(None))
 
 
 def usual(_: FrontEndParameters) -> FrontEndParameters:
@@ -31,7 +36,7 @@ def usual(_: FrontEndParameters) -> FrontEndParameters:
 
 
 def road(rng: np.random.Generator, value: np.ndarray, n: int, clutter: int) -> Observations:
-    """Floor points as a body at roll, pitch, height (3,) sees them, and what stands on it."""
+    """Return floor points and objects in the frame of a body at roll, pitch and height (3,)."""
     floor = np.c_[rng.uniform([3, -4], [20, 4], (n, 2)), np.zeros(n)]
     things = rng.uniform([3, -6, 0.1], [25, 6, 3], (clutter, 3))
     p = np.concatenate([floor, things]) - [0, 0, value[2]]
@@ -44,7 +49,7 @@ def test_a_floor_alone_is_found_as_well_as_stated() -> None:
     squares = []
     for _ in range(200):
         value = rng.normal(0, [0.03, 0.03, 0.05])
-        floor = floor_of(road(rng, value, 60, 0), HEIGHT_M, 0.99)
+        floor = fit_floor(road(rng, value, 60, 0), HEIGHT_M, 0.99)
         assert floor is not None
         found, sigma = floor.attitude
         squares.append(((found - value) / sigma) ** 2)
@@ -65,7 +70,7 @@ def test_a_floor_is_no_surer_than_its_points_lie(rougher: float, excess: float) 
     p[:, 2] = rougher * SIGMA_M * rng.standard_normal(n)
     stated = np.zeros((n, 3, 3))
     stated[:, 2, 2] = SIGMA_M**2
-    floor = floor_of(Observations(p, stated), HEIGHT_M, 0.99)
+    floor = fit_floor(Observations(p, stated), HEIGHT_M, 0.99)
     assert floor is not None
     design = np.c_[p[:, :2], np.ones(n)]
     alone = np.linalg.inv(design.T @ design) * SIGMA_M**2 * n / floor.n_points
@@ -88,7 +93,7 @@ def test_what_stands_on_it_does_not_tilt_it() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         value = rng.normal(0, [0.03, 0.03, 0.05])
-        floor = floor_of(road(rng, value, 60, 60), HEIGHT_M, 0.99)
+        floor = fit_floor(road(rng, value, 60, 60), HEIGHT_M, 0.99)
         assert floor is not None
         found, _ = floor.attitude
         assert np.all(np.abs(found - value) < [0.012, 0.012, 0.05])
@@ -96,19 +101,19 @@ def test_what_stands_on_it_does_not_tilt_it() -> None:
 
 def test_where_no_floor_shows_there_is_none() -> None:
     rng = np.random.default_rng(2)
-    assert floor_of(road(rng, np.zeros(3), 5, 0), HEIGHT_M, 0.99) is None
+    assert fit_floor(road(rng, np.zeros(3), 5, 0), HEIGHT_M, 0.99) is None
     wall = road(rng, np.array([0.0, 0.9, 0.0]), 60, 0)
-    assert floor_of(wall, HEIGHT_M, 0.99) is None
+    assert fit_floor(wall, HEIGHT_M, 0.99) is None
     line = road(rng, np.zeros(3), 60, 0)
     on_a_line = line.position_m * [1.0, 0.0, 0.0]
-    assert floor_of(replace(line, position_m=on_a_line), HEIGHT_M, 0.99) is None
+    assert fit_floor(replace(line, position_m=on_a_line), HEIGHT_M, 0.99) is None
 
 
 def test_heights_of_a_trajectory_are_above_its_beginning() -> None:
-    """A trajectory may begin at any height, a map begins on its floor."""
+    """The height of a map is relative to the first frame of the trajectory."""
     odometry = se3.in_space(np.zeros((2, 3)), [[0.0, 0.0], [0.1, -0.2]])
     odometry[:, 2, 3] = [5.0, 5.25]
-    levels = Levels("odometry", StereoCamera(), np.eye(4), odometry)
+    levels = AttitudeMeasurements("odometry", StereoCamera(), np.eye(4), odometry)
     nothing = Features(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty((0, 64)))
     assert levels.measured(0, nothing, 0.3).value == pytest.approx([0.0, 0.0, 0.0])
     assert levels.measured(1, nothing, 0.3).value == pytest.approx([0.1, -0.2, 0.25])
@@ -117,11 +122,14 @@ def test_heights_of_a_trajectory_are_above_its_beginning() -> None:
 def test_by_default_the_odometry_says_whether_the_body_is_level() -> None:
     upright = se3.from_planar(np.array([[0, 0, 0.3], [1, 0, 0.4]]))
     tilted = se3.in_space(np.array([[0, 0, 0.3], [1, 0, 0.4]]), [[0, 0], [0, 0.01]])
-    found = [known_from("auto", odometry) for odometry in (None, upright, tilted)]
+    found = [choose_attitude_source("auto", odometry) for odometry in (None, upright, tilted)]
     assert found == ["pictures", "mount", "odometry"]
-    assert known_from("floor", upright) == "floor"
-    felt = Inertial(np.zeros(1, np.int64), np.array([[0.0, 0.0, 9.8]]))
-    assert [known_from("auto", each, felt) for each in (None, upright)] == ["imu", "mount"]
+    assert choose_attitude_source("floor", upright) == "floor"
+    felt = ImuData(np.zeros(1, np.int64), np.array([[0.0, 0.0, 9.8]]))
+    assert [choose_attitude_source("auto", each, felt) for each in (None, upright)] == [
+        "imu",
+        "mount",
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +140,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> StereoRecording:
 def test_a_trajectory_that_tilts_levels_what_is_seen(
     recording: StereoRecording, tmp_path: Path
 ) -> None:
-    """A body that is said to look down has seen the same points lower; its way is the same."""
+    """A stated downward pitch lowers the observed points and keeps the path."""
     roll_pitch = [0.02, 0.05]
     T = se3.in_space(POSES, np.tile(roll_pitch, (len(POSES), 1)))
     tilted = replace(recording, odometry=TimedPoses(recording.time_ns, T))

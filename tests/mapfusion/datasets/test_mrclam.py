@@ -1,4 +1,4 @@
-"""A small recording in MRCLAM's format, written here with a known truth, and what comes of it."""
+"""MRCLAM importer on a small synthetic recording with known truth."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ DURATION_S = 40.0
 
 
 def true_pose(robot: int, time_s: float) -> np.ndarray:
-    """Stands for a second, then drives on a circle."""
+    """Stand for a second, then drive on a circle."""
     drive_s, turn = max(time_s - 1.0, 0.0), TURN_RAD_S[robot]
     angle, radius = turn * drive_s, SPEED_M_S / turn
     arc = np.array([radius * np.sin(angle), radius * (1 - np.cos(angle)), angle])

@@ -1,11 +1,16 @@
-"""Poses between poses, and the frames that bodies and cameras come in."""
+"""Interpolation of poses, camera mounts and body frames."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
-from mapfusion.datasets.levelling import MountSettings, level_mount, levelled, robot_in_body
+from mapfusion.datasets.levelling import (
+    MountSettings,
+    level_mount,
+    level_observations,
+    robot_in_body,
+)
 from mapfusion.datasets.tum import TimedPoses
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
@@ -51,7 +56,7 @@ def test_times_that_run_back_are_refused() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_robot_looks_where_its_camera_does(seed: int) -> None:
-    """Whatever order a body has its axes in, and whatever small angle its camera is off by."""
+    """The mount is recovered for any order of the body axes and a small camera rotation."""
     rng = np.random.default_rng(seed)
     axes = np.rint(Rotation.create_group("O").as_matrix())[rng.integers(24)]
     off = Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3)).as_matrix()
@@ -76,11 +81,11 @@ def test_a_level_camera_keeps_its_observations() -> None:
     camera, rng = StereoCamera(), np.random.default_rng(0)
     seen = Observations(rng.normal(size=(5, 3)), np.tile(np.eye(3), (5, 1, 1)))
     T = level_mount(camera.baseline_m, camera.mount_x_m, camera.mount_z_m)
-    assert levelled(seen, camera, T) is seen
+    assert level_observations(seen, camera, T) is seen
 
 
 def test_what_is_fixed_to_a_body_moves_with_it() -> None:
-    """A point of the other body lies where the first body's pose carries it."""
+    """A point of the other body is transformed by the pose of the first body."""
     rng = np.random.default_rng(3)
     T, T_body_other, point = poses(rng, 4), poses(rng, 1)[0], np.array([*rng.normal(size=3), 1.0])
     moved = TimedPoses(TIMES_NS, T).moved(T_body_other)

@@ -1,9 +1,9 @@
-"""Motions and paths of the KITTI extract, beside OpenCV's and what is measured of its truth."""
+"""Motions and paths of the KITTI extract compared with OpenCV and the truth."""
 
 import numpy as np
 import pytest
 
-from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.mapping import run_log
@@ -27,7 +27,7 @@ CUTS = {
 
 
 def chained(motions: np.ndarray) -> np.ndarray:
-    """Poses (T, 4, 4) from motions (T - 1, 4, 4)."""
+    """Return poses (T, 4, 4) from motions (T - 1, 4, 4)."""
     poses = [np.eye(4)]
     for T in motions:
         poses.append(poses[-1] @ T)
@@ -36,7 +36,7 @@ def chained(motions: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def by_opencv(work: StereoImport) -> list[np.ndarray]:
-    """Motions (25, 4, 4) of the robot by five seeds of RANSAC."""
+    """Return motions (25, 4, 4) of the robot for five seeds of RANSAC."""
     pairs = lk_pnp.correspondences(work, 26)
     return [lk_pnp.motions(work, pairs, seed) for seed in range(5)]
 
@@ -120,7 +120,7 @@ def test_kitti_paths_are_no_worse_than_their_odometry(work: StereoImport) -> Non
     for name, rows in CUTS.items():
         frames = np.arange(26)[rows]
         first = int(np.argmax(frames >= UNMEASURED))
-        one = work.log_of(Cut(name.replace("-", "_"), rows))
+        one = work.log_of(RecordingPart(name.replace("-", "_"), rows))
         for kept, ratio in zip((whole, measured), over_odometry(one, first), strict=True):
             kept.append(ratio)
     assert max(measured) <= 1.0
@@ -131,7 +131,7 @@ def test_kitti_paths_are_no_worse_than_their_odometry(work: StereoImport) -> Non
 def test_kitti_s_right_links_are_kept(
     kitti: StereoRecording, work: StereoImport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Links that lie within 1.5 px, 1 px in disparity, of where the true motion takes them."""
+    """Reprojection errors by the true motion are below 1.5 px, and 1 px in disparity."""
     calls = []
     found_by = tracking.estimate_rigid_motion
 

@@ -1,4 +1,4 @@
-"""Extracts of KITTI and EuRoC: enough is seen of them, and the maps of their parts are one."""
+"""Extracts of KITTI and EuRoC: observations suffice and maps of parts agree."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from mapfusion.align.aligners import make_aligner
 from mapfusion.align.correspondences import match
 from mapfusion.datasets.camera_calibration import Lens, StereoCalibration
 from mapfusion.datasets.formats import read_recording
-from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.errors import InputError
 from mapfusion.fastslam.filter import FastSlamParameters
@@ -76,7 +76,7 @@ def assert_aligned(pair: list[Imported], T: np.ndarray, seed: int) -> None:
 @pytest.mark.parametrize("first", [0, 12])
 def test_kitti_seen_by_two_robots_is_one_map(work: StereoImport, first: int) -> None:
     """Even and odd frames: all, and those from the thirteenth on, whose truth was measured."""
-    pair = [work.log_of(Cut(f"{k}", slice(first + k, None, 2))) for k in (0, 1)]
+    pair = [work.log_of(RecordingPart(f"{k}", slice(first + k, None, 2))) for k in (0, 1)]
     T = se2.between(*[one.truth[0] for one in pair if one.truth is not None])
     for seed in range(5):
         assert_aligned(pair, T, seed)
@@ -87,7 +87,10 @@ def test_kitti_parts_of_a_drive_are_one_map(work: StereoImport, imported: Import
 
     The extract's truth there is no measured one (`test_real_paths.py`).
     """
-    pair = [work.log_of(Cut(name, slice(*rows))) for name, rows in (("A", (0, 18)), ("B", (8, 26)))]
+    pair = [
+        work.log_of(RecordingPart(name, slice(*rows)))
+        for name, rows in (("A", (0, 18)), ("B", (8, 26)))
+    ]
     for seed in range(5):
         assert_aligned(pair, dead_reckoned(imported.log.odometry)[8], seed)
 

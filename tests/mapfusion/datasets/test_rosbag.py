@@ -1,4 +1,4 @@
-"""Bags of ROS 2 written here by hand, and bags of both kinds that are damaged or lack a topic."""
+"""ROS bags: handwritten ROS 2 bags, and damaged or incomplete bags of both versions."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
 from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import export_drive, read_recording
-from mapfusion.datasets.rosbag import RosbagSettings, chained, picture
+from mapfusion.datasets.rosbag import RosbagSettings, decode_image, lookup_transform
 from mapfusion.errors import InputError
 from tests.mapfusion.datasets.written_layouts import CAMERA, POSES, TIMES_S, drive
 
@@ -56,7 +56,7 @@ def tilted() -> np.ndarray:
 
 
 def messages(encoding: str) -> list[tuple[str, str, int, Any]]:
-    """Topic, type, frame and message of a short drive, in the order of time."""
+    """Return topic, type, frame and message of a short drive in the order of time."""
     found = []
     for k, pair in enumerate(drive()[:3]):
         for camera, image in enumerate(pair):
@@ -140,10 +140,10 @@ def test_frames_are_chained_up_and_down_a_tree() -> None:
         transform("a", "b", turned, b),
         transform("/root", "/c", turned, c),
     ]
-    found = chained(tree, "c", "b")
+    found = lookup_transform(tree, "c", "b")
     assert found is not None
     np.testing.assert_allclose(found[:3, 3], a + b - c, atol=1e-12)
-    assert chained(tree, "c", "elsewhere") is None
+    assert lookup_transform(tree, "c", "elsewhere") is None
 
 
 def test_rows_with_padding_and_deep_levels_are_read() -> None:
@@ -151,7 +151,7 @@ def test_rows_with_padding_and_deep_levels_are_read() -> None:
     padded = np.zeros((3, 10), np.uint8)
     padded[:, :8] = levels.astype(">u2").view(np.uint8)
     message = T["sensor_msgs/msg/Image"](header(0, "c"), 3, 4, "mono16", 1, 10, padded.ravel())
-    np.testing.assert_array_equal(picture(message), levels)
+    np.testing.assert_array_equal(decode_image(message), levels)
 
 
 @pytest.mark.parametrize(

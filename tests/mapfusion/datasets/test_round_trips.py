@@ -1,4 +1,4 @@
-"""What is written in the layouts of others is read again as it was: pictures, times, points."""
+"""Exported drives are read again without change: pictures, times, points."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import EXPORTERS, export_drive, read_recording, settings_class
 from mapfusion.datasets.levelling import MountSettings
-from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
+from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2, se3
@@ -52,7 +52,7 @@ def written() -> StereoDrive:
 
 
 def every_frame(_: FrontEndParameters) -> FrontEndParameters:
-    """Settings of a simulation, with tracks that count at once."""
+    """Return simulation settings in which new tracks count at once."""
     usual = FrontEndParameters()
     return replace(usual, tracks=replace(usual.tracks, min_length=1))
 
@@ -66,7 +66,7 @@ def imported(
     recording = read_again(name, path)
     assert recording.name == "R1"
     work = StereoImport(recording, every_frame)
-    return name, recording, work.log_of(Cut("R1", slice(None))), work
+    return name, recording, work.log_of(RecordingPart("R1", slice(None))), work
 
 
 def test_there_is_a_test_of_each_format() -> None:
@@ -89,7 +89,7 @@ def test_times_and_odometry_are_the_same(imported: tuple) -> None:
 
 
 def test_the_truth_is_the_same(imported: tuple) -> None:
-    """In the world where the layout knows one; KITTI begins at the first pose."""
+    """Truth is in the world frame, or relative to the first pose for KITTI."""
     name, _, one, _ = imported
     assert one.truth is not None
     wanted = se2.between(TRUTH[0], TRUTH) if name == "kitti" else TRUTH
@@ -140,9 +140,9 @@ def test_a_bag_of_ros_2_takes_the_place_of_a_bag_alone(
 def test_a_body_that_tilts_is_written_and_read(
     written: StereoDrive, name: str, tmp_path: Path
 ) -> None:
-    """The truth in space; what it measures of its tilt with the odometry, which stays the same."""
+    """The true tilt is part of the truth, the measured tilt part of the odometry."""
     tilt_rad = np.array([[0.05, -0.02], [0.01, 0.06], [-0.04, 0.03]])
-    tilted = replace(written, tilt_rad=tilt_rad, told_tilt_rad=tilt_rad + 0.004)
+    tilted = replace(written, tilt_rad=tilt_rad, measured_tilt_rad=tilt_rad + 0.004)
     (path,) = export_drive(name, tmp_path, tilted)
     recording = read_again(name, path)
     assert recording.truth is not None
@@ -153,7 +153,7 @@ def test_a_body_that_tilts_is_written_and_read(
         atol=1e-9,
     )  # fmt: skip
     np.testing.assert_allclose(se3.roll_pitch(told[:, :3, :3]), tilt_rad + 0.004, atol=1e-12)
-    made = StereoImport(recording, every_frame).log_of(Cut("R1", slice(None)))
+    made = StereoImport(recording, every_frame).log_of(RecordingPart("R1", slice(None)))
     np.testing.assert_allclose(made.log.odometry, WHEELS, atol=1e-12)
     assert made.attitude is not None
     np.testing.assert_allclose(made.attitude.value[0, :2], tilt_rad[0] + 0.004, atol=1e-4)

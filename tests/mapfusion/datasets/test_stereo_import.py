@@ -1,9 +1,13 @@
-"""Settings that follow from a camera: the same disparities, whatever its metres."""
+"""Front-end settings scale with the camera and keep their disparities."""
 
 import numpy as np
 import pytest
 
-from mapfusion.datasets.stereo_import import derived_vision, strays_px, with_window_for
+from mapfusion.datasets.stereo_import import (
+    front_end_for_camera,
+    reprojection_errors_px,
+    scale_descriptor_window,
+)
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.vision.front_end import FrontEndParameters
@@ -15,7 +19,7 @@ from mapfusion.vision.visual_odometry import RigidMotion
 def test_depths_are_those_of_the_usual_disparities(focal_px: float, baseline_m: float) -> None:
     usual, head = FrontEndParameters(), StereoCamera()
     camera = StereoCamera(640, 480, focal_px, baseline_m)
-    own = derived_vision(camera)
+    own = front_end_for_camera(camera)
     for mine, theirs in (
         (own.max_depth_m, usual.max_depth_m),
         (own.stereo.min_depth_m, usual.stereo.min_depth_m),
@@ -28,10 +32,11 @@ def test_depths_are_those_of_the_usual_disparities(focal_px: float, baseline_m: 
 def test_the_window_doubles_with_the_depths_that_are_seen() -> None:
     camera, vision = StereoCamera(), FrontEndParameters()
     sides = [
-        with_window_for(vision, camera, np.full(9, depth)).usurf.side_m for depth in (3, 4, 7, 14)
+        scale_descriptor_window(vision, camera, np.full(9, depth)).usurf.side_m
+        for depth in (3, 4, 7, 14)
     ]
     assert sides == pytest.approx([0.6, 0.6, 1.2, 2.4])
-    assert with_window_for(vision, camera, np.empty(0)) is vision
+    assert scale_descriptor_window(vision, camera, np.empty(0)) is vision
 
 
 def test_what_tracks_stray_is_the_noise_of_their_places() -> None:
@@ -46,7 +51,7 @@ def test_what_tracks_stray_is_the_noise_of_their_places() -> None:
         Tracks(rows, rows, seen[rows, :2] + noise * rng.standard_normal((n, 2)), seen[rows, 2], own)
         for rows, seen, own in ((np.arange(n), uvd[0], None), (order, uvd[1], motion))
     )
-    strays = strays_px(camera, before, after)
+    strays = reprojection_errors_px(camera, before, after)
     assert len(strays) == 2 * n
     # the motion hardly scales the picture: two frames have an equal share in what strays
     assert np.std(strays) == pytest.approx(np.sqrt(2) * noise, rel=0.04)

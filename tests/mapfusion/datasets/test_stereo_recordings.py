@@ -1,4 +1,4 @@
-"""Four layouts of one rendered drive give one log; what is wrong with any is one line."""
+"""Four layouts of one rendered drive give the same log."""
 
 import shutil
 from dataclasses import replace
@@ -11,8 +11,8 @@ import pytest
 
 from mapfusion.datasets.formats import import_recording, read_recording, settings_class
 from mapfusion.datasets.levelling import MountSettings
-from mapfusion.datasets.stereo_import import Cut, Imported, StereoImport
-from mapfusion.datasets.stereo_recording import Shot, paired
+from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
+from mapfusion.datasets.stereo_recording import Shot, pair_shots
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2, se3
 from mapfusion.robot_log import read_log
@@ -40,7 +40,7 @@ def pairs() -> list[Pair]:
 
 @pytest.fixture(scope="module")
 def folders(pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Layouts that tests only read."""
+    """Return layouts that tests only read."""
     return {name: write(tmp_path_factory.mktemp(name), pairs) for name, write in WRITERS.items()}
 
 
@@ -50,7 +50,7 @@ def read(name: str, folder: Path, **mount: float) -> Any:
 
 
 def imported(name: str, folder: Path, rows: slice = slice(None), **mount: float) -> Imported:
-    return StereoImport(read(name, folder, **mount)).log_of(Cut("R1", rows))
+    return StereoImport(read(name, folder, **mount)).log_of(RecordingPart("R1", rows))
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_observations_lie_on_the_walls(name: str, logs: dict[str, Imported]) -> 
 def test_the_truth_of_a_colour_pair_is_of_a_robot_that_carries_it(
     folders: dict[str, Path], tmp_path: Path
 ) -> None:
-    """The colour pair stands 0.06 m to the left of the grey one, and so does its robot."""
+    """The colour pair and its robot are 0.06 m to the left of the grey pair."""
     day = Path(shutil.copytree(folders["kitti_raw"].parent, tmp_path / "day"))
     drive, aside_m = day / folders["kitti_raw"].name, 0.06
     for grey, colour in ((0, 2), (1, 3)):
@@ -162,7 +162,7 @@ def test_a_tilted_mount_turns_the_points_back(folders: dict[str, Path]) -> None:
 def test_sixteen_bits_and_colour_are_the_same_pictures(
     pairs: list[Pair], folders: dict[str, Path], tmp_path: Path
 ) -> None:
-    """Ten bits stored in sixteen lose two; grey in three channels stays grey."""
+    """Ten bits in 16 are shifted by two; grey in three channels is unchanged."""
     deep = [tuple(4 * image.astype(np.uint16) for image in pair) for pair in pairs]
     coloured = [tuple(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) for image in pair) for pair in pairs]
     for name, written in (("deep", deep), ("coloured", coloured)):
@@ -189,12 +189,12 @@ def test_pairs_are_each_others_nearest_in_time() -> None:
         return [Shot(round(1e6 * t), f"{t}", lambda: np.zeros((1, 1))) for t in times_ms]
 
     left, right = shots(0, 50, 100, 150, 200, 300, 301.5), shots(1, 51, 99, 101, 149, 260, 301)
-    times, pictures, dropped = paired(left, right)
+    times, pictures, dropped = pair_shots(Path("drive"), left, right)
     assert (times / 1e6).tolist() == [0, 50, 100, 150, 301.5]
     assert len(pictures) == 5
     assert [text.split(" (")[0] for text in dropped] == ["200", "300", "101", "260"]
     with pytest.raises(InputError, match="make 1 pairs"):
-        paired(shots(0, 50), shots(0, 90))
+        pair_shots(Path("drive"), shots(0, 50), shots(0, 90))
 
 
 def test_a_list_of_pairs_stands_for_folders(pairs: list[Pair], tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def test_a_list_of_pairs_stands_for_folders(pairs: list[Pair], tmp_path: Path) -
 
 
 def test_pictures_alone_tell_the_way(pairs: list[Pair], tmp_path: Path) -> None:
-    """Also over the pause, which is a step twice as long."""
+    """The pause is a step of twice the length."""
     sequence = write_kitti(tmp_path, pairs)
     (sequence / "odometry.tum").unlink()
     seen = imported("kitti", sequence)
@@ -251,11 +251,11 @@ def test_front_end_settings_can_be_replaced(folders: dict[str, Path]) -> None:
         return replace(derived, harris=replace(derived.harris, max_corners=20))
 
     work = StereoImport(read("kitti", folders["kitti"]), fewer)
-    assert work.log_of(Cut("R1", slice(None))).observations.max() <= 20
+    assert work.log_of(RecordingPart("R1", slice(None))).observations.max() <= 20
 
 
 def test_pictures_go_with_the_times_in_their_names(tmp_path: Path) -> None:
-    """By name 10.0.png comes before 9.5.png; each picture is one grey level, which tells it."""
+    """10.0.png precedes 9.5.png by name; a unique grey level identifies each picture."""
     seconds, size = ("9.0", "9.5", "10.0", "10.5"), (CAMERA.height_px, CAMERA.width_px)
     for side in ("left", "right"):
         (tmp_path / side).mkdir()

@@ -1,4 +1,4 @@
-"""A short rendered drive, written by hand in the layouts that others publish."""
+"""Short rendered drive, written in the published layouts without the exporters."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def read_yaml(path: Path) -> dict:
 
 
 def drive() -> list[Pair]:
-    """Pictures of a room whose end wall is 3 m ahead."""
+    """Render pictures of a room whose end wall is 3 m ahead."""
     rng = np.random.default_rng(0)
     planes = [
         wall(rng, (3, 2), (3, -2), 6.0, -2.0, texels_per_m=60),
@@ -44,14 +44,14 @@ def matrix_of(pose: np.ndarray) -> np.ndarray:
 
 
 def robot_from_left() -> np.ndarray:
-    """T_robot_left, of optical axes."""
+    """Return T_robot_left in optical axes."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = OPTICAL.T, CAMERA.p_robot_left
     return T
 
 
 def tum_lines(start_ns: int, poses: np.ndarray) -> str:
-    """A trajectory of the robot, in TUM's format."""
+    """Return a trajectory of the robot in the TUM format."""
     lines = ["# a comment"]
     for t, (x, y, theta) in zip(TIMES_S, poses.tolist(), strict=False):
         ns = start_ns + round(1e9 * t)
@@ -61,7 +61,7 @@ def tum_lines(start_ns: int, poses: np.ndarray) -> str:
 
 
 def write_kitti(root: Path, pairs: list[Pair]) -> Path:
-    """`root/sequences/07` and `root/poses/07.txt`; returns the sequence."""
+    """Write `root/sequences/07` and `root/poses/07.txt`; return the sequence."""
     sequence = root / "sequences" / "07"
     for camera in (0, 1):
         (sequence / f"image_{camera}").mkdir(parents=True)
@@ -91,7 +91,7 @@ RECTIFIED, VELO_CAMERA, IMU_VELO = (
 
 
 def write_kitti_raw(root: Path, pairs: list[Pair]) -> Path:
-    """A drive in the folder of its day; returns the drive."""
+    """Write a raw drive in the folder of its day and return its path."""
     day = root / "2011_09_26"
     drive = day / "2011_09_26_drive_0007_sync"
     start = np.datetime64("2011-09-26T13:02:25.964389445", "ns")
@@ -119,7 +119,7 @@ def write_kitti_raw(root: Path, pairs: list[Pair]) -> Path:
 
 
 def write_oxts(oxts: Path, stamped: str, poses: np.ndarray) -> None:
-    """States of an inertial unit 2 degrees north of the equator, where lengths are 0.06 % off."""
+    """Write states of an inertial unit 2 degrees north of the equator (0.06 % scale error)."""
     (oxts / "data").mkdir(parents=True)
     (oxts / "timestamps.txt").write_text(stamped)
     first = np.radians(2.0)
@@ -139,7 +139,7 @@ def spaced(values: np.ndarray) -> str:
 
 
 def write_euroc(root: Path, pairs: list[Pair]) -> Path:
-    """`root/mav0`, of a body whose x axis looks up, y left and z back: as MAVs have them."""
+    """Write `root/mav0` for a body with x up, y left and z back, as on MAVs."""
     T_body_robot = np.eye(4)
     T_body_robot[:3, :3] = np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0.0]])
     stamps = [START_NS + round(1e9 * t) for t in TIMES_S[: len(pairs)]]

@@ -1,0 +1,287 @@
+"""Relative motions between frames of a robot log: observed ones, and those of odometry or truth.
+
+A motion is observed if two frames show the same points: a least-squares fit of these points gives
+the motion and its covariance. Motions of odometry or truth are differences of poses.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.geometry import se3
+from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.se2 import between, rotation, wrap
+from mapfusion.robot_log import NO_TRACK, RobotLog
+from mapfusion.tables import NO_LABEL
+from mapfusion.vision.visual_odometry import MIN_LINKS, RigidMotion, rigid_links
+
+PLANAR = [0, 1, 5]  # x, y and the rotation about z, within shifts and rotation vectors in space
+MIN_MOTIONS = 4  # of which a median is computed
+_LINK_PROBABILITY = 0.999  # that a true link of consecutive frames lies inside the gate
+_MAX_DESCRIPTOR_DISTANCE = 0.5  # of unit vectors, as `FastSlamParameters.descriptor_threshold`
+# Tolerances added to the covariances of a planar fit, relative to the extent of the points.
+_TOLERANCES = (1.0, 0.25, 0.06, 0.015, 0.0)
+# Condition number of links at a single place, which leave the rotation undetermined.
+_MAX_CONDITION = 1e12
+_MIN_PLANAR_LINKS = 2  # to determine a planar motion; their distance is checked as well
+# Factors tried on stated covariances, and the number of frames for the trial: observations whose
+# covariances are in a wrong unit still determine the motion.
+_COVARIANCE_FACTORS, _TRIAL_FRAMES = (1.0, 1e2, 1e4, 1e6), 40
+
+
+class Motions(NamedTuple):
+    """Motions from frame `start` to frame `end` of a log, in the robot frame at the start.
+
+    Attributes:
+        start: first frames, shape (N,).
+        end: last frames, shape (N,).
+        motion: shifts in m and rotation vectors in rad, shape (N, 6).
+        covariance: error covariances, shape (N, 6, 6). For planar data only the entries of x, y
+            and the rotation about z are not zero.
+        n_links: number of points that both frames show, shape (N,).
+        n_agree: number of these points that agree with the motion, shape (N,).
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    motion: Float
+    covariance: Float
+    n_links: np.ndarray
+    n_agree: np.ndarray
+
+    @property
+    def sigma(self) -> Float:
+        """Root of the trace for shifts (m) and for rotations (rad), shape (N, 2)."""
+        variance = np.diagonal(self.covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
+        return np.sqrt(variance.sum(axis=2))
+
+
+class _PairMotion(NamedTuple):
+    """Observed motion T_first_second (4, 4) of one pair of frames; other fields as `Motions`."""
+
+    T: Float
+    covariance: Float
+    n_links: int
+    n_agree: int
+
+
+def links(
+    log: RobotLog, starts: np.ndarray, first: int, second: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the observations of the same points in two frames.
+
+    Points are matched by label if the log has labels, else by track, else by mutually nearest
+    descriptors.
+
+    Args:
+        log: the robot log.
+        starts: `log.frame_starts()`.
+        first: one frame.
+        second: the other frame.
+
+    Returns:
+        Rows of the log's observations in the first and in the second frame, each of shape (n,).
+    """
+    seen = log.observations
+    a, b = (np.arange(starts[k], starts[k + 1]) for k in (first, second))
+    for names, none in ((seen.label, NO_LABEL), (seen.track, NO_TRACK)):
+        if names is not None:
+            a, b = a[names[a] != none], b[names[b] != none]
+            _, own, other = np.intersect1d(names[a], names[b], return_indices=True)
+            return a[own], b[other]
+    if seen.descriptor is None or not len(a) or not len(b):
+        return a[:0], b[:0]
+    similarity = seen.descriptor[a] @ seen.descriptor[b].T
+    other, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    similar = similarity.max(axis=1) > 1 - _MAX_DESCRIPTOR_DISTANCE**2 / 2
+    mutual = similar & (back[other] == np.arange(len(a)))
+    return a[mutual], b[other[mutual]]
+
+
+def _planar_motion(
+    p_before: Float, S_before: Float, p_after: Float, S_after: Float
+) -> _PairMotion | None:
+    """Fit a planar motion to links; return None if fewer than two agree or the rotation is free.
+
+    The fit is a weighted least-squares fit of the links inside the gate. A tolerance that is added
+    to all covariances decreases to zero, as in `rigid_links`.
+    """
+    n = len(p_before)
+    extent = float(np.sqrt(np.mean(np.var(p_after, axis=0)))) or 1.0
+    weight, agree, gate = np.ones(n), np.ones(n, dtype=bool), chi_square_bound(_LINK_PROBABILITY, 2)
+    for tolerance in _TOLERANCES:
+        # Closed-form weighted least squares (Umeyama 1991).
+        before, after, share = p_before[agree], p_after[agree], weight[agree] / weight[agree].sum()
+        mean_before, mean_after = share @ before, share @ after
+        a, b = before - mean_before, after - mean_after
+        sine = share @ (b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0])
+        theta = float(np.arctan2(sine, share @ np.sum(a * b, axis=1)))
+        R = rotation(theta)
+        t = mean_before - R @ mean_after
+        # Gate and weights of the next fit.
+        residual = p_before - p_after @ R.T - t
+        spread = S_before + R @ S_after @ R.T + (tolerance * extent) ** 2 * np.eye(2)
+        information = np.linalg.inv(spread)
+        square = np.einsum("ni,nij,nj->n", residual, information, residual)
+        agree, weight = square <= gate, 1.0 / np.trace(spread, axis1=1, axis2=2)
+        if np.count_nonzero(agree) < _MIN_PLANAR_LINKS:
+            return None
+    # Covariance of the weighted least-squares estimate: G S G'.
+    lever = p_after[agree] @ R.T
+    J = np.zeros((len(lever), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    normal = np.einsum("nia,n,nib->ab", J, weight[agree], J)
+    if np.linalg.cond(normal) > _MAX_CONDITION:
+        return None
+    gain = np.einsum("ab,nib,n->nai", np.linalg.inv(normal), J, weight[agree])
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(PLANAR, PLANAR)] = np.einsum("nai,nij,nbj->ab", gain, spread[agree], gain)
+    T = se3.from_planar(np.array([*t, theta]))
+    return _PairMotion(T, covariance, n, int(np.count_nonzero(agree)))
+
+
+def _pair_motion(
+    log: RobotLog, starts: np.ndarray, first: int, second: int, factor: float
+) -> _PairMotion | None:
+    """Return the motion between two frames; None if the links do not determine it.
+
+    Stated covariances are multiplied by `factor`.
+    """
+    a, b = links(log, starts, first, second)
+    seen = log.observations
+    p, S = seen.position_m, factor * seen.covariance_m2
+    if log.planar and len(a) >= _MIN_PLANAR_LINKS:
+        return _planar_motion(p[a, :2], S[a, :2, :2], p[b, :2], S[b, :2, :2])
+    if log.planar or len(a) < MIN_LINKS:
+        return None
+    _, found = rigid_links(p[a], S[a], p[b], S[b], _LINK_PROBABILITY)
+    if found is None:
+        return None
+    return _PairMotion(found.T_before_after, found.covariance, len(a), found.n_links)
+
+
+def _motion_vectors(T: Float) -> Float:
+    """Return shifts and rotation vectors (N, 6) of motions (N, 4, 4); NaN where unknown."""
+    from scipy.spatial.transform import Rotation  # the import takes a quarter of a second
+
+    vectors = np.full((len(T), 6), np.nan)
+    known = np.isfinite(T).all(axis=(1, 2))
+    vectors[known, :3] = T[known, :3, 3]
+    if known.any():
+        vectors[known, 3:] = Rotation.from_matrix(T[known, :3, :3]).as_rotvec()
+    return vectors
+
+
+def observed_motions(log: RobotLog, lag: int = 1, factor: float = 1.0) -> Motions:
+    """Return the motions over every `lag` frames, for the pairs of frames that share enough points.
+
+    Stated covariances are multiplied by `factor`.
+    """
+    starts, frames, found = log.frame_starts(), [], list[_PairMotion]()
+    for end in range(lag, len(log), lag):
+        motion = _pair_motion(log, starts, end - lag, end, factor)
+        if motion is not None:
+            frames.append((end - lag, end))
+            found.append(motion)
+    start, end = np.array(frames, dtype=np.int64).reshape(-1, 2).T
+    T = np.array([motion.T for motion in found]).reshape(-1, 4, 4)
+    covariance = np.array([motion.covariance for motion in found]).reshape(-1, 6, 6)
+    counts = np.array([(motion.n_links, motion.n_agree) for motion in found], dtype=np.int64)
+    return Motions(start, end, _motion_vectors(T), covariance, *counts.reshape(-1, 2).T)
+
+
+def motions_between_frames(motions: Sequence[tuple[int, RigidMotion]]) -> Motions:
+    """Return known motions from frame to frame as `Motions`; each is given with its last frame."""
+    end = np.array([k for k, _ in motions], dtype=np.int64)
+    T = np.array([motion.T_before_after for _, motion in motions]).reshape(-1, 4, 4)
+    covariance = np.array([motion.covariance for _, motion in motions]).reshape(-1, 6, 6)
+    n_links = np.array([motion.n_links for _, motion in motions], dtype=np.int64)
+    return Motions(end - 1, end, _motion_vectors(T), covariance, n_links, n_links)
+
+
+def odometry_motions(log: RobotLog, noise: MotionNoise) -> Motions:
+    """Return the motions from frame to frame of the odometry, with their stated noise."""
+    n = len(log) - 1
+    motion, covariance = np.zeros((n, 6)), np.zeros((n, 6, 6))
+    motion[:, PLANAR] = log.odometry[1:]
+    sigma = np.array([noise.standard_deviations(each) for each in log.odometry[1:]]).reshape(-1, 3)
+    covariance[:, PLANAR, PLANAR] = sigma**2
+    end, none = np.arange(1, n + 1), np.zeros(n, dtype=np.int64)
+    return Motions(end - 1, end, motion, covariance, none, none)
+
+
+def observed_spans(log: RobotLog) -> list[Motions]:
+    """Return observed motions from frame to frame and over spans of 2, 4, 8, ... frames.
+
+    Stated covariances that are far too small, such as covariances in a wrong unit, are enlarged
+    until the motion is determined for most frames that share points.
+    """
+    factor = 1.0
+    steps = observed_motions(log)
+    min_links = _MIN_PLANAR_LINKS if log.planar else MIN_LINKS
+    if 2 * len(steps) < len(log) - 1:
+        starts = log.frame_starts()
+        tried = np.unique(np.linspace(1, len(log) - 1, _TRIAL_FRAMES).astype(int)).tolist()
+        frames = [k for k in tried if len(links(log, starts, k - 1, k)[0]) >= min_links]
+        for factor in _COVARIANCE_FACTORS:
+            found = [_pair_motion(log, starts, k - 1, k, factor) for k in frames]
+            if 2 * sum(motion is not None for motion in found) >= len(frames):
+                break
+        steps = steps if factor == 1 else observed_motions(log, 1, factor)
+    return [steps, *(observed_motions(log, lag, factor) for lag in _span_lengths(len(log)))]
+
+
+def composed_spans(steps: Motions, n_frames: int) -> list[Motions]:
+    """Return motions from frame to frame and their compositions over 2, 4, 8, ... frames.
+
+    Only spans in which every step is known are composed. Covariances are summed.
+    """
+    from scipy.spatial.transform import Rotation
+
+    T_step = se3.pose(np.eye(3), np.zeros((int(steps.end.max(initial=0)) + 1, 3)))
+    step_covariance = np.full((len(T_step), 6, 6), np.nan)
+    if len(steps.end):
+        R = Rotation.from_rotvec(steps.motion[:, 3:]).as_matrix()
+        T_step[steps.end] = se3.pose(R, steps.motion[:, :3])
+    step_covariance[steps.end] = steps.covariance
+    spans = [steps]
+    for lag in _span_lengths(n_frames):
+        end = np.arange(lag, len(T_step), lag)
+        T = np.tile(np.eye(4), (len(end), 1, 1))
+        covariance = np.zeros((len(end), 6, 6))
+        for k in range(lag):
+            T = T @ T_step[end - lag + 1 + k]
+            covariance += step_covariance[end - lag + 1 + k]
+        known = np.isfinite(covariance).all(axis=(1, 2))
+        none = np.zeros(int(known.sum()), dtype=np.int64)
+        motion = _motion_vectors(T[known])
+        spans.append(Motions(end[known] - lag, end[known], motion, covariance[known], none, none))
+    return spans
+
+
+def _span_lengths(n_frames: int) -> list[int]:
+    """Return the span lengths 2, 4, 8, ... of which a log has enough spans."""
+    longest = max((n_frames - 1) // MIN_MOTIONS, 1)
+    return [2**k for k in range(1, int(np.log2(longest)) + 1)]
+
+
+def poses_from_increments(increments: Float) -> Float:
+    """Return poses (T, 3) in the first frame from increments (T, 3); the first row is ignored."""
+    heading = np.cumsum(increments[:, 2]) - increments[0, 2]
+    before = np.concatenate([[0.0], heading[:-1]])
+    step = np.einsum("nij,nj->ni", rotation(before), increments[:, :2])
+    return np.column_stack([np.cumsum(step, axis=0) - step[0], wrap(heading)])
+
+
+def motions_of_poses(poses: Float, start: np.ndarray, end: np.ndarray) -> tuple[Float, Float]:
+    """Return shifts (N, 3) and rotation vectors (N, 3) between poses (T, 3) or (T, 4, 4)."""
+    if poses.ndim == 3:
+        vectors = _motion_vectors(se3.between(poses[start], poses[end]))
+        return vectors[:, :3], vectors[:, 3:]
+    moved = between(poses[start], poses[end])
+    shift, turn = np.zeros((len(moved), 3)), np.zeros((len(moved), 3))
+    shift[:, :2], turn[:, 2] = moved[:, :2], moved[:, 2]
+    return shift, turn
