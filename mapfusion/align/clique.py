@@ -11,8 +11,13 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.consensus import Consensus, consistency, in_rows
-from mapfusion.align.mahalanobis_gate import PlanarPairs, Spread, settle, settle_at_best_scale
+from mapfusion.align.consensus import Consensus, consistency_graphs, packed_rows
+from mapfusion.align.mahalanobis_gate import (
+    PairSpread,
+    PlanarPairs,
+    refit_at_best_drift,
+    refit_to_support,
+)
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import WORD, chi_square_bound, count_common, kernel, trailing_zeros
@@ -29,13 +34,13 @@ def degrees(graph: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def has(bits: np.ndarray, v: int) -> bool:
+def contains(bits: np.ndarray, v: int) -> bool:
     """Whether v is in a set (W,)."""
     return (bits[v // WORD] >> np.uint64(v % WORD)) & np.uint64(1) != 0
 
 
 @kernel
-def members(bits: np.ndarray, into: np.ndarray) -> int:
+def list_members(bits: np.ndarray, into: np.ndarray) -> int:
     """Write the numbers of a set (W,) into `into`, ascending; returns how many there are."""
     count = 0
     for w in range(len(bits)):
@@ -48,7 +53,7 @@ def members(bits: np.ndarray, into: np.ndarray) -> int:
 
 
 @kernel
-def most_first(degree: np.ndarray) -> np.ndarray:
+def by_descending_degree(degree: np.ndarray) -> np.ndarray:
     """Vertices by descending degree (N,), those of one degree in their order (a counting sort).
 
     Those of a negative degree are left out.
@@ -67,26 +72,26 @@ def most_first(degree: np.ndarray) -> np.ndarray:
     return order
 
 
-def set_of(chosen: np.ndarray) -> np.ndarray:
+def bit_set(chosen: np.ndarray) -> np.ndarray:
     """The numbers that are marked (N,) as bits of words (W,)."""
     bits = np.zeros(-(-len(chosen) // WORD) * WORD, np.bool_)
     bits[: len(chosen)] = chosen
     return np.packbits(bits, bitorder="little").view("<u8")
 
 
-def everyone(n: int) -> np.ndarray:
+def full_set(n: int) -> np.ndarray:
     """The set (W,) of all numbers below n."""
-    return set_of(np.ones(n, np.bool_))
+    return bit_set(np.ones(n, np.bool_))
 
 
 @kernel
-def keep_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarray) -> int:
+def reduce_to_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarray) -> int:
     """Take away from `chosen` (W,) until all that remain have `least` neighbours among them.
 
     They are the core of that order (Seidman 1983): all cliques of more vertices than `least` are in
     it. Their numbers go into `rows`; returns how many, 0 where too few are left to have so many.
     """
-    n, before = members(chosen, rows), -1
+    n, before = list_members(chosen, rows), -1
     while n != before:
         before = n
         for i in range(before):
@@ -96,13 +101,13 @@ def keep_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarra
             if count_common(graph[v], chosen) < least:
                 chosen[v // WORD] &= ~(np.uint64(1) << np.uint64(v % WORD))
                 n -= 1
-        members(chosen, rows)
+        list_members(chosen, rows)
     return n if n > least else 0
 
 
-def may_hold(graph: np.ndarray, among: np.ndarray, size: int) -> bool:
+def may_contain_clique(graph: np.ndarray, among: np.ndarray, size: int) -> bool:
     """Whether some vertices (W,) have neighbours enough for a clique of more than `size`."""
-    return keep_core(graph, among.copy(), size, np.empty(len(graph), np.int64)) > 0
+    return reduce_to_core(graph, among.copy(), size, np.empty(len(graph), np.int64)) > 0
 
 
 @kernel
@@ -112,7 +117,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
     From `starts` vertices; of all walks (K,) the largest, the first on a tie.
     """
     n, words = graph.shape
-    order = most_first(degrees(graph))
+    order = by_descending_degree(degrees(graph))
     best, clique = np.zeros(n, np.int64), np.zeros(n, np.int64)
     size_of_best = 0
     left = np.empty(words, np.uint64)
@@ -125,7 +130,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
         for v in order:
             if not some:
                 break
-            if has(left, v):
+            if contains(left, v):
                 clique[size] = v
                 size += 1
                 some = np.uint64(0)
@@ -140,7 +145,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
 
 
 @kernel
-def colour(
+def greedy_colouring(
     graph: np.ndarray,
     candidates: np.ndarray,
     at_least: int,
@@ -196,7 +201,9 @@ def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np
     for v in range(n):
         candidates[0, v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
     depth = 0
-    listed[0] = colour(graph, candidates[0], at_least, vertex[0], number[0], uncoloured, same)
+    listed[0] = greedy_colouring(
+        graph, candidates[0], at_least, vertex[0], number[0], uncoloured, same
+    )
     while depth >= 0 and budget > 0:
         if listed[depth] == 0 or depth + number[depth, listed[depth] - 1] <= at_least:
             depth -= 1
@@ -212,7 +219,7 @@ def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np
         candidates[depth, v // WORD] &= ~(np.uint64(1) << np.uint64(v % WORD))
         if some:
             depth += 1
-            listed[depth] = colour(
+            listed[depth] = greedy_colouring(
                 graph,
                 candidates[depth],
                 at_least - depth,
@@ -234,7 +241,7 @@ def _subgraph(graph: np.ndarray, rows: np.ndarray) -> np.ndarray:
     small = np.zeros((n, (n + WORD - 1) // WORD), np.uint64)
     for i in range(n):
         for j in range(n):
-            if has(graph[rows[i]], rows[j]):
+            if contains(graph[rows[i]], rows[j]):
                 small[i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
     return small
 
@@ -257,15 +264,15 @@ def larger_clique(
     best, rows = np.zeros(0, np.int64), np.empty(n, np.int64)
     chosen, before = among.copy(), np.zeros(words, np.uint64)
     degree = np.full(n, -1)
-    for v in rows[: keep_core(graph, chosen, at_least, rows)]:
+    for v in rows[: reduce_to_core(graph, chosen, at_least, rows)]:
         degree[v] = count_common(graph[v], chosen)
-    for v in most_first(degree):
+    for v in by_descending_degree(degree):
         if degree[v] < at_least:  # a larger clique was found since
             break
         if count_common(before, graph[v]) >= at_least:
             for w in range(words):
                 chosen[w] = before[w] & graph[v, w]
-            count = keep_core(graph, chosen, at_least - 1, rows)
+            count = reduce_to_core(graph, chosen, at_least - 1, rows)
             if count:
                 small = _subgraph(graph, rows[:count])
                 found, budget = _branch_and_bound(small, at_least - 1, budget)
@@ -351,7 +358,7 @@ class CliqueSearch:
 
     def __init__(self, clique: Clique, pairs: PlanarPairs) -> None:
         self._pairs, self._bound, self._variances_m2 = pairs, clique.bound, clique.variances_m2
-        self._rows, self._spread = in_rows(pairs), Spread.of(pairs)
+        self._rows, self._spread = packed_rows(pairs), PairSpread.of(pairs)
         self._scales_m2 = float(self._variances_m2[0]), float(self._variances_m2[-1])
         self._agreement = chi_square_bound(clique.agreement_probability, 1)
         self._max_nodes = clique.max_nodes
@@ -362,7 +369,7 @@ class CliqueSearch:
 
     def graphs(self, rows: np.ndarray) -> np.ndarray:
         """Which of some pairs (n,) agree (2, n, W): without s_drift, and with it."""
-        return consistency(self._rows[rows], self._scales_m2, self._agreement)
+        return consistency_graphs(self._rows[rows], self._scales_m2, self._agreement)
 
     def offer_greedy(self, rows: np.ndarray, least: int = 2) -> np.ndarray:
         """Offer a greedy clique of some pairs (n,) at either scale, of no fewer than `least`.
@@ -385,7 +392,7 @@ class CliqueSearch:
             return
         pairs, scales, bound = self._pairs, self._variances_m2, self._bound
         T_a_b, inside = np.array(fit_rigid(pairs.p_a, pairs.p_b, clique)), np.empty_like(self.near)
-        log, level = settle_at_best_scale(T_a_b, pairs, self._spread, scales, bound, inside)
+        log, level = refit_at_best_drift(T_a_b, pairs, self._spread, scales, bound, inside)
         if log > self._log:
             self.T_a_b, self.inside, self.level, self._log = T_a_b, inside, level, log
             self.near = self.support(1)
@@ -395,7 +402,7 @@ class CliqueSearch:
         inside = np.zeros(len(self._pairs.p_a), np.bool_)
         if self.level >= 0:
             given = self._pairs, self._spread.own_m2, self._scales_m2[scale], self._bound
-            settle(self.T_a_b.copy(), *given, inside)
+            refit_to_support(self.T_a_b.copy(), *given, inside)
         return inside
 
     def is_plain(self) -> bool:
@@ -403,7 +410,7 @@ class CliqueSearch:
         support, others = int(np.count_nonzero(self.near)), np.flatnonzero(~self.near)
         if support <= _WORTH_A_LOOK * len(self.near):
             return False
-        return not may_hold(self.graphs(others)[1], everyone(len(others)), support // 2)
+        return not may_contain_clique(self.graphs(others)[1], full_set(len(others)), support // 2)
 
     def none_in_parts(self, parts: list[np.ndarray]) -> bool:
         """Whether no clique of the pairs that do not support the motion has half as many.
@@ -413,7 +420,7 @@ class CliqueSearch:
         graphs = [self.offer_greedy(rows) for rows in parts]
         size = int(np.count_nonzero(self.near)) // (2 * len(parts))
         for rows, graph in zip(parts, graphs, strict=True):
-            others = set_of(~self.near[rows])
+            others = bit_set(~self.near[rows])
             clique, finished = larger_clique(graph[1], others, size, self._max_nodes)
             if len(clique) or not finished:
                 return False
@@ -427,6 +434,8 @@ class CliqueSearch:
         for scale, graph in enumerate(self.graphs(rows)):
             greedy = greedy_clique(graph, _GREEDY_STARTS)
             self.offer(greedy)
-            if may_hold(graph, set_of(~self.near), int(np.count_nonzero(self.near)) // 2):
+            if may_contain_clique(
+                graph, bit_set(~self.near), int(np.count_nonzero(self.near)) // 2
+            ):
                 at_least = max(int(np.count_nonzero(self.support(scale))), len(greedy))
-                self.offer(larger_clique(graph, everyone(len(rows)), at_least, self._max_nodes)[0])
+                self.offer(larger_clique(graph, full_set(len(rows)), at_least, self._max_nodes)[0])

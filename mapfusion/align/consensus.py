@@ -14,12 +14,12 @@ from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.drift import DRIFT_FLOOR_M
 from mapfusion.align.mahalanobis_gate import (
+    PairSpread,
     PlanarPairs,
-    Spread,
     mean_variances,
-    settle_at_best_scale,
+    refit_at_best_drift,
 )
-from mapfusion.align.method import Fit, Undetermined, why_one_place
+from mapfusion.align.method import Fit, Undetermined, why_angle_is_open
 from mapfusion.geometry.numerics import (
     WORD,
     Float,
@@ -129,7 +129,7 @@ def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> f
     return (difference * difference / bound - v) / 2
 
 
-def in_rows(pairs: PlanarPairs) -> Float:
+def packed_rows(pairs: PlanarPairs) -> Float:
     """The pairs (N, 10): p_a, p_b, and xx, xy, yy of S_a and of S_b; a row is read as one piece."""
     rows = np.empty((len(pairs.p_a), 10))
     rows[:, :2], rows[:, 2:4] = pairs.p_a, pairs.p_b
@@ -178,7 +178,7 @@ def _agreeing(
 
 
 @kernel
-def consistency(rows: Float, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
+def consistency_graphs(rows: Float, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
     """Graphs of consistent correspondences, for a small and a large s_drift.
 
     Every two are first compared coarsely, under the landmarks' worst variances; only the few that
@@ -261,8 +261,8 @@ class Consensus:
     def _settle(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
         inlier, level = np.zeros(len(pairs), dtype=bool), -1
         if np.all(np.isfinite(T_a_b)):
-            given = planar, spread_of(pairs), self.variances_m2, self.bound
-            _, level = settle_at_best_scale(T_a_b, *given, inlier)
+            given = planar, pair_spread(pairs), self.variances_m2, self.bound
+            _, level = refit_at_best_drift(T_a_b, *given, inlier)
         return self.fit_of(T_a_b, inlier, level, pairs, planar)
 
     def fit_of(
@@ -274,15 +274,15 @@ class Consensus:
         if level < 0:
             return Undetermined("fewer than 2 correspondences support the motion found")
         variance_m2, support = self.variances_m2[level], pairs[inlier]
-        reason = why_one_place(support, variance_m2)
+        reason = why_angle_is_open(support, variance_m2)
         if reason:
             return Undetermined(reason)
         weight = 1 / mean_variances(planar, variance_m2)[inlier]
         return Fit(T_a_b, inlier, weight=weight, fitted=support)
 
 
-def spread_of(pairs: Pairs) -> Spread:
+def pair_spread(pairs: Pairs) -> PairSpread:
     """What no motion changes, of the last call with these pairs if there was one."""
-    if Spread not in pairs.kept:
-        pairs.kept[Spread] = Spread.of(pairs.in_plan())
-    return pairs.kept[Spread]
+    if PairSpread not in pairs.kept:
+        pairs.kept[PairSpread] = PairSpread.of(pairs.in_plan())
+    return pairs.kept[PairSpread]

@@ -35,7 +35,7 @@ _WIDE = 4.0  # times the median variance of heights: a block would take the wide
 _ABSENT = 1e9
 
 
-def nearest_both_ways(
+def nearest_descriptors(
     map_a: LandmarkMap,
     map_b: LandmarkMap,
     height_bound: float,
@@ -397,7 +397,7 @@ def _mutually_nearest(
     map_a: LandmarkMap, map_b: LandmarkMap, height_bound: float, floor_m2: float
 ) -> tuple[np.ndarray, np.ndarray, Float]:
     """Return rows (N,) of both maps, each the other's nearest, and their descriptors' distances."""
-    nearest_b, distance2, nearest_a = nearest_both_ways(map_a, map_b, height_bound, floor_m2)
+    nearest_b, distance2, nearest_a = nearest_descriptors(map_a, map_b, height_bound, floor_m2)
     rows = np.flatnonzero(nearest_a[nearest_b] == np.arange(len(map_a)))
     return rows, nearest_b[rows], np.sqrt(np.maximum(distance2[rows], 0.0))
 

@@ -128,7 +128,7 @@ def whole_map_covariance(
     return covariance + drift_sigma_m**2 * common
 
 
-def calibration_part(T_a_b: Float, pairs: Pairs, drift_sigma_m: float) -> Float:
+def calibration_covariance(T_a_b: Float, pairs: Pairs, drift_sigma_m: float) -> Float:
     """Covariance (3, 3) that T_a_b has of it, beside that of independent residuals.
 
     To first order: an error that moves all points of a map at once moves the least squares of

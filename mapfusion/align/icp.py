@@ -14,8 +14,8 @@ from mapfusion.align.nearest_neighbours import (
     GROUP,
     BoxTree,
     Groups,
-    look_up_group,
-    room_for_groups,
+    find_nearest_of_group,
+    new_search_state,
 )
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import Float, kernel
@@ -112,10 +112,10 @@ def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: fl
 
     It ends with the first group that makes it exceed `most`.
     """
-    room, nobody = room_for_groups(), np.full(len(groups.row), -1)
+    room, nobody = new_search_state(), np.full(len(groups.row), -1)
     total = 0.0
     for first in range(0, groups.n, GROUP):
-        look_up_group(T_a_b, first, groups, tree, nobody, room)
+        find_nearest_of_group(T_a_b, first, groups, tree, nobody, room)
         for q in range(min(GROUP, groups.n - first)):
             total += room.square[q]
         if total > most:
@@ -134,13 +134,13 @@ def pair_and_solve(
         round changed no pair.
     """
     p, n = tree.p, len(p_b)
-    T_a_b, everyone, room = T_start.copy(), np.arange(n), room_for_groups()
+    T_a_b, everyone, room = T_start.copy(), np.arange(n), new_search_state()
     row_of, found = groups.row, room.nearest
     nearest, in_group, matched = np.full(n, -1), np.full(len(row_of), -1), np.empty((n, 3))
     for rounds in range(max_rounds + 1):
         changed = False
         for first in range(0, len(in_group), GROUP):
-            look_up_group(T_a_b, first, groups, tree, in_group, room)
+            find_nearest_of_group(T_a_b, first, groups, tree, in_group, room)
             for q in range(GROUP):
                 i, k = first + q, int(found[q])
                 if k != in_group[i]:

@@ -121,7 +121,7 @@ def log_likelihood(
 
 
 @kernel
-def settle(
+def refit_to_support(
     T_a_b: Float,
     pairs: PlanarPairs,
     own_m2: Float,
@@ -158,7 +158,7 @@ def spread_area_m2(p: Float) -> float:
     return 12 * math.sqrt(max(determinant, 0.0))  # a side L has the variance L^2 / 12
 
 
-class Spread(NamedTuple):
+class PairSpread(NamedTuple):
     """What of N pairs no motion changes.
 
     Attributes:
@@ -170,17 +170,17 @@ class Spread(NamedTuple):
     area_m2: float
 
     @classmethod
-    def of(cls, pairs: PlanarPairs) -> "Spread":
+    def of(cls, pairs: PlanarPairs) -> "PairSpread":
         """Of pairs, one or more."""
         area_m2 = max(spread_area_m2(pairs.p_a), spread_area_m2(pairs.p_b))
         return cls(mean_variances(pairs), area_m2)
 
 
 @kernel
-def settle_at_best_scale(
+def refit_at_best_drift(
     T_a_b: Float,
     pairs: PlanarPairs,
-    spread: Spread,
+    spread: PairSpread,
     variances_m2: Float,
     bound: float,
     inside: np.ndarray,
@@ -198,7 +198,7 @@ def settle_at_best_scale(
         inside[i] = False
     best, best_level = -math.inf, -1
     for level in range(len(variances_m2) - 1, -1, -1):
-        count = settle(T, pairs, own_m2, variances_m2[level], bound, marks)
+        count = refit_to_support(T, pairs, own_m2, variances_m2[level], bound, marks)
         if count < 2:
             break
         # one false pair counted before any is seen keeps the share below 1
@@ -217,7 +217,7 @@ def settle_at_best_scale(
 _CALLED_FALSE = 1e-3
 
 
-def is_unlike_the_others(
+def is_outlier_to_others(
     T_without: Float, covariance: Float, variance_m2: float, pairs: PlanarPairs, left_out: int
 ) -> bool:
     """Whether a pair lies farther from where the others put it than they explain.
@@ -240,7 +240,7 @@ def is_unlike_the_others(
     return -m / 2 * math.log1p(D / m) < math.log(_CALLED_FALSE / len(p_b))
 
 
-def why_one_pair(
+def why_rests_on_one_pair(
     T_a_b: Float, T_without: Float | None, pairs: PlanarPairs, truth: Float, gate_m: float
 ) -> str:
     """Why the motion rests on the pair of most leverage; empty when it does not.
@@ -260,7 +260,7 @@ def why_one_pair(
 
 
 @kernel
-def most_leverage(
+def highest_leverage_pair(
     T_a_b: Float, pairs: PlanarPairs, variance_m2: float, truth: Float, covariance: Float
 ) -> int:
     """The pair whose residual moves its own fit most: the largest trace of J cov J' W.

@@ -38,7 +38,7 @@ def lacks_extent(p: Float, covariance_m2: Float, drift_m2: float, dimensions: in
     return bool(weight @ along**2 <= chi_square_bound(1 - SHAPE_FALSE_ALARM, freedom))
 
 
-def why_one_place(pairs: Pairs, drift_m2: float = 0.0, which: str = " that agree") -> str:
+def why_angle_is_open(pairs: Pairs, drift_m2: float = 0.0, which: str = " that agree") -> str:
     """Return why the angle between the maps is open; empty if the pairs (1 or more) determine it.
 
     The angle is open if all pairs lie on one point of either map. `which` pairs they are, the
@@ -57,7 +57,7 @@ def why_one_place(pairs: Pairs, drift_m2: float = 0.0, which: str = " that agree
     return ""
 
 
-def why_one_line(pairs: Pairs) -> str:
+def why_affine_map_is_open(pairs: Pairs) -> str:
     """Return why an affine map from b to a is open; empty if the pairs determine it.
 
     It is open if in plan all landmarks of map b that have a pair lie on one line.
@@ -85,7 +85,11 @@ class Needs:
         """Why the pairs span too little; empty when they do not."""
         if self.dimensions == 0:
             return ""
-        return why_one_place(pairs, which="") if self.dimensions == 1 else why_one_line(pairs)
+        return (
+            why_angle_is_open(pairs, which="")
+            if self.dimensions == 1
+            else why_affine_map_is_open(pairs)
+        )
 
 
 @dataclass(frozen=True)
@@ -144,5 +148,5 @@ def supported(
     if n < 2:
         return Fit(T_a_b, inlier, refusal=refusal or f"{n} correspondences support the motion")
     support = pairs[inlier]
-    reason = why_one_place(support)
+    reason = why_angle_is_open(support)
     return Undetermined(reason) if reason else Fit(T_a_b, inlier, fitted=support, refusal=refusal)

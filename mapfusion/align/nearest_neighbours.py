@@ -48,7 +48,7 @@ class BoxTree(NamedTuple):
     @classmethod
     def of(cls, p: Float) -> "BoxTree":
         """Tree over points (N, 3)."""
-        rows, boxes, ends = in_leaves(p, -(-len(p) // n_leaves_of(len(p), POINTS_PER_LEAF)))
+        rows, boxes, ends = split_into_leaves(p, -(-len(p) // n_leaves_of(len(p), POINTS_PER_LEAF)))
         in_order = p[rows]
         x, y, z = np.ascontiguousarray(in_order.T)
         return cls(in_order, x, y, z, rows, boxes, ends[0], ends[1])
@@ -62,7 +62,7 @@ def n_leaves_of(n: int, size: int) -> int:
     return n_leaves
 
 
-def in_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarray]:
+def split_into_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarray]:
     """Points (N, 3) halved along the longest side of their box until `size` are left or fewer.
 
     The lower half is filled first, so that of all leaves with points only the last is not full.
@@ -115,12 +115,12 @@ class Groups(NamedTuple):
     @classmethod
     def of(cls, p: Float) -> "Groups":
         """Groups of points (N, 3)."""
-        row, _, _ = in_leaves(p, GROUP)
+        row, _, _ = split_into_leaves(p, GROUP)
         row = np.append(row, np.full(-len(p) % GROUP, row[len(p) // GROUP * GROUP :][:1]))
         return cls(len(p), row, *np.ascontiguousarray(p[row].T))
 
 
-class Room(NamedTuple):
+class SearchState(NamedTuple):
     """Of one group: where its points are, what each has found, and the boxes still to be asked.
 
     Attributes:
@@ -145,17 +145,17 @@ class Room(NamedTuple):
 
 
 @kernel
-def room_for_groups() -> Room:
+def new_search_state() -> SearchState:
     """One for any number of groups, one after the other."""
     x, y, z, nearest = np.empty(GROUP), np.empty(GROUP), np.empty(GROUP), np.empty(GROUP)
     node, away = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)
     near, far = np.empty(POINTS_PER_LEAF, np.int64), np.empty(POINTS_PER_LEAF)
-    return Room(x, y, z, nearest, np.empty(GROUP), node, away, near, far)
+    return SearchState(x, y, z, nearest, np.empty(GROUP), node, away, near, far)
 
 
 @kernel
-def look_up_group(
-    T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: Room
+def find_nearest_of_group(
+    T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: SearchState
 ) -> None:
     """Fill in what a group, moved by T_a_b, has nearest, from what was nearest before.
 
@@ -201,7 +201,7 @@ def _between(low: float, high: float, box_low: float, box_high: float) -> float:
 
 
 @kernel
-def _descend(tree: BoxTree, room: Room) -> None:
+def _descend(tree: BoxTree, room: SearchState) -> None:
     """Go down the tree with a group, to the nearest boxes first."""
     _, px, py, pz, _, box, starts, ends = tree
     x, y, z, found, square, nodes, aways, near, far = room
@@ -315,7 +315,7 @@ def _cells(middle: float, radius: float, corner: float, cell: float, cells: int)
 
 
 @kernel
-def runs_about(x: float, y: float, radius_m: float, grid: Grid, runs: np.ndarray) -> int:
+def ranges_within(x: float, y: float, radius_m: float, grid: Grid, runs: np.ndarray) -> int:
     """Ranges of grid.p with all points within a radius of (x, y), and others.
 
     They go into `runs` (ny, 2), first and one behind the last of each; returns how many.

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.consensus import Consensus, drift_needed, in_rows, spread_of
-from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, settle
+from mapfusion.align.consensus import Consensus, drift_needed, packed_rows, pair_spread
+from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, refit_to_support
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.ransac import draw_pair
 from mapfusion.align.rigid_motion import fit_two
@@ -41,10 +41,10 @@ class RansacMahalanobis(Consensus):
         """T_a_b of the best minimal set at the largest s_drift, settled on its support."""
         planar = pairs.in_plan()
         if RansacMahalanobis not in pairs.kept:
-            pairs.kept[RansacMahalanobis] = in_rows(planar)
+            pairs.kept[RansacMahalanobis] = packed_rows(planar)
         _, T_a_b = least_truncated_squares(
             planar,
-            spread_of(pairs).own_m2,
+            pair_spread(pairs).own_m2,
             pairs.kept[RansacMahalanobis],
             self.variances_m2[-1],
             self.bound,
@@ -93,7 +93,7 @@ def least_truncated_squares(
         if count < 2 or score <= best_raw:
             continue
         best_raw = score
-        count = settle(T_a_b, pairs, own_m2, variance_m2, bound, inside)
+        count = refit_to_support(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         count, score = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         if count >= 2 and score > best_score:
             for k in range(3):

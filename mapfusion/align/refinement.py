@@ -9,14 +9,14 @@ import numpy as np
 
 from mapfusion.align.alignment import MIN_PAIRS, Alignment, Pairs, Status, undetermined
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.drift import calibration_part, drift_step
+from mapfusion.align.drift import calibration_covariance, drift_step
 from mapfusion.align.mahalanobis_gate import (
     PlanarPairs,
-    is_unlike_the_others,
-    most_leverage,
-    why_one_pair,
+    highest_leverage_pair,
+    is_outlier_to_others,
+    why_rests_on_one_pair,
 )
-from mapfusion.align.method import why_one_place
+from mapfusion.align.method import why_angle_is_open
 from mapfusion.geometry.numerics import Float, invert, kernel
 from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points, wrap
 from mapfusion.parameters import Range, require_in_range, require_shape
@@ -87,7 +87,7 @@ class Refinement:
             return undetermined(reason, len(pairs), started_s)
         inlier = np.zeros(len(pairs), dtype=bool)
         inlier[rows] = truth > 0.5
-        reason = why_one_place(pairs[inlier], variance) if np.any(inlier) else ""
+        reason = why_angle_is_open(pairs[inlier], variance) if np.any(inlier) else ""
         if reason:
             return undetermined(reason, len(pairs), started_s)
         if moved_m > _TOLERANCE_M:
@@ -101,10 +101,12 @@ class Refinement:
             # a known identity that the motion rests on is false only if it is unlike all others
             if pairs.by_name and solved:
                 rest = (T_without, sure, drift_m2)
-                if is_unlike_the_others(*rest, planar, left_out):
+                if is_outlier_to_others(*rest, planar, left_out):
                     may_move_m = self.gate_m
-            reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, may_move_m)
-        covariance = covariance + calibration_part(T_a_b, pairs[inlier], math.sqrt(variance))
+            reason = why_rests_on_one_pair(
+                T_a_b, T_without if solved else None, planar, truth, may_move_m
+            )
+        covariance = covariance + calibration_covariance(T_a_b, pairs[inlier], math.sqrt(variance))
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
             T_a_b,
@@ -251,5 +253,5 @@ def maximise_likelihood(
             for column in range(3):
                 normal[row, column] -= missing[row, column]
         determined = invert(normal, covariance)
-    most = most_leverage(T_a_b, pairs, variance, truth, covariance)
+    most = highest_leverage_pair(T_a_b, pairs, variance, truth, covariance)
     return determined, moved, T_a_b, covariance, variance, truth, most

@@ -23,7 +23,7 @@ import numpy as np
 
 from mapfusion.align.alignment import MIN_PAIRS, Alignment, Pairs, Status
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.nearest_neighbours import Grid, runs_about
+from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import moved_point
@@ -59,7 +59,7 @@ def independent_pairs(p_a: Float, p_b: Float, heights: Float) -> IndependentPair
     return IndependentPairs(p_a, p_b, heights, possible_repairings(heights), Grid.of(p_a))
 
 
-def thin(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
+def independent_rows(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
     """Rows (n,) of the pairs (N, 2 or 3), in order, that are no neighbours of a kept one.
 
     Neighbours are less than patch_m apart in both maps.
@@ -72,7 +72,7 @@ def _mark_thinned(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.nd
     kept = np.zeros(len(p_a), np.bool_)
     runs = np.empty((near_a.shape[1], 2), np.int64)
     for i in range(len(p_a)):
-        n_runs = runs_about(p_a[i, 0], p_a[i, 1], patch_m, near_a, runs)
+        n_runs = ranges_within(p_a[i, 0], p_a[i, 1], patch_m, near_a, runs)
         kept[i] = not _has_neighbour(i, p_a, p_b, patch_m, near_a.row, runs[:n_runs], kept)
     return kept
 
@@ -91,13 +91,13 @@ def _has_neighbour(
     for run in range(len(runs)):
         for k in range(runs[run, 0], runs[run, 1]):
             j = row_of[k]
-            if kept[j] and apart_by_less(p_a, i, j, patch_m) and apart_by_less(p_b, i, j, patch_m):
+            if kept[j] and is_closer(p_a, i, j, patch_m) and is_closer(p_b, i, j, patch_m):
                 return True
     return False
 
 
 @kernel
-def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
+def is_closer(p: Float, i: int, j: int, distance_m: float) -> bool:
     """Whether points i and j of (N, D) are less than a distance apart."""
     if abs(p[i, 0] - p[j, 0]) >= distance_m:  # most are already told apart by this
         return False
@@ -221,7 +221,7 @@ def agreeing_repairings(
     beyond = widest * widest * (1 + _ROUNDING)
     for j in range(len(p_b)):
         x, y = moved[j, 0], moved[j, 1]
-        for run in range(runs_about(x, y, widest, near_a, runs)):
+        for run in range(ranges_within(x, y, widest, near_a, runs)):
             for k in range(runs[run, 0], runs[run, 1]):
                 dx, dy = near_a.p[k, 0] - x, near_a.p[k, 1] - y
                 if dx * dx + dy * dy > beyond:  # without the root, most are told already
@@ -447,7 +447,7 @@ class Acceptance:
         """Rows (n,) of the pairs that count, best match first."""
         rows = pairs.of_one_height(self.height)
         rows = rows[np.argsort(pairs.distance[rows], kind="stable")]
-        return rows[thin(*pairs[rows].points(), self.patch_m)]
+        return rows[independent_rows(*pairs[rows].points(), self.patch_m)]
 
     def _heights(self, pairs: Pairs) -> Float:
         """Heights (n, 4) as `IndependentPairs` has them; of planar maps all 0."""

@@ -119,7 +119,7 @@ def _twin(whole: Float, part: Float) -> Float:
     return np.logaddexp(np.log(fitted_twins.WHOLE) + whole, np.log1p(-fitted_twins.WHOLE) + part)
 
 
-def log10_beside_one(log10_ratios: Float) -> float:
+def log10_without_discovery(log10_ratios: Float) -> float:
     """log10 of how much likelier regions (R,) are if right than if wrong and found by one of them.
 
     The one, whichever of them, is then as under a right motion: of ratios r_i it is
@@ -138,7 +138,7 @@ _FEW = 2.0  # regions: a share of so few is drawn to nothing
 _MOST_EXTENT_M = 12.0  # of support: beyond a hall it is as good as anywhere
 
 
-class Signs(NamedTuple):
+class EvidenceFeatures(NamedTuple):
     """What speaks for and against one alignment.
 
     Attributes:
@@ -179,6 +179,6 @@ class Signs(NamedTuple):
         )
 
 
-def probability(signs: Signs) -> float:
+def probability_correct(signs: EvidenceFeatures) -> float:
     """That the alignment is right."""
     return float(1 / (1 + np.exp(-(INTERCEPT + signs.features() @ np.array(WEIGHTS)))))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.nearest_neighbours import Grid, runs_about
+from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import inverse, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -16,18 +16,29 @@ from mapfusion.verification.likelihood import (
     DECISIVE,
     TwinShares,
     log10_against_chance,
-    log10_beside_one,
     log10_ratio,
+    log10_without_discovery,
 )
 from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.rivals import BETWEEN, Copies, about_each, laid_on_like
-from mapfusion.verification.visibility import MUST, UNSEEN, Seen, Watch, how_seen
+from mapfusion.verification.rivals import (
+    BETWEEN,
+    RepeatedLandmarks,
+    count_neighbours,
+    mark_repeated,
+)
+from mapfusion.verification.visibility import (
+    MUST,
+    UNSEEN,
+    ObservedLandmarks,
+    ViewingHistory,
+    classify_visibility,
+)
 
 # Of a descriptor's dimensions, those after which it is asked whether the distance is too large yet.
 _AT_A_TIME = 8
 
 
-class Looks(NamedTuple):
+class DescribedLandmarks(NamedTuple):
     """N landmarks by place and look, for the kernel.
 
     Attributes:
@@ -43,7 +54,7 @@ class Looks(NamedTuple):
     descriptor: np.ndarray
 
 
-class Gates(NamedTuple):
+class MatchGates(NamedTuple):
     """How far off what is the same may be.
 
     Attributes:
@@ -61,7 +72,13 @@ class Gates(NamedTuple):
 
 
 @kernel
-def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> np.ndarray:
+def mark_matched(
+    p: Float,
+    rows: np.ndarray,
+    own: DescribedLandmarks,
+    other: DescribedLandmarks,
+    gates: MatchGates,
+) -> np.ndarray:
     """Bool (n,): whether `other` has some `rows` (n,) of `own`, whose places are p (N, 3) there.
 
     What has no descriptor (NaN) is not found.
@@ -75,7 +92,7 @@ def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> n
     most, floor_m2, unlike2 = gates.height_bound, gates.height_floor_m2, gates.unlike**2
     for m in range(len(rows)):
         i = rows[m]
-        for run in range(runs_about(p[i, 0], p[i, 1], distance_m, near, runs)):
+        for run in range(ranges_within(p[i, 0], p[i, 1], distance_m, near, runs)):
             for k in range(runs[run, 0], runs[run, 1]):
                 dx, dy = at[k, 0] - p[i, 0], at[k, 1] - p[i, 1]
                 if dx * dx + dy * dy > distance_m * distance_m:
@@ -173,11 +190,11 @@ class Regions:
         """The same, if wrong then found by one of them, which is no evidence; 0 of none."""
         if shares not in self._evidence:  # a verdict rests on it in several places
             ratios = log10_ratio(self.found, self.expected, shares)
-            self._evidence[shares] = log10_beside_one(ratios)
+            self._evidence[shares] = log10_without_discovery(ratios)
         return self._evidence[shares]
 
 
-class Squares(NamedTuple):
+class RegionGrid(NamedTuple):
     """The squares of the plane that are one region each.
 
     Attributes:
@@ -190,7 +207,7 @@ class Squares(NamedTuple):
     middle: Float
 
     @classmethod
-    def about(cls, p_a: Float, side_m: float) -> "Squares":
+    def about(cls, p_a: Float, side_m: float) -> "RegionGrid":
         """About the middle of supporters (n, 2 or 3); about the origin without any."""
         if not len(p_a):
             return cls(side_m, np.zeros(2))
@@ -203,7 +220,7 @@ class Squares(NamedTuple):
         return np.unique(column * width + row, return_inverse=True)[1]
 
 
-class _Asked(NamedTuple):
+class _Expected(NamedTuple):
     """Landmarks that another robot had in view (n,).
 
     Attributes:
@@ -219,7 +236,7 @@ class _Asked(NamedTuple):
     copied: np.ndarray
 
 
-class Witness:
+class ViewedMap:
     """A map with viewing evidence, made ready to be asked what it must have seen."""
 
     def __init__(self, landmarks: LandmarkMap) -> None:
@@ -228,18 +245,20 @@ class Witness:
         assert viewing is not None
         assert descriptor is not None
         self.landmarks, self._viewing = landmarks, viewing
-        self.watch = Watch.of(viewing)
+        self.watch = ViewingHistory.of(viewing)
         position = np.ascontiguousarray(landmarks.position_m)
         z_m2 = landmarks.covariance_m2[:, 2, 2].copy()
         near = Grid.of(position[:, :2])
-        self.looks = Looks(near, position[:, 2].copy(), z_m2, np.ascontiguousarray(descriptor))
+        self.looks = DescribedLandmarks(
+            near, position[:, 2].copy(), z_m2, np.ascontiguousarray(descriptor)
+        )
         # what was found of this map alone, by what was asked: several pairs have the same map
         self.kept: dict[tuple, Any] = {}
 
     @cached_property
     def crowd(self) -> np.ndarray:
         """(N,) landmarks about each."""
-        return about_each(np.ones(len(self.landmarks), np.bool_), self.looks.near)
+        return count_neighbours(np.ones(len(self.landmarks), np.bool_), self.looks.near)
 
     def laid_by(self, T: Float) -> Float:
         """Its landmarks (N, 3) where a motion of the plane lays them."""
@@ -247,32 +266,32 @@ class Witness:
         p[:, :2] = transform_points(T, p[:, :2])
         return p
 
-    def seen_from(self, T: Float) -> Seen:
+    def seen_from(self, T: Float) -> ObservedLandmarks:
         """Its landmarks as another robot would find them, T from its frame to that one's."""
         viewing, p = self._viewing, self.laid_by(T)
         angle = viewing.direction_rad + T[2]
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         distance = np.where(viewing.n_views > 0, viewing.distance_m, 0.0)
-        return Seen(p, direction, distance)
+        return ObservedLandmarks(p, direction, distance)
 
 
-class Witnesses:
+class ViewedMapPair:
     """Two maps that may be asked about any motion between them."""
 
-    def __init__(self, a: Witness, b: Witness, parameters: EvidenceParameters) -> None:
+    def __init__(self, a: ViewedMap, b: ViewedMap, parameters: EvidenceParameters) -> None:
         self.a, self.b, self._parameters = a, b, parameters
         height = HeightGate()
         planar = a.landmarks.planar or b.landmarks.planar
         bound = np.inf if planar else height.bound
         unlike = parameters.max_descriptor_distance
-        self._gates = Gates(parameters.gate_m, bound, height.floor_m**2, unlike)
+        self._gates = MatchGates(parameters.gate_m, bound, height.floor_m**2, unlike)
         # which of a's or b's landmarks (N,) the other has under a motion: copies ask for all, and
         # regions, after them, for some of the same; and how the other saw them
         self._found: dict[tuple[bool, bytes], np.ndarray] = {}
         self._how: dict[tuple[bool, bytes], np.ndarray] = {}
 
     @classmethod
-    def beside_itself(cls, own: Witness, parameters: EvidenceParameters) -> "Witnesses":
+    def beside_itself(cls, own: ViewedMap, parameters: EvidenceParameters) -> "ViewedMapPair":
         """A map that may be asked about motions onto itself, with what it was asked before."""
         key = cls, parameters
         if key not in own.kept:
@@ -280,12 +299,12 @@ class Witnesses:
         return own.kept[key]
 
     @cached_property
-    def _of(self) -> dict[str, "Witnesses"]:
+    def _of(self) -> dict[str, "ViewedMapPair"]:
         """These, and each map beside itself, by what motions are of."""
         a, b = (self.beside_itself(own, self._parameters) for own in (self.a, self.b))
         return {BETWEEN: self, "a": a, "b": b}
 
-    def regions(self, of: str, T: Float, squares: Squares, copies: Copies) -> Regions:
+    def regions(self, of: str, T: Float, squares: RegionGrid, copies: RepeatedLandmarks) -> Regions:
         """What must have been seen under a motion, and is there, in squares of frame a.
 
         Of two maps both ways are counted into one square: they are of one part of the world. What
@@ -293,11 +312,11 @@ class Witnesses:
         """
         if of != BETWEEN:
             own = copies.in_a if of == "a" else copies.in_b
-            return self._of[of].regions(BETWEEN, T, squares, Copies(own, own))
+            return self._of[of].regions(BETWEEN, T, squares, RepeatedLandmarks(own, own))
         T_a_b = T
         asked_b, b_in_a = self._asked(self.b, self.a, T_a_b, copies.in_b)
         asked_a, _ = self._asked(self.a, self.b, inverse(T_a_b), copies.in_a)
-        asked = _Asked(*map(np.concatenate, zip(asked_b, asked_a, strict=True)))
+        asked = _Expected(*map(np.concatenate, zip(asked_b, asked_a, strict=True)))
         places = np.concatenate([b_in_a[asked_b.rows], self.a.landmarks.position_m[asked_a.rows]])
         place = squares.of(places[:, :2])
         n = int(place.max(initial=-1)) + 1
@@ -308,26 +327,26 @@ class Witnesses:
         counts = expected.sum(axis=(1, 2)) >= LEAST_EXPECTED
         return Regions(found[counts], expected[counts])
 
-    def copies(self, of: str, T: Float) -> Copies:
+    def copies(self, of: str, T: Float) -> RepeatedLandmarks:
         """Landmarks of both maps that a motion lays on their like."""
         two = self._of[of]
         in_a, in_b = two._laid(two.a, two.b, inverse(T)), two._laid(two.b, two.a, T)
         if of == BETWEEN:
-            return Copies(in_a, in_b)
-        none = Copies.none(len(self.a.landmarks), len(self.b.landmarks))
+            return RepeatedLandmarks(in_a, in_b)
+        none = RepeatedLandmarks.none(len(self.a.landmarks), len(self.b.landmarks))
         return none._replace(**{f"in_{of}": in_a | in_b})
 
-    def _laid(self, own: Witness, other: Witness, T: Float) -> np.ndarray:
+    def _laid(self, own: ViewedMap, other: ViewedMap, T: Float) -> np.ndarray:
         key = own is self.a, T.tobytes()
         if key not in self._found:
             p = own.laid_by(T)
-            found = has(p, np.arange(len(p)), own.looks, other.looks, self._gates)
+            found = mark_matched(p, np.arange(len(p)), own.looks, other.looks, self._gates)
             self._found[key] = found
-        return laid_on_like(self._found[key], own.crowd, own.looks.near)
+        return mark_repeated(self._found[key], own.crowd, own.looks.near)
 
     def _asked(
-        self, own: Witness, other: Witness, T: Float, copied: np.ndarray
-    ) -> tuple[_Asked, Float]:
+        self, own: ViewedMap, other: ViewedMap, T: Float, copied: np.ndarray
+    ) -> tuple[_Expected, Float]:
         """What `other` has of `own`, and all of own's landmarks in its frame.
 
         T (3,) maps own's frame into that of the other.
@@ -337,9 +356,9 @@ class Witnesses:
             p = own.laid_by(T)
         else:
             seen = own.seen_from(T)
-            self._how[key], p = how_seen(seen, other.watch), seen.p
+            self._how[key], p = classify_visibility(seen, other.watch), seen.p
         how, known = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
         looks = own.looks, other.looks
-        found = has(p, rows, *looks, self._gates) if known is None else known[rows]
-        return _Asked(rows, how[rows], found, copied[rows]), p
+        found = mark_matched(p, rows, *looks, self._gates) if known is None else known[rows]
+        return _Expected(rows, how[rows], found, copied[rows]), p

@@ -8,9 +8,9 @@ import numpy as np
 
 from mapfusion.align.alignment import MIN_PAIRS, Pairs
 from mapfusion.align.clique import Clique
-from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_both_ways
+from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_descriptors
 from mapfusion.align.method import Undetermined
-from mapfusion.align.nearest_neighbours import Grid, runs_about
+from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import transform_points
@@ -29,34 +29,34 @@ _LEAST, _LEAST_SHARE = 5, 0.3
 BETWEEN = "a b"  # of a motion between two maps; of one map onto itself: a, b
 
 
-class Copies(NamedTuple):
+class RepeatedLandmarks(NamedTuple):
     """Which landmarks of two maps lie in places that may be copies: bool (N_a,) and (N_b,)."""
 
     in_a: np.ndarray
     in_b: np.ndarray
 
     @classmethod
-    def none(cls, n_a: int, n_b: int) -> "Copies":
+    def none(cls, n_a: int, n_b: int) -> "RepeatedLandmarks":
         """Of maps in which nothing is held twice."""
         return cls(np.zeros(n_a, np.bool_), np.zeros(n_b, np.bool_))
 
-    def joined(self, others: Iterable["Copies"]) -> "Copies":
+    def joined(self, others: Iterable["RepeatedLandmarks"]) -> "RepeatedLandmarks":
         """Those of any of several motions."""
         in_a, in_b = self.in_a.copy(), self.in_b.copy()
         for other in others:
             in_a |= other.in_a
             in_b |= other.in_b
-        return Copies(in_a, in_b)
+        return RepeatedLandmarks(in_a, in_b)
 
 
-def of_others(copies: Sequence[Copies], own: int) -> Copies:
+def repeated_under_others(copies: Sequence[RepeatedLandmarks], own: int) -> RepeatedLandmarks:
     """What motions but one of them lay on its like."""
-    first = Copies.none(len(copies[own].in_a), len(copies[own].in_b))
+    first = RepeatedLandmarks.none(len(copies[own].in_a), len(copies[own].in_b))
     return first.joined(each for k, each in enumerate(copies) if k != own)
 
 
 @kernel
-def about_each(counted: np.ndarray, near: Grid) -> np.ndarray:
+def count_neighbours(counted: np.ndarray, near: Grid) -> np.ndarray:
     """How many of the landmarks about each (N,) are `counted` (N,), itself among them."""
     p, row_of = near.p, near.row
     n = np.zeros(len(counted), np.int64)
@@ -64,19 +64,19 @@ def about_each(counted: np.ndarray, near: Grid) -> np.ndarray:
     for k in range(len(p)):
         if not counted[row_of[k]]:
             continue
-        for run in range(runs_about(p[k, 0], p[k, 1], _PLACE_M, near, runs)):
+        for run in range(ranges_within(p[k, 0], p[k, 1], _PLACE_M, near, runs)):
             for m in range(runs[run, 0], runs[run, 1]):
                 dx, dy = p[m, 0] - p[k, 0], p[m, 1] - p[k, 1]
                 n[row_of[m]] += dx * dx + dy * dy <= _PLACE_M * _PLACE_M
     return n
 
 
-def laid_on_like(found: np.ndarray, crowd: np.ndarray, near: Grid) -> np.ndarray:
+def mark_repeated(found: np.ndarray, crowd: np.ndarray, near: Grid) -> np.ndarray:
     """Which landmarks (N,) lie where enough of those about them are `found` (N,) elsewhere.
 
     Of `crowd` (N,) is how many there are about each.
     """
-    hits = about_each(found, near)
+    hits = count_neighbours(found, near)
     return (hits >= _LEAST) & (hits >= _LEAST_SHARE * crowd)
 
 
@@ -86,7 +86,7 @@ _ELSEWHERE_M = 1.0
 _UNLIKE = 0.6  # of descriptors, at the most: as landmarks of two maps are paired
 
 
-def twins(landmarks: LandmarkMap) -> Correspondences:
+def similar_landmarks(landmarks: LandmarkMap) -> Correspondences:
     """Landmarks that are each other's most alike among those elsewhere, each pair both ways.
 
     A motion under which such pairs agree lays one part of the map on its like. Maps without
@@ -98,7 +98,7 @@ def twins(landmarks: LandmarkMap) -> Correspondences:
     height = HeightGate()
     bound = math.inf if landmarks.planar else height.bound
     gates = bound, height.floor_m**2, _ELSEWHERE_M
-    nearest, distance2, _ = nearest_both_ways(landmarks, landmarks, *gates)
+    nearest, distance2, _ = nearest_descriptors(landmarks, landmarks, *gates)
     rows = np.arange(n)
     unlike = np.sqrt(np.maximum(distance2, 0.0))
     kept = (nearest >= 0) & (nearest[nearest] == rows) & (unlike <= _UNLIKE)
@@ -106,7 +106,7 @@ def twins(landmarks: LandmarkMap) -> Correspondences:
 
 
 @kernel
-def largest_patch_m(p: Float, reach_m: float, least: int) -> float:
+def longest_patch_side_m(p: Float, reach_m: float, least: int) -> float:
     """The longest side of the largest patch of points (n, 2), 0 of none.
 
     Points that are less than `reach_m` apart are of one patch, which has `least` points or more.
@@ -140,7 +140,7 @@ DISTINCT_M = 1.0
 _LEAST_PAIRS = 6  # among fewer no motion is more than chance
 
 
-class Supported(NamedTuple):
+class SupportedMotion(NamedTuple):
     """A motion, and what of the correspondences supports it.
 
     Attributes:
@@ -154,7 +154,7 @@ class Supported(NamedTuple):
     inlier: np.ndarray
 
 
-def apart_m(T_a_b: Float, other: Float, p_b: Float) -> float:
+def rms_distance_m(T_a_b: Float, other: Float, p_b: Float) -> float:
     """How far apart two motions (3,) move points (n, 2), RMS."""
     apart = transform_points(T_a_b, p_b) - transform_points(other, p_b)
     return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
@@ -162,12 +162,12 @@ def apart_m(T_a_b: Float, other: Float, p_b: Float) -> float:
 
 def distinct_motions(
     pairs: Pairs, most: int, acceptance: Acceptance, refinement: Refinement
-) -> list[Supported]:
+) -> list[SupportedMotion]:
     """Up to `most` motions, that of the largest clique first, then that of what it leaves, ...
 
     Each is refined on all pairs, and held against chance with them.
     """
-    found: list[Supported] = []
+    found: list[SupportedMotion] = []
     chance, method = acceptance.on(pairs), Clique()
     p_a, p_b = pairs.p_a[:, :2], pairs.p_b[:, :2]
     rows, widest_m = np.arange(len(pairs)), max(acceptance.gates_m)
@@ -179,18 +179,18 @@ def distinct_motions(
             break
         refined = refinement.refine(pairs, fit.T_a_b)
         T = refined.T_a_b if np.isfinite(refined.T_a_b).all() else fit.T_a_b
-        if not any(apart_m(T, each.T_a_b, p_b) < DISTINCT_M for each in found):
+        if not any(rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M for each in found):
             log10 = chance.judge(refined).log10_false_alarms
-            found.append(Supported(T, log10, _within(T, p_a, p_b, widest_m)))
+            found.append(SupportedMotion(T, log10, _within(T, p_a, p_b, widest_m)))
         rows = rows[~(fit.inlier | _within(fit.T_a_b, p_a[rows], p_b[rows], widest_m))]
     return found
 
 
 def self_motions(
     landmarks: LandmarkMap, most: int, acceptance: Acceptance, refinement: Refinement
-) -> tuple[Pairs, list[Supported]]:
+) -> tuple[Pairs, list[SupportedMotion]]:
     """The twins of a map, and motions that lay parts of it on their like."""
-    pairs = Pairs(landmarks, landmarks, twins(landmarks))
+    pairs = Pairs(landmarks, landmarks, similar_landmarks(landmarks))
     back = np.searchsorted(pairs.index_a, pairs.index_b)  # rows ascend, and each pair is both ways
     found = []
     for each in distinct_motions(pairs, most, acceptance, refinement):

@@ -13,23 +13,29 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.likelihood import COPIED, OWN, Signs, TwinShares, probability
+from mapfusion.verification.likelihood import (
+    COPIED,
+    OWN,
+    EvidenceFeatures,
+    TwinShares,
+    probability_correct,
+)
 from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import Regions, Squares, Witness, Witnesses
+from mapfusion.verification.regions import RegionGrid, Regions, ViewedMap, ViewedMapPair
 from mapfusion.verification.rivals import (
     BETWEEN,
     DISTINCT_M,
-    Copies,
-    Supported,
-    apart_m,
+    RepeatedLandmarks,
+    SupportedMotion,
     distinct_motions,
-    largest_patch_m,
-    of_others,
+    longest_patch_side_m,
+    repeated_under_others,
+    rms_distance_m,
     self_motions,
 )
 
 
-def laid_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
+def landmark_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
     """By how far the landmarks of map b lie off for the alignment's sake, RMS, in metres.
 
     To first order: the mean over the landmarks of tr(J S J') with J = d(T p_b)/dT. What supports an
@@ -81,7 +87,7 @@ class RivalMotion:
     n_contradicted: int
     n_regions: int
     log10_evidence: float
-    copies: Copies
+    copies: RepeatedLandmarks
 
 
 @dataclass(frozen=True)
@@ -132,7 +138,7 @@ def why_not_sought(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
 
 def find_evidence(
     pairs: Pairs,
-    witnesses: Witnesses,
+    witnesses: ViewedMapPair,
     acceptance: Acceptance,
     refinement: Refinement,
     parameters: EvidenceParameters,
@@ -150,7 +156,10 @@ def find_evidence(
     laid = [witnesses.copies(of, each.T_a_b) for of, each in kinds]
     regions = [
         witnesses.regions(
-            of, motion.T_a_b, Squares.about(supporters[k], region_m), of_others(laid, k)
+            of,
+            motion.T_a_b,
+            RegionGrid.about(supporters[k], region_m),
+            repeated_under_others(laid, k),
         )
         for k, (of, motion) in enumerate(kinds)
     ]
@@ -163,8 +172,8 @@ def find_evidence(
 
 
 def _onto_itself(
-    own: Witness, acceptance: Acceptance, refinement: Refinement
-) -> tuple[Pairs, list[Supported]]:
+    own: ViewedMap, acceptance: Acceptance, refinement: Refinement
+) -> tuple[Pairs, list[SupportedMotion]]:
     """The twins of a map and its motions onto itself, found once."""
     key = self_motions, acceptance, refinement
     if key not in own.kept:
@@ -172,13 +181,13 @@ def _onto_itself(
     return own.kept[key]
 
 
-def _largest_twin_m(alike: Pairs, motions: list[Supported], acceptance: Acceptance) -> float:
+def _largest_twin_m(alike: Pairs, motions: list[SupportedMotion], acceptance: Acceptance) -> float:
     """The largest thing that a map holds twice."""
     longest = 0.0
     for motion in motions:
         if motion.log10_false_alarms <= math.log10(acceptance.false_alarms):
             p = np.ascontiguousarray(alike.p_a[motion.inlier, :2])
-            longest = max(longest, largest_patch_m(p, _PATCH_REACH_M, _LEAST_OF_PATCH))
+            longest = max(longest, longest_patch_side_m(p, _PATCH_REACH_M, _LEAST_OF_PATCH))
     return longest
 
 
@@ -197,7 +206,11 @@ def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
 
 
 def _rival(
-    of: str, motion: Supported, regions: Regions, log10_evidence: float, copies: Copies
+    of: str,
+    motion: SupportedMotion,
+    regions: Regions,
+    log10_evidence: float,
+    copies: RepeatedLandmarks,
 ) -> RivalMotion:
     counts = (regions.n_confirmed, regions.n_contradicted, len(regions))
     n_support = int(np.count_nonzero(motion.inlier))
@@ -228,7 +241,7 @@ class Judge:
         self,
         pairs: Pairs,
         known: PairEvidence | None = None,
-        witnesses: tuple[Witness, Witness] | None = None,
+        witnesses: tuple[ViewedMap, ViewedMap] | None = None,
     ) -> "PairJudge":
         """Made ready for any number of alignments of two maps.
 
@@ -249,16 +262,16 @@ class PairJudge:
         judge: Judge,
         pairs: Pairs,
         known: PairEvidence | None,
-        witnesses: tuple[Witness, Witness] | None,
+        witnesses: tuple[ViewedMap, ViewedMap] | None,
     ) -> None:
         self._judge, self._pairs, self._known, self._ready = judge, pairs, known, witnesses
         self._chance = judge.acceptance.on(pairs)
         self._bound = math.log10(judge.acceptance.false_alarms)
 
     @cached_property
-    def _witnesses(self) -> Witnesses:
-        a, b = self._ready or (Witness(self._pairs.map_a), Witness(self._pairs.map_b))
-        return Witnesses(a, b, self._judge.evidence)
+    def _witnesses(self) -> ViewedMapPair:
+        a, b = self._ready or (ViewedMap(self._pairs.map_a), ViewedMap(self._pairs.map_b))
+        return ViewedMapPair(a, b, self._judge.evidence)
 
     @cached_property
     def evidence(self) -> PairEvidence | None:
@@ -283,7 +296,7 @@ class PairJudge:
             found = regions.log10_evidence(evidence.shares)
             told = {"log10_evidence": found, "n_confirmed": regions.n_confirmed}
             signs = self._signs(alignment, regions, evidence, by_chance.log10_false_alarms)
-            p = probability(signs)
+            p = probability_correct(signs)
             told |= {"n_contradicted": regions.n_contradicted, "probability": p}
             status, reason = self._weighed(alignment, regions, evidence)
             if status is Status.ACCEPTED and p < self._judge.evidence.least_probability:
@@ -304,7 +317,7 @@ class PairJudge:
         refined = (self._judge.refinement.refine(self._pairs, each.T_a_b) for each in others)
         return [replace(each, status=Status.AMBIGUOUS) for each in refined if each.ok]
 
-    def signs(self, alignment: Alignment) -> Signs | None:
+    def signs(self, alignment: Alignment) -> EvidenceFeatures | None:
         """What speaks for and against an alignment; None where no evidence can be sought."""
         if self.evidence is None:
             return None
@@ -315,13 +328,13 @@ class PairJudge:
     def regions(self, alignment: Alignment, evidence: PairEvidence) -> Regions:
         """What becomes of what both robots must have seen under an alignment."""
         T_a_b, p_b = alignment.T_a_b, self._pairs.map_b.position_m[:, :2]
-        squares = Squares.about(self._pairs.p_a[alignment.inlier], evidence.region_m)
+        squares = RegionGrid.about(self._pairs.p_a[alignment.inlier], evidence.region_m)
         others = (
             each.copies
             for each in evidence.motions
-            if each.of != BETWEEN or apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
+            if each.of != BETWEEN or rms_distance_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
         )
-        none = Copies.none(len(self._pairs.map_a), len(self._pairs.map_b))
+        none = RepeatedLandmarks.none(len(self._pairs.map_a), len(self._pairs.map_b))
         return self._witnesses.regions(BETWEEN, T_a_b, squares, none.joined(others))
 
     def _signs(
@@ -330,13 +343,13 @@ class PairJudge:
         regions: Regions,
         evidence: PairEvidence,
         log10_false_alarms: float,
-    ) -> Signs:
+    ) -> EvidenceFeatures:
         told = log10_false_alarms, regions.log10_evidence(evidence.shares)
         counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
         extent_m = self._extent_m(alignment)
         one_place = self._is_one_place(alignment, extent_m)
         repeats = evidence.repeats(self._bound)
-        return Signs(*told, *counts, extent_m, repeats, one_place)
+        return EvidenceFeatures(*told, *counts, extent_m, repeats, one_place)
 
     def _weighed(
         self, alignment: Alignment, regions: Regions, evidence: PairEvidence
@@ -401,7 +414,9 @@ class PairJudge:
     def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
         """The rivals that are another motion."""
         p_b = self._pairs.map_b.position_m[:, :2]
-        return [each for each in evidence.rivals if apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M]
+        return [
+            each for each in evidence.rivals if rms_distance_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
+        ]
 
     def _extent_m(self, alignment: Alignment) -> float:
         """The longer side of where the supporters lie."""
@@ -420,7 +435,7 @@ class PairJudge:
         drift_m = 0.0 if self._pairs.by_name else alignment.drift_sigma_m
         stated = whole_map_covariance(alignment.T_a_b, alignment.covariance, drift_m, p_a)
         p_b = self._pairs.map_b.position_m[:, :2]
-        sigma_m, sigma_rad = laid_sigma_m(alignment.T_a_b, stated, p_b), math.sqrt(stated[2, 2])
+        sigma_m, sigma_rad = landmark_sigma_m(alignment.T_a_b, stated, p_b), math.sqrt(stated[2, 2])
         if sigma_m <= settings.max_sigma_m and sigma_rad <= settings.max_sigma_rad:
             return ""
         found = f"sigma {sigma_m:.2g} m, {sigma_rad:.2g} rad"

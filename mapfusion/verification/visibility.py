@@ -55,7 +55,7 @@ class Poses(NamedTuple):
     reach_m: Float
 
 
-class Parts(NamedTuple):
+class BearingSectors(NamedTuple):
     """In which of B parts of the field of view something lies, by its slope: left over ahead.
 
     Attributes:
@@ -69,7 +69,7 @@ class Parts(NamedTuple):
     per_slope: float
 
     @classmethod
-    def of(cls, field: FieldOfView, parts: int) -> "Parts":
+    def of(cls, field: FieldOfView, parts: int) -> "BearingSectors":
         """Of a field of view in so many parts of equal angles."""
         low, high = field.bearing_rad
         if not low < high:
@@ -86,7 +86,7 @@ class Parts(NamedTuple):
         return cls(part.astype(np.int64), first, 1 / width)
 
 
-class Watch(NamedTuple):
+class ViewingHistory(NamedTuple):
     """All poses of a path of T frames, and what was in view from them.
 
     Attributes:
@@ -100,14 +100,14 @@ class Watch(NamedTuple):
 
     stretches: Stretches
     poses: Poses
-    parts: Parts
+    parts: BearingSectors
     reach_m: np.ndarray
     bearing_rad: Float
     range_m: Float
     height_m: Float
 
     @classmethod
-    def of(cls, viewing: Viewing) -> "Watch":
+    def of(cls, viewing: Viewing) -> "ViewingHistory":
         """Of viewing evidence."""
         field, reach = viewing.field, viewing.reach_m
         n_frames, n_parts = reach.shape
@@ -122,7 +122,7 @@ class Watch(NamedTuple):
         poses = Poses(x, y, np.cos(theta), np.sin(theta), farthest.reshape(n, -1))
         together = _together(poses, theta, reach_m, aside_rad)
         limits = field.bearing_rad, field.range_m, field.height_m
-        return cls(together, poses, Parts.of(field, n_parts), reach, *limits)
+        return cls(together, poses, BearingSectors.of(field, n_parts), reach, *limits)
 
 
 def _together(poses: Poses, theta: Float, reach_m: Float, aside_rad: float) -> Stretches:
@@ -145,17 +145,29 @@ LEAST_FRAMES = 5
 UNSEEN, MAY, MUST = 0, 1, 2
 
 
-class Likeness(NamedTuple):
+class ViewpointTolerance(NamedTuple):
     """From where a landmark looks as it did: within a ratio of its distance, and an angle."""
 
     ratio: float
     slant_rad: float
 
 
-LIKE = {MUST: Likeness(1.4, math.radians(30.0)), MAY: Likeness(2.0, math.radians(45.0))}
-_MUST_RATIO2, _MAY_RATIO2 = LIKE[MUST].ratio ** 2, LIKE[MAY].ratio ** 2
-_MUST_COS2, _MAY_COS2 = math.cos(LIKE[MUST].slant_rad) ** 2, math.cos(LIKE[MAY].slant_rad) ** 2
-_MAY_RATIO, _MAY_COS = LIKE[MAY].ratio, math.cos(LIKE[MAY].slant_rad)
+VIEWPOINT_TOLERANCES = {
+    MUST: ViewpointTolerance(1.4, math.radians(30.0)),
+    MAY: ViewpointTolerance(2.0, math.radians(45.0)),
+}
+_MUST_RATIO2, _MAY_RATIO2 = (
+    VIEWPOINT_TOLERANCES[MUST].ratio ** 2,
+    VIEWPOINT_TOLERANCES[MAY].ratio ** 2,
+)
+_MUST_COS2, _MAY_COS2 = (
+    math.cos(VIEWPOINT_TOLERANCES[MUST].slant_rad) ** 2,
+    math.cos(VIEWPOINT_TOLERANCES[MAY].slant_rad) ** 2,
+)
+_MAY_RATIO, _MAY_COS = (
+    VIEWPOINT_TOLERANCES[MAY].ratio,
+    math.cos(VIEWPOINT_TOLERANCES[MAY].slant_rad),
+)
 _ONES = np.uint64(0x0101010101010101)  # the lowest bit of each byte
 # Bits of what `_look` says of a pose: it may have seen a landmark, from about where it was seen, or
 # so it is but for the part of the field of view, which is to be looked up by the angle.
@@ -163,7 +175,7 @@ _MAY_BIT, _ALIKE_BIT, _UNSURE_BIT = 0, 1, 2
 _LEAST_AHEAD = 1e-300  # m; what is behind has no slope, and is told by its sign
 
 
-class Seen(NamedTuple):
+class ObservedLandmarks(NamedTuple):
     """N landmarks and how they were seen, in the frame of the robot that looks for them.
 
     Attributes:
@@ -178,7 +190,7 @@ class Seen(NamedTuple):
 
 
 @kernel
-def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
+def classify_visibility(seen: ObservedLandmarks, watch: ViewingHistory) -> np.ndarray:
     """UNSEEN, MAY or MUST (N,) of each landmark: LEAST_FRAMES frames or more had it in view so."""
     p, direction, distance_m = seen
     # arrays by themselves: taken from a tuple, each access would count its references
@@ -260,7 +272,7 @@ def _look(
     c: int,
     levels: int,
     poses: Poses,
-    parts: Parts,
+    parts: BearingSectors,
     range_m: Float,
     n_steps: int,
     said: np.ndarray,

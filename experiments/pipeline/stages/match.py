@@ -22,7 +22,7 @@ from mapfusion.align.refinement import Refinement
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import Witness
+from mapfusion.verification.regions import ViewedMap
 from mapfusion.verification.verdict import Judge, why_not_sought
 
 # Evaluated iterations a part: small enough that an interruption loses little and two cores end
@@ -64,9 +64,9 @@ def run(settings: MatchSettings, job: Job) -> None:
 
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
-def _witness(folders: RobotFolders, iteration: int) -> Witness:
+def _witness(folders: RobotFolders, iteration: int) -> ViewedMap:
     """A robot's map, with what it was asked: it is in as many pairs as there are other robots."""
-    return Witness(known_at(stored_maps(folders), iteration))
+    return ViewedMap(known_at(stored_maps(folders), iteration))
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:

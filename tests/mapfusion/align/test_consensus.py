@@ -14,10 +14,10 @@ from scipy.stats import f as f_distribution
 from mapfusion.align.aligners import make_aligner
 from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.clique import Clique, CliqueSearch
-from mapfusion.align.consensus import consistency, in_rows
+from mapfusion.align.consensus import consistency_graphs, packed_rows
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
-from mapfusion.align.mahalanobis_gate import mean_variances, settle
+from mapfusion.align.mahalanobis_gate import mean_variances, refit_to_support
 from mapfusion.align.method import Fit
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, least_truncated_squares
@@ -170,7 +170,7 @@ def test_clique_is_the_largest_set_that_agrees():
         largest = np.array(next(s for s in sets if agree[np.ix_(s, s)].all()))
         planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
         T, inside = np.array(fit_rigid(a, b, largest)), np.empty(14, dtype=bool)
-        settle(T, planar, mean_variances(planar), 1e-12, aligner.bound, inside)
+        refit_to_support(T, planar, mean_variances(planar), 1e-12, aligner.bound, inside)
         found = estimate(aligner, pair)
         np.testing.assert_array_equal(found.inlier, inside)
         assert error(found.T_a_b, T) == pytest.approx((0, 0), abs=1e-6)
@@ -247,7 +247,9 @@ def slow_search(pairs, variance, bound, agreement, max_draws, seed):
         if np.sum(raw > 0) < 2 or np.sum(raw) <= best_raw:
             continue
         best_raw = np.sum(raw)
-        settle(T, planar, mean_variances(planar), variance, bound, np.empty(n, dtype=bool))
+        refit_to_support(
+            T, planar, mean_variances(planar), variance, bound, np.empty(n, dtype=bool)
+        )
         score = scores(T, pairs, variance, bound)
         if np.sum(score > 0) >= 2 and np.sum(score) > best_score:
             best_T, best_score, count = T, np.sum(score), np.sum(score > 0)
@@ -265,7 +267,7 @@ def test_search_equals_its_twin(seed):
     pairs = Pairs(*maps, pair.correspondences)
     bound, agreement = float(chi2.ppf(0.99, 2)), float(chi2.ppf(0.99, 1))
     planar = pairs.in_plan()
-    given = planar, mean_variances(planar), in_rows(planar)
+    given = planar, mean_variances(planar), packed_rows(planar)
     draws, T = least_truncated_squares(
         *given, 0.0025, bound, agreement, 1.0, LOG_MISS, 3000, np.uint64(seed + 1)
     )
@@ -346,7 +348,7 @@ def test_kernel_equals_its_twin(n):
     (map_a, map_b), pair = blurred(np.random.default_rng(n), n)
     pairs = Pairs(map_a, map_b, pair.correspondences).in_plan()
     scales = 0.0025 * (n > 64), 0.01
-    found = unpacked(consistency(in_rows(pairs), scales, BOUND), n)
+    found = unpacked(consistency_graphs(packed_rows(pairs), scales, BOUND), n)
     for graph, variance in zip(found, scales, strict=True):
         np.testing.assert_array_equal(graph, slow_consistency(pairs, variance, BOUND))
         np.testing.assert_array_equal(graph, graph.T)
@@ -358,7 +360,7 @@ def test_single_precision_loses_no_pair():
     maps = [replace(m, position_m=50 * m.position_m) for m in (map_a, map_b)]
     maps = [replace(m, covariance_m2=2500 * m.covariance_m2) for m in maps]
     pairs = Pairs(*maps, pair.correspondences).in_plan()
-    found = unpacked(consistency(in_rows(pairs), (0.0, 1e-12), BOUND), 200)
+    found = unpacked(consistency_graphs(packed_rows(pairs), (0.0, 1e-12), BOUND), 200)
     np.testing.assert_array_equal(found[0], slow_consistency(pairs, 0.0, BOUND))
     assert np.sum(found[0]) > 0.99 * 200 * 199
 
@@ -371,7 +373,7 @@ def test_true_pairs_agree_with_the_probability_stated(drift_m):
         (map_a, map_b), pair = blurred(rng, n, true_share=1.0)
         map_b.position_m[:, :2] += rng.normal(0, drift_m, (n, 2))
         pairs = Pairs(map_a, map_b, pair.correspondences).in_plan()
-        graph = consistency(in_rows(pairs), (drift_m**2, 0.01), BOUND)[:1]
+        graph = consistency_graphs(packed_rows(pairs), (drift_m**2, 0.01), BOUND)[:1]
         disagreeing.append(1 - np.sum(unpacked(graph, n)) / (n * (n - 1)))
     # one landmark is in 199 comparisons: the scatter over the maps tells how sure the mean is
     sure = 4 * np.std(disagreeing) / np.sqrt(30)
@@ -382,7 +384,9 @@ def test_does_not_depend_on_the_frames():
     rng = np.random.default_rng(1)
     (map_a, map_b), pair = blurred(rng, 150)
     graphs = [
-        consistency(in_rows(Pairs(a, b, pair.correspondences).in_plan()), (0.0, 0.01), BOUND)
+        consistency_graphs(
+            packed_rows(Pairs(a, b, pair.correspondences).in_plan()), (0.0, 0.01), BOUND
+        )
         for a, b in ((map_a, map_b), (moved(map_a, motion(rng)), moved(map_b, motion(rng))))
     ]
     np.testing.assert_array_equal(*graphs)
@@ -393,5 +397,5 @@ def test_exact_maps_without_covariance_agree():
     rng = np.random.default_rng(2)
     pair = given_pairs(rng, 100, planar=True, T_a_b=np.array([1000.0, -700.0, 2.0]))
     pairs = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
-    graph = unpacked(consistency(in_rows(pairs), (1e-12, 0.01), BOUND), 100)[0]
+    graph = unpacked(consistency_graphs(packed_rows(pairs), (1e-12, 0.01), BOUND), 100)[0]
     assert np.sum(graph) == 100 * 99

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from mapfusion.align.aligners import make_aligner
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.drift import DRIFT_FLOOR_M, calibration_part, estimate_drift_m
+from mapfusion.align.drift import DRIFT_FLOOR_M, calibration_covariance, estimate_drift_m
 from mapfusion.align.refinement import Refinement
 from mapfusion.fusion.fused_map import AlignedPair
 from mapfusion.fusion.fusers import make_fuser
@@ -72,7 +72,9 @@ def test_equals_solving_again_with_spoiled_maps(pair: MapPair, camera: str) -> N
 def test_headings_alone_turn_one_map_about_either_beginning(pair: MapPair) -> None:
     a, b = CalibrationError(0.002), CalibrationError(0.001)
     own = with_errors(pair, a, b)
-    found = calibration_part(pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences), 0.1)
+    found = calibration_covariance(
+        pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences), 0.1
+    )
     x, y, _ = pair.T_a_b
     by = np.array([[-y, x, 1.0], [0.0, 0.0, -1.0]]).T * [0.002, 0.001]
     # the maps' noise leaves residuals, which turn with neither
@@ -99,11 +101,13 @@ def test_fused_motions_are_no_surer_than_the_cameras(pair: MapPair) -> None:
 
 def test_inverse_alignments_are_equally_sure(pair: MapPair) -> None:
     own = with_errors(pair, OF_A, OF_B)
-    there = calibration_part(pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences), 1.0)
+    there = calibration_covariance(
+        pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences), 1.0
+    )
     c = own.correspondences
     turned = type(c)(c.index_b, c.index_a, c.distance)
     T = se2.inverse(pair.T_a_b)
-    back = calibration_part(T, Pairs(own.map_b, own.map_a, turned), 1.0)
+    back = calibration_covariance(T, Pairs(own.map_b, own.map_a, turned), 1.0)
     cos, sin = np.cos(T[2]), np.sin(T[2])
     J = np.array([[-cos, sin, T[1]], [-sin, -cos, -T[0]], [0, 0, -1]])  # d inverse / dT
     sigma = np.sqrt(np.diag(back))

@@ -9,15 +9,15 @@ from scipy.stats import chi2, f, multivariate_normal
 from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.mahalanobis_gate import (
+    PairSpread,
     PlanarPairs,
-    Spread,
-    is_unlike_the_others,
+    highest_leverage_pair,
+    is_outlier_to_others,
     log_likelihood,
     mark_supporters,
     mean_variances,
-    most_leverage,
-    settle,
-    settle_at_best_scale,
+    refit_at_best_drift,
+    refit_to_support,
     spread_area_m2,
 )
 from mapfusion.align.refinement import Refinement
@@ -95,7 +95,7 @@ def test_leverage_is_the_hat_matrix_s_trace() -> None:
         covariance = np.linalg.inv(np.einsum("nki,nkl,nlj->ij", J, W, J))
         hat = np.einsum("nki,ij,nlj,nlk->n", J, covariance, J, W)
         assert hat.sum() == pytest.approx(3)  # as many as parameters
-        assert most_leverage(T, pairs, variance, truth, covariance) == np.argmax(hat)
+        assert highest_leverage_pair(T, pairs, variance, truth, covariance) == np.argmax(hat)
 
 
 @pytest.mark.parametrize("n", [4, 6, 12])
@@ -113,11 +113,11 @@ def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
         variance = float(np.sum(e**2)) / (2 * (n - 1) - 3)
         J = motion_jacobian(T, others.p_b)
         covariance = np.linalg.inv(np.einsum("nki,nkj->ij", J, J)) * variance
-        called += is_unlike_the_others(T, covariance, variance, pairs, 0)
+        called += is_outlier_to_others(T, covariance, variance, pairs, 0)
     assert called <= 2  # 0.075 are expected at n = 4
     far = p_a.copy()
     far[0] += 300.0
-    assert is_unlike_the_others(T, covariance, variance, pairs._replace(p_a=far), 0)
+    assert is_outlier_to_others(T, covariance, variance, pairs._replace(p_a=far), 0)
 
 
 @pytest.mark.parametrize("n", [4, 6, 20])
@@ -131,7 +131,7 @@ def test_the_limit_of_a_pair_is_that_of_the_f_distribution(n: int) -> None:
         moved = p_a.copy()
         moved[k] += sigma_m * np.sqrt(share * limit) * np.array([0.6, -0.8])
         pairs = PlanarPairs(moved, p_b, none, none)
-        assert is_unlike_the_others(T_TRUE, known, sigma_m**2, pairs, k) == unlike
+        assert is_outlier_to_others(T_TRUE, known, sigma_m**2, pairs, k) == unlike
 
 
 BOUND = float(chi2.ppf(0.99, 2))
@@ -176,7 +176,7 @@ def test_settled_motion_fits_its_own_support(case):
     pairs, T_a_b = case
     planar, inside = pairs.in_plan(), np.empty(200, dtype=bool)
     T = T_a_b + np.array([0.05, -0.05, 0.002])
-    count = settle(T, planar, mean_variances(planar), 0.0025, BOUND, inside)
+    count = refit_to_support(T, planar, mean_variances(planar), 0.0025, BOUND, inside)
     fitted = np.empty(3)
     fit_weighted(planar.p_a, planar.p_b, inside / mean_variances(planar, 0.0025), fitted)
     assert error(T, fitted) == pytest.approx((0, 0), abs=1e-12)
@@ -202,14 +202,14 @@ def test_the_scale_that_the_residuals_have_is_chosen(drift_m, level):
         planar = Pairs(pair.map_a, stretched(rng, pair.map_b, 1), pair.correspondences).in_plan()
         T, inside = pair.T_a_b.copy(), np.empty(300, dtype=bool)
         scales = np.array([0.0, 0.05, 0.1]) ** 2 + 1e-12
-        spread = Spread.of(planar)
-        assert settle_at_best_scale(T, planar, spread, scales, BOUND, inside)[1] == level
+        spread = PairSpread.of(planar)
+        assert refit_at_best_drift(T, planar, spread, scales, BOUND, inside)[1] == level
 
 
 def test_no_support_at_any_scale():
     pair = given_pairs(np.random.default_rng(3), 50, 1.0, 0.01, planar=True)
     planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
     T, inside = pair.T_a_b + np.array([500.0, 0, 0]), np.ones(50, dtype=bool)
-    spread = Spread.of(planar)
-    assert settle_at_best_scale(T, planar, spread, np.array([1e-4]), BOUND, inside)[1] == -1
+    spread = PairSpread.of(planar)
+    assert refit_at_best_drift(T, planar, spread, np.array([1e-4]), BOUND, inside)[1] == -1
     assert not inside.any()

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from mapfusion.align import method as module
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.method import SHAPE_FALSE_ALARM, lacks_extent, why_one_place
+from mapfusion.align.method import SHAPE_FALSE_ALARM, lacks_extent, why_angle_is_open
 from tests.mapfusion.align.map_pairs import covariances, landmarks
 
 
@@ -74,9 +74,9 @@ def test_points_without_noise_have_the_extent_that_rounding_leaves(dimensions):
 def test_either_map_at_one_point_leaves_the_angle_open(at_one_point):
     p = np.random.default_rng(1).uniform(0, 9, (20, 3))
     maps = {name: landmarks(p, name=name) for name in "ab"}
-    assert why_one_place(pairs_of(maps)) == ""
+    assert why_angle_is_open(pairs_of(maps)) == ""
     maps[at_one_point] = landmarks(np.tile(p[:1], (20, 1)), name=at_one_point)
-    assert f"map {at_one_point}" in why_one_place(pairs_of(maps))
+    assert f"map {at_one_point}" in why_angle_is_open(pairs_of(maps))
 
 
 def pairs_of(maps):

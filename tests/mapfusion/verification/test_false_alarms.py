@@ -25,10 +25,10 @@ from mapfusion.verification.false_alarms import (
     chance_of_agreeing,
     fewest_false_alarms,
     independent_pairs,
+    independent_rows,
     log10_tail,
     minimal_motion,
     named_false_alarms,
-    thin,
 )
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks, motion, moved, swapped
 
@@ -268,8 +268,8 @@ def test_thinning_keeps_the_first_of_neighbours_in_both_maps():
         if not any(near):
             kept.append(i)
     assert 100 < len(kept) < 195
-    np.testing.assert_array_equal(thin(p_a, p_b, 0.4), kept)
-    np.testing.assert_array_equal(thin(p_a, p_b, 0.0), np.arange(200))
+    np.testing.assert_array_equal(independent_rows(p_a, p_b, 0.4), kept)
+    np.testing.assert_array_equal(independent_rows(p_a, p_b, 0.0), np.arange(200))
 
 
 def twin_counts(T_a_b, p_a, p_b, heights, n):

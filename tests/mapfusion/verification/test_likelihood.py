@@ -12,12 +12,12 @@ from mapfusion.verification.likelihood import (
     RIGHT,
     WRONG,
     BetaRate,
-    Signs,
+    EvidenceFeatures,
     TwinShares,
     log10_against_chance,
-    log10_beside_one,
     log10_ratio,
-    probability,
+    log10_without_discovery,
+    probability_correct,
 )
 
 
@@ -117,7 +117,7 @@ def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
     found_by_one = (np.outer(right, wrong) + np.outer(wrong, right)) / 2
     by_region = log10_ratio(*must_own(k, np.full(n + 1, n)), TwinShares(s, 0.5))
     ratio = [
-        [10 ** log10_beside_one(np.array([first, second])) for second in by_region]
+        [10 ** log10_without_discovery(np.array([first, second])) for second in by_region]
         for first in by_region
     ]
     np.testing.assert_allclose(found_by_one * ratio, np.outer(right, right), rtol=1e-9)
@@ -125,13 +125,13 @@ def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
 
 
 def test_one_region_alone_is_no_evidence_for_what_it_found() -> None:
-    assert log10_beside_one(np.array([1.3])) == pytest.approx(0.0)
-    assert log10_beside_one(np.zeros(0)) == 0.0
-    assert log10_beside_one(np.full(4, 0.8)) == pytest.approx(3 * 0.8)
-    assert log10_beside_one(np.array([1.3, -1.2])) == pytest.approx(-0.9, abs=0.01)
+    assert log10_without_discovery(np.array([1.3])) == pytest.approx(0.0)
+    assert log10_without_discovery(np.zeros(0)) == 0.0
+    assert log10_without_discovery(np.full(4, 0.8)) == pytest.approx(3 * 0.8)
+    assert log10_without_discovery(np.array([1.3, -1.2])) == pytest.approx(-0.9, abs=0.01)
 
 
-FAIR = Signs(-20.0, 1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
+FAIR = EvidenceFeatures(-20.0, 1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
 
 
 @pytest.mark.parametrize(
@@ -146,13 +146,13 @@ FAIR = Signs(-20.0, 1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
     ],
 )
 def test_it_grows_with_what_speaks_for_it(better: dict, worse: dict) -> None:
-    high, low = (probability(FAIR._replace(**signs)) for signs in (better, worse))
+    high, low = (probability_correct(FAIR._replace(**signs)) for signs in (better, worse))
     assert 0 < low < high < 1
 
 
 def test_the_features_are_bounded_so_that_nothing_is_certain() -> None:
-    most = Signs(-1e9, 1e9, 10**6, 0, 10**6, 1e9, repeats=False, one_place=False)
-    assert probability(most) < 1
+    most = EvidenceFeatures(-1e9, 1e9, 10**6, 0, 10**6, 1e9, repeats=False, one_place=False)
+    assert probability_correct(most) < 1
     assert np.isfinite(most.features()).all()
     np.testing.assert_allclose(most.features()[[0, 1, 4]], [10.0, 3.0, 12.0])
 
@@ -188,5 +188,5 @@ def test_coefficients_belong_to_their_features(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(model, "INTERCEPT", -0.25)
     for k, feature in enumerate(expected):
         monkeypatch.setattr(model, "WEIGHTS", tuple(0.5 * (i == k) for i in range(7)))
-        p = probability(signs)
+        p = probability_correct(signs)
         assert np.log(p / (1 - p)) == pytest.approx(0.5 * feature - 0.25)

@@ -16,9 +16,9 @@ from mapfusion.registration import Registration
 from mapfusion.verification import verdict as verdict_module
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import Witness
-from mapfusion.verification.rivals import BETWEEN, Copies, self_motions
-from mapfusion.verification.verdict import Judge, RivalMotion, laid_sigma_m
+from mapfusion.verification.regions import ViewedMap
+from mapfusion.verification.rivals import BETWEEN, RepeatedLandmarks, self_motions
+from mapfusion.verification.verdict import Judge, RivalMotion, landmark_sigma_m
 from tests.mapfusion.verification.two_rooms import Wall, between, mapped
 
 JUDGE = Judge()
@@ -63,7 +63,7 @@ def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
     evidence, (said, refined) = sought.judge.evidence, verdict(A, B)
     assert evidence is not None
     elsewhere = refined.T_a_b + np.array([0.0, 30.0, 0.0])
-    none = Copies.none(len(A), len(B))
+    none = RepeatedLandmarks.none(len(A), len(B))
     told = log10_by_chance, 9, 2, 0, 2, said.log10_evidence
     rival = RivalMotion(BETWEEN, elsewhere, *told, none)
     assert said.log10_evidence > 2.5
@@ -81,7 +81,7 @@ def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str
     assert sought.judge is not None
     evidence = sought.judge.evidence
     assert evidence is not None
-    none = Copies.none(len(A), len(B))
+    none = RepeatedLandmarks.none(len(A), len(B))
     others = [
         RivalMotion(
             BETWEEN, refined.T_a_b + np.array([0.0, 30.0 * k, 0.0]), -5.0, 9, 0, 3, 3, -4.0, none
@@ -182,7 +182,7 @@ def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> 
     wall = Wall(20, seed=1, copies=[(2, 2, 12), (5, 1.5, 16)])
     ends = (1, 11), (4, 16), (7, 19)
     maps = [mapped(wall, *each, seed=k, name=f"R{k}") for k, each in enumerate(ends)]
-    ready, asked = [Witness(each) for each in maps], []
+    ready, asked = [ViewedMap(each) for each in maps], []
 
     def counted(landmarks: LandmarkMap, *settings):
         asked.append(landmarks.name)
@@ -234,7 +234,7 @@ def test_it_is_the_rms_of_what_drawn_alignments_do(T_a_b: list[float]) -> None:
     laid = np.stack([se2.transform_points(each, P_B) for each in drawn])
     off = laid - se2.transform_points(T, P_B)
     expected = np.sqrt(np.mean(np.sum(off**2, axis=2)))
-    assert laid_sigma_m(T, COVARIANCE, P_B) == pytest.approx(expected, rel=0.03)
+    assert landmark_sigma_m(T, COVARIANCE, P_B) == pytest.approx(expected, rel=0.03)
 
 
 def test_where_the_frames_have_their_origins_does_not_matter() -> None:
@@ -244,5 +244,5 @@ def test_where_the_frames_have_their_origins_does_not_matter() -> None:
     moved = se2.rotation(T[2]) @ shift
     J = np.eye(3)
     J[:2, 2] = sin * shift[0] + cos * shift[1], -cos * shift[0] + sin * shift[1]
-    there = laid_sigma_m(T - [*moved, 0.0], J @ COVARIANCE @ J.T, P_B + shift)
-    assert there == pytest.approx(laid_sigma_m(T, COVARIANCE, P_B), rel=1e-9)
+    there = landmark_sigma_m(T - [*moved, 0.0], J @ COVARIANCE @ J.T, P_B + shift)
+    assert there == pytest.approx(landmark_sigma_m(T, COVARIANCE, P_B), rel=1e-9)
