@@ -1,4 +1,4 @@
-"""Settings of the evidence, and of how sure an alignment has to be."""
+"""Parameters of the verification: matches, evidence and uncertainty."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -8,26 +8,28 @@ from mapfusion.parameters import Range, require_in_range
 
 @dataclass(frozen=True)
 class EvidenceParameters:
-    """What counts as seen again, and how much evidence a verdict needs.
+    """Gates for landmarks seen again, and thresholds of the verdict.
 
     Attributes:
-        gate_m: distance up to which a landmark of the other map is taken for one that must be
-            there: covariances, the alignment's own and what both maps drift lie within it.
-        max_descriptor_distance: of the two; that of one landmark's sightings in the filter.
-        region_m: least side of a region that is one piece of evidence: neighbouring corners are of
-            one picture. It grows to the largest thing that the maps hold twice.
-        place_m: longest side of a place that a world may hold twice as a whole, a room: where most
-            of the smaller map lies within it and agrees, nothing around it has been compared.
-        least_ratio: by how many times more likely the regions must be if the alignment is right
-            than if it is not, where maps resemble themselves or another motion fits them, and for
-            each motion that is more than chance: so that at most one pair of maps of so many has a
-            wrong motion that gets there (Markov's and Boole's inequalities).
-        most_against: by how many times less likely they may be before it counts as contradicted: at
-            most one right motion of so many gets there.
-        least_probability: that the alignment is right; below a half it is likelier wrong.
-        max_sigma_m: of where an alignment lays the other map's landmarks, RMS over them. Twice
-            that, 95 %, is what least squares still mends and what a merged map is used for: 0.5 m.
-        max_sigma_rad: of its rotation; twice that moves a landmark at 5 m by as much.
+        gate_m: largest distance between a landmark and its match in the other map. It covers the
+            landmarks' covariances, the alignment's uncertainty and the drift of both maps.
+        max_descriptor_distance: largest descriptor distance of a match; that of the observations of
+            one landmark in the filter.
+        region_m: smallest side of a region that counts as one piece of evidence, since neighbouring
+            corners belong to one texture. It grows to the largest structure that the maps repeat.
+        place_m: longest side of a place that may occur twice as a whole, such as a room. If most of
+            the smaller map lies in such a place and agrees, its surroundings were not compared.
+        least_ratio: smallest likelihood ratio of the regions, right motion over wrong motion, if
+            maps repeat structure or another motion fits; multiplied by the number of motions that
+            pass the test against chance. At most one pair of maps in this number has a wrong motion
+            that reaches it (Markov's and Boole's inequalities).
+        most_against: inverse of the likelihood ratio below which an alignment is contradicted; at
+            most one right motion in this number falls below it.
+        least_probability: smallest probability that the alignment is right.
+        max_sigma_m: largest standard deviation of the other map's landmarks under the alignment,
+            RMS. Two standard deviations (95 %) are 0.5 m, the limit of a useful merged map.
+        max_sigma_rad: largest standard deviation of the rotation; two standard deviations move a
+            landmark at 5 m by 0.5 m.
     """
 
     gate_m: Annotated[float, Range(0.01, 10, "m")] = 0.3

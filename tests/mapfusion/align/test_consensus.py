@@ -185,7 +185,7 @@ def test_what_the_clique_leaves_out_changes_nothing(true_share, monkeypatch):
     monkeypatch.setattr("mapfusion.align.clique._PART", 100)
     parts = estimate("clique", pair)
     monkeypatch.setattr("mapfusion.align.clique._PART", 400)
-    monkeypatch.setattr("mapfusion.align.clique.may_hold", lambda *_: True)
+    monkeypatch.setattr("mapfusion.align.clique.may_contain_clique", lambda *_: True)
     whole = estimate("clique", pair)
     for found in (quick, parts):
         np.testing.assert_array_equal(found.inlier, whole.inlier)
