@@ -304,7 +304,7 @@ class ViewedMapPair:
 
     @cached_property
     def _of(self) -> dict[str, "ViewedMapPair"]:
-        """This pair and the pairs of each map with itself, by the domain of a motion."""
+        """Pairs by the domain of a motion: both maps, or either map with itself."""
         a, b = (self.beside_itself(own, self._parameters) for own in (self.a, self.b))
         return {BETWEEN: self, "a": a, "b": b}
 

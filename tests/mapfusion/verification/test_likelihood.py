@@ -153,8 +153,8 @@ def test_it_grows_with_what_speaks_for_it(better: dict, worse: dict) -> None:
 def test_the_features_are_bounded_so_that_nothing_is_certain() -> None:
     most = EvidenceFeatures(-1e9, 1e9, 10**6, 0, 10**6, 1e9, repeats=False, one_place=False)
     assert probability_correct(most) < 1
-    assert np.isfinite(most.features()).all()
-    np.testing.assert_allclose(most.features()[[0, 1, 4]], [10.0, 3.0, 12.0])
+    assert np.isfinite(most.vector()).all()
+    np.testing.assert_allclose(most.vector()[[0, 1, 4]], [10.0, 3.0, 12.0])
 
 
 @pytest.mark.parametrize(
@@ -173,12 +173,12 @@ def test_a_contradiction_weighs_as_much_as_three_confirmations(
     n_confirmed: int, n_contradicted: int, net: float
 ) -> None:
     signs = FAIR._replace(n_confirmed=n_confirmed, n_contradicted=n_contradicted)
-    assert signs.features()[2] == pytest.approx(net, abs=1e-15)
+    assert signs.vector()[2] == pytest.approx(net, abs=1e-15)
 
 
 @pytest.mark.parametrize(("n_support", "decades"), [(0, 0.0), (9, 1.0), (99, 2.0)])
 def test_support_counts_by_its_decades(n_support: int, decades: float) -> None:
-    assert FAIR._replace(n_support=n_support).features()[3] == pytest.approx(decades)
+    assert FAIR._replace(n_support=n_support).vector()[3] == pytest.approx(decades)
 
 
 def test_coefficients_belong_to_their_features(monkeypatch: pytest.MonkeyPatch) -> None:
