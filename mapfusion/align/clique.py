@@ -300,8 +300,8 @@ def larger_clique(
 
 _GREEDY_STARTS = 100  # start vertices; a large greedy clique prunes most of the search
 _SAMPLE = 128  # pairs of the first, cheap search
-# Share of supporters at which the graph of the other pairs takes half the time of the whole graph. A
-# clique of the sample must contain at least half of this share.
+# Share of supporters at which the graph of the other pairs takes half the time of the whole graph.
+# A clique of the sample must contain at least half of this share.
 _WORTH_A_LOOK = 0.3
 # Largest number of pairs of one graph, which fits the processor's cache; the time grows with the
 # square. In smaller parts chance agreement would exceed the true pairs.

@@ -89,8 +89,8 @@ def mark_matched(
         gates: largest differences of a match.
     """
     # unpacked once: each access through the tuple would count references
-    _, z_own, z2_own, look_own = own
-    near, z_other, z2_other, look_other = other
+    _, z_own, z2_own, descriptor_own = own
+    near, z_other, z2_other, descriptor_other = other
     at, row_of, distance_m = near.p, near.row, gates.distance_m
     found = np.zeros(len(rows), np.bool_)
     runs = np.empty((near.shape[1], 2), np.int64)
@@ -107,9 +107,9 @@ def mark_matched(
                 if most < math.inf and dz * dz > most * (z2_own[i] + z2_other[j] + floor_m2):
                     continue
                 square = 0.0  # distance of the descriptors
-                for first in range(0, look_own.shape[1], _DESCRIPTOR_STEP):
-                    for d in range(first, min(first + _DESCRIPTOR_STEP, look_own.shape[1])):
-                        square += (look_own[i, d] - look_other[j, d]) ** 2
+                for first in range(0, descriptor_own.shape[1], _DESCRIPTOR_STEP):
+                    for d in range(first, min(first + _DESCRIPTOR_STEP, descriptor_own.shape[1])):
+                        square += (descriptor_own[i, d] - descriptor_other[j, d]) ** 2
                     if square > unlike2:
                         break
                 if square <= unlike2:
@@ -179,7 +179,7 @@ class Regions:
             enough[np.argmax(self._all)] = False
         return enough
 
-    def seen_again(self, part: int) -> tuple[int, int]:
+    def count_confirmed(self, part: int) -> tuple[int, int]:
         """Return the number of confirmed and of all regions `beside_best` in a part."""
         enough = self.beside_best(part)
         return int(np.sum(self._parts[enough, part] >= DECISIVE)), int(np.sum(enough))
@@ -250,20 +250,20 @@ class ViewedMap:
         assert viewing is not None
         assert descriptor is not None
         self.landmarks, self._viewing = landmarks, viewing
-        self.watch = ViewingHistory.of(viewing)
+        self.history = ViewingHistory.of(viewing)
         position = np.ascontiguousarray(landmarks.position_m)
         z_m2 = landmarks.covariance_m2[:, 2, 2].copy()
         near = Grid.of(position[:, :2])
-        self.looks = DescribedLandmarks(
+        self.described = DescribedLandmarks(
             near, position[:, 2].copy(), z_m2, np.ascontiguousarray(descriptor)
         )
         # results that depend on this map alone, by query: several pairs share a map
         self.kept: dict[tuple, Any] = {}
 
     @cached_property
-    def crowd(self) -> np.ndarray:
+    def n_near(self) -> np.ndarray:
         """Number of landmarks near each landmark, shape (N,)."""
-        return count_neighbours(np.ones(len(self.landmarks), np.bool_), self.looks.near)
+        return count_neighbours(np.ones(len(self.landmarks), np.bool_), self.described.near)
 
     def transformed(self, T: Float) -> Float:
         """Return the positions under a motion of the plane, shape (N, 3)."""
@@ -271,7 +271,7 @@ class ViewedMap:
         p[:, :2] = transform_points(T, p[:, :2])
         return p
 
-    def seen_from(self, T: Float) -> ObservedLandmarks:
+    def observed_from(self, T: Float) -> ObservedLandmarks:
         """Return the landmarks with their viewpoints in another frame, T from this frame to it."""
         viewing, p = self._viewing, self.transformed(T)
         angle = viewing.direction_rad + T[2]
@@ -349,9 +349,9 @@ class ViewedMapPair:
         key = own is self.a, T.tobytes()
         if key not in self._found:
             p = own.transformed(T)
-            found = mark_matched(p, np.arange(len(p)), own.looks, other.looks, self._gates)
+            found = mark_matched(p, np.arange(len(p)), own.described, other.described, self._gates)
             self._found[key] = found
-        return mark_repeated(self._found[key], own.crowd, own.looks.near)
+        return mark_repeated(self._found[key], own.n_near, own.described.near)
 
     def _expected(
         self, own: ViewedMap, other: ViewedMap, T: Float, copied: np.ndarray
@@ -364,10 +364,10 @@ class ViewedMapPair:
         if key in self._how:
             p = own.transformed(T)
         else:
-            seen = own.seen_from(T)
-            self._how[key], p = classify_visibility(seen, other.watch), seen.p
+            seen = own.observed_from(T)
+            self._how[key], p = classify_visibility(seen, other.history), seen.p
         how, known = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
-        looks = own.looks, other.looks
+        looks = own.described, other.described
         found = mark_matched(p, rows, *looks, self._gates) if known is None else known[rows]
         return _Expected(rows, how[rows], found, copied[rows]), p

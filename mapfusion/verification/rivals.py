@@ -71,13 +71,13 @@ def count_neighbours(counted: np.ndarray, near: Grid) -> np.ndarray:
     return n
 
 
-def mark_repeated(found: np.ndarray, crowd: np.ndarray, near: Grid) -> np.ndarray:
+def mark_repeated(found: np.ndarray, n_near: np.ndarray, near: Grid) -> np.ndarray:
     """Mark landmarks (N,) in neighbourhoods of which enough landmarks are `found` (N,) elsewhere.
 
-    `crowd` (N,) is the number of landmarks near each.
+    `n_near` (N,) is the number of landmarks near each.
     """
     hits = count_neighbours(found, near)
-    return (hits >= _LEAST) & (hits >= _LEAST_SHARE * crowd)
+    return (hits >= _LEAST) & (hits >= _LEAST_SHARE * n_near)
 
 
 # Smallest distance of two similar landmarks: neighbouring corners share most of their descriptor

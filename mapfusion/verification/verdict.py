@@ -138,7 +138,7 @@ def why_not_sought(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
 
 def find_evidence(
     pairs: Pairs,
-    witnesses: ViewedMapPair,
+    viewed_maps: ViewedMapPair,
     acceptance: Acceptance,
     refinement: Refinement,
     parameters: EvidenceParameters,
@@ -147,7 +147,7 @@ def find_evidence(
 
     Args:
         pairs: correspondences of the maps.
-        witnesses: the maps, prepared for queries.
+        viewed_maps: the maps, prepared for queries.
         acceptance: test of each motion against chance.
         refinement: least squares of each motion.
         parameters: size of a region.
@@ -156,7 +156,7 @@ def find_evidence(
     motions = [(BETWEEN, m) for m in distinct_motions(pairs, N_RIVALS, acceptance, refinement)]
     n_between, region_m = len(motions), parameters.region_m
     supporters = [pairs.p_a[motion.inlier] for _, motion in motions]
-    for side, own in zip("ab", (witnesses.a, witnesses.b), strict=True):
+    for side, own in zip("ab", (viewed_maps.a, viewed_maps.b), strict=True):
         key = self_motions, acceptance, refinement
         if key not in own.kept:
             own.kept[key] = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
@@ -170,9 +170,9 @@ def find_evidence(
                 side_m = longest_patch_side_m(p, _PATCH_REACH_M, _LEAST_OF_PATCH)
                 region_m = max(region_m, side_m)
     # regions under each motion, with the structure that other motions explain counted apart
-    copies = [witnesses.copies(of, motion.T_a_b) for of, motion in motions]
+    copies = [viewed_maps.copies(of, motion.T_a_b) for of, motion in motions]
     regions = [
-        witnesses.regions(
+        viewed_maps.regions(
             of,
             motion.T_a_b,
             RegionGrid.about(supporters[k], region_m),
@@ -206,8 +206,8 @@ def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
     the map holds a structure twice, and says nothing of other regions.
     """
     wrong = sorted(rivals, key=lambda r: r.n_contradicted - r.n_confirmed)[1:]
-    own = [_TWINS_BEFORE, *(regions.seen_again(OWN) for regions in wrong)]
-    copied = [_COPIES_BEFORE, *(regions.seen_again(COPIED) for regions in [*wrong, *selves])]
+    own = [_TWINS_BEFORE, *(regions.count_confirmed(OWN) for regions in wrong)]
+    copied = [_COPIES_BEFORE, *(regions.count_confirmed(COPIED) for regions in [*wrong, *selves])]
     shares = (np.sum(counts, axis=0) for counts in (own, copied))
     return TwinShares(*(float(confirmed / n) for confirmed, n in shares))
 
@@ -236,16 +236,16 @@ class Judge:
         self,
         pairs: Pairs,
         known: PairEvidence | None = None,
-        witnesses: tuple[ViewedMap, ViewedMap] | None = None,
+        viewed_maps: tuple[ViewedMap, ViewedMap] | None = None,
     ) -> "PairJudge":
         """Prepare the verification of any number of alignments of two maps.
 
         Args:
             pairs: correspondences of the maps.
             known: evidence found earlier; by default it is found at first use.
-            witnesses: both maps prepared for queries; by default they are prepared at first use.
+            viewed_maps: both maps prepared for queries; by default they are prepared at first use.
         """
-        return PairJudge(self, pairs, known, witnesses)
+        return PairJudge(self, pairs, known, viewed_maps)
 
 
 class PairJudge:
@@ -256,14 +256,14 @@ class PairJudge:
         judge: Judge,
         pairs: Pairs,
         known: PairEvidence | None,
-        witnesses: tuple[ViewedMap, ViewedMap] | None,
+        viewed_maps: tuple[ViewedMap, ViewedMap] | None,
     ) -> None:
-        self._judge, self._pairs, self._known, self._ready = judge, pairs, known, witnesses
+        self._judge, self._pairs, self._known, self._ready = judge, pairs, known, viewed_maps
         self._chance = judge.acceptance.on(pairs)
         self._bound = math.log10(judge.acceptance.false_alarms)
 
     @cached_property
-    def _witnesses(self) -> ViewedMapPair:
+    def _viewed_maps(self) -> ViewedMapPair:
         a, b = self._ready or (ViewedMap(self._pairs.map_a), ViewedMap(self._pairs.map_b))
         return ViewedMapPair(a, b, self._judge.evidence)
 
@@ -276,7 +276,7 @@ class PairJudge:
             return self._known
         judge = self._judge
         settings = (judge.acceptance, judge.refinement, judge.evidence)
-        return find_evidence(self._pairs, self._witnesses, *settings)
+        return find_evidence(self._pairs, self._viewed_maps, *settings)
 
     def judge(self, alignment: Alignment) -> Verdict:
         """Return the verdict on one alignment of the correspondences."""
@@ -341,7 +341,7 @@ class PairJudge:
             if each.of != BETWEEN or rms_distance_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
         )
         none = RepeatedLandmarks.none(len(self._pairs.map_a), len(self._pairs.map_b))
-        return self._witnesses.regions(BETWEEN, T_a_b, squares, none.joined(others))
+        return self._viewed_maps.regions(BETWEEN, T_a_b, squares, none.joined(others))
 
     def _features(
         self,

@@ -14,7 +14,7 @@ from mapfusion.geometry.se2 import wrap
 from mapfusion.viewing import FieldOfView, Viewing
 
 # Consecutive frames per block. A robot moves and turns little in this time.
-STRETCH = 8
+FRAMES_PER_BLOCK = 8
 ROUNDING = 1e-9  # relative bound on the rounding error of a distance, an angle or a slope
 # A landmark at most this far behind the farthest landmark of its sector is not occluded: within a
 # sector, a slanted wall covers a range of distances.
@@ -23,8 +23,8 @@ CELLS = 512  # slope cells; few of them contain the edge of a sector
 _STEEPEST_RAD = math.pi / 2 - 1e-3  # bearing beyond which a slope resolves angles poorly
 
 
-class Stretches(NamedTuple):
-    """C blocks of STRETCH consecutive frames; the last block may be shorter.
+class PoseBlocks(NamedTuple):
+    """C blocks of FRAMES_PER_BLOCK consecutive frames; the last block may be shorter.
 
     Attributes:
         x_m, y_m: centre of the positions, shape (C,).
@@ -48,10 +48,10 @@ class Poses(NamedTuple):
     """Poses of C blocks; the last block is padded with poses that saw nothing.
 
     Attributes:
-        x_m, y_m, cos, sin: positions and headings, shape (C, STRETCH).
+        x_m, y_m, cos, sin: positions and headings, shape (C, FRAMES_PER_BLOCK).
         reach_m: range of the farthest landmark seen in each of the B sectors, followed by one
             value for points outside the field of view and one for points whose sector is
-            undecided, shape (C, STRETCH (B + 2)).
+            undecided, shape (C, FRAMES_PER_BLOCK (B + 2)).
     """
 
     x_m: Float
@@ -97,7 +97,7 @@ class ViewingHistory(NamedTuple):
     """Poses of a path of T frames and the ranges seen from each of them.
 
     Attributes:
-        stretches: bounds of each block of poses.
+        blocks: bounds of each block of poses.
         poses: single poses.
         parts: sectors of the field of view.
         reach_m: range of the farthest landmark seen in each sector, shape (T, B).
@@ -105,7 +105,7 @@ class ViewingHistory(NamedTuple):
         height_m: limits of the visible heights at each of H steps of range, shape (H, 2).
     """
 
-    stretches: Stretches
+    blocks: PoseBlocks
     poses: Poses
     parts: BearingSectors
     reach_m: np.ndarray
@@ -118,11 +118,13 @@ class ViewingHistory(NamedTuple):
         """Return the history of a map's viewing evidence."""
         field, reach = viewing.field, viewing.reach_m
         n_frames, n_parts = reach.shape
-        n = -(-n_frames // STRETCH)
-        farthest = np.full((n * STRETCH, n_parts + 2), -np.inf)
+        n = -(-n_frames // FRAMES_PER_BLOCK)
+        farthest = np.full((n * FRAMES_PER_BLOCK, n_parts + 2), -np.inf)
         farthest[:n_frames, :n_parts] = reach.astype(np.float64) + BEHIND_M
         farthest[:n_frames, n_parts + 1] = np.inf
-        rows = np.minimum(np.arange(n * STRETCH), n_frames - 1).reshape(n, STRETCH)
+        rows = np.minimum(np.arange(n * FRAMES_PER_BLOCK), n_frames - 1).reshape(
+            n, FRAMES_PER_BLOCK
+        )
         x, y, theta = (np.ascontiguousarray(viewing.pose[rows, k]) for k in range(3))
         aside_rad = float(np.abs(field.bearing_rad).max())
         reach_m = farthest[:, :n_parts].reshape(n, -1).max(axis=1)
@@ -134,7 +136,7 @@ class ViewingHistory(NamedTuple):
         turned = np.abs(wrap(theta - mean[:, None])).max(axis=1)
         least = np.cos(np.minimum(aside_rad + turned + ROUNDING, np.pi))
         radius_m = np.sqrt(square.max(axis=1))
-        blocks = Stretches(mid_x, mid_y, radius_m, np.cos(mean), np.sin(mean), least, reach_m)
+        blocks = PoseBlocks(mid_x, mid_y, radius_m, np.cos(mean), np.sin(mean), least, reach_m)
         limits = field.bearing_rad, field.range_m, field.height_m
         return cls(blocks, poses, BearingSectors.of(field, n_parts), reach, *limits)
 
@@ -201,8 +203,8 @@ def classify_visibility(seen: ObservedLandmarks, watch: ViewingHistory) -> np.nd
     """
     p, direction, distance_m = seen
     # unpacked once: each access through the tuple would count references
-    stretches, poses, parts, reach_m, bearing_rad, range_m, height_m = watch
-    x, y, radius, cos, sin, least_cos, stretch_m = stretches
+    blocks, poses, parts, reach_m, bearing_rad, range_m, height_m = watch
+    x, y, radius, cos, sin, least_cos, block_reach_m = blocks
     how = np.zeros(len(p), np.int64)
     eights = np.zeros((len(x) + WORD - 1) // WORD * 8, np.uint64)
     possible = eights.view(np.uint8)[: len(x)]
@@ -214,7 +216,7 @@ def classify_visibility(seen: ObservedLandmarks, watch: ViewingHistory) -> np.nd
         for step in range(len(height_m)):
             levels |= (height_m[step, 0] <= p[i, 2] <= height_m[step, 1]) << step
         own = p[i, 0], p[i, 1], ux, uy, max(r / _MAY_RATIO, range_m[0]), r * _MAY_RATIO
-        _mark_possible_blocks(own, x, y, radius, cos, sin, least_cos, stretch_m, possible)
+        _mark_possible_blocks(own, x, y, radius, cos, sin, least_cos, block_reach_m, possible)
         must = may = 0
         for w in range(len(eights) // 8):
             word = packed(eights, w)
@@ -283,7 +285,7 @@ def _flag_poses(
     n_steps: int,
     flags: np.ndarray,
 ) -> None:
-    """Set the flags (STRETCH,) of each pose of block c for one landmark.
+    """Set the flags (FRAMES_PER_BLOCK,) of each pose of block c for one landmark.
 
     `sight` is the landmark's position, its viewing direction and the square of its viewing
     distance. Bit h of `levels` is set if its height is in view at step h of the range. The loop is
@@ -292,10 +294,10 @@ def _flag_poses(
     x, y, cos, sin, reach_m = poses
     part_of, first, per_slope = parts
     at_x, at_y, ux, uy, r2 = sight
-    nearest, farthest, columns = range_m[0], range_m[1], reach_m.shape[1] // STRETCH
+    nearest, farthest, columns = range_m[0], range_m[1], reach_m.shape[1] // FRAMES_PER_BLOCK
     per_range = farthest if farthest > 0 else 1.0
     row = np.uint64(c)
-    for k in range(STRETCH):
+    for k in range(FRAMES_PER_BLOCK):
         dx, dy = at_x - x[c, k], at_y - y[c, k]
         square, along = dx * dx + dy * dy, dx * ux + dy * uy
         away = math.sqrt(square)
@@ -344,4 +346,4 @@ def _is_in_view(
     if not low <= bearing <= high:
         return False
     part = min(int((bearing - low) / (high - low) * parts), parts - 1)
-    return math.sqrt(dx * dx + dy * dy) <= reach_m[c * STRETCH + k, part] + BEHIND_M
+    return math.sqrt(dx * dx + dy * dy) <= reach_m[c * FRAMES_PER_BLOCK + k, part] + BEHIND_M

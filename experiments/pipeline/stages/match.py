@@ -51,11 +51,11 @@ def run(settings: MatchSettings, job: Job) -> None:
     for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
         pairs = match(map_a, map_b, settings.match)
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
-        witnesses = None
+        viewed_maps = None
         if not why_not_sought(map_a, map_b):
             a, b = folders_of_both(job)
-            witnesses = _witness(a, k), _witness(b, k)
-        if evidence := judge.on(Pairs(map_a, map_b, pairs), witnesses=witnesses).evidence:
+            viewed_maps = _viewed_map(a, k), _viewed_map(b, k)
+        if evidence := judge.on(Pairs(map_a, map_b, pairs), viewed_maps=viewed_maps).evidence:
             rivals += rival_rows(names, evidence)
         columns = names | {"index_a": pairs.index_a, "index_b": pairs.index_b}
         made.append(pd.DataFrame(columns | {"descriptor_distance": pairs.distance}))
@@ -64,7 +64,7 @@ def run(settings: MatchSettings, job: Job) -> None:
 
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
-def _witness(folders: RobotFolders, iteration: int) -> ViewedMap:
+def _viewed_map(folders: RobotFolders, iteration: int) -> ViewedMap:
     """A robot's map, with what it was asked: it is in as many pairs as there are other robots."""
     return ViewedMap(known_at(stored_maps(folders), iteration))
 

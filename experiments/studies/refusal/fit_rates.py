@@ -61,13 +61,13 @@ def regions_of(worlds: Sequence[MappedWorld]) -> tuple[Counts, Counts]:
                 judge = settings.acceptance, settings.refinement
                 found = distinct_motions(pairs, N_RIVALS, *judge)
                 motions = [(each.T_a_b, each.inlier) for each in found]
-            witnesses = ViewedMapPair(
+            viewed_maps = ViewedMapPair(
                 ViewedMap(case.map_a), ViewedMap(case.map_b), settings.evidence
             )
             none = RepeatedLandmarks.none(len(case.map_a), len(case.map_b))
             for T, inlier in motions:
                 squares = RegionGrid.about(pairs.p_a[inlier], settings.evidence.region_m)
-                found = witnesses.regions(BETWEEN, T, squares, none)
+                found = viewed_maps.regions(BETWEEN, T, squares, none)
                 of_kind = right if case.n_common else wrong
                 of_kind.append((found.found[:, OWN], found.expected[:, OWN]))
     return _joined(right), _joined(wrong)

@@ -52,14 +52,14 @@ def regions_of(worlds: Sequence[MappedWorld]) -> list[Regions]:
             if case.n_common or evidence is None:
                 continue
             motions = distinct_motions(pairs, N_RIVALS, settings.acceptance, settings.refinement)
-            witnesses = ViewedMapPair(
+            viewed_maps = ViewedMapPair(
                 ViewedMap(case.map_a), ViewedMap(case.map_b), settings.evidence
             )
             laid = [each.copies for each in evidence.motions]  # these motions' are the first
             for number, each in enumerate(motions):
                 squares = RegionGrid.about(pairs.p_a[each.inlier], evidence.region_m)
                 copies = repeated_under_others(laid, number)
-                found.append(witnesses.regions(BETWEEN, each.T_a_b, squares, copies))
+                found.append(viewed_maps.regions(BETWEEN, each.T_a_b, squares, copies))
     return found
 
 

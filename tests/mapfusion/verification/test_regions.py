@@ -72,14 +72,14 @@ def test_the_right_motion_is_confirmed_everywhere() -> None:
     assert found.log10_ratio(SHARES) > 3
     best = log10_ratio(found.found, found.expected, SHARES).max()
     assert found.log10_evidence(SHARES) >= found.log10_ratio(SHARES) - best
-    assert found.seen_again(OWN) == (len(found) - 1, len(found) - 1)  # one of them found it
+    assert found.count_confirmed(OWN) == (len(found) - 1, len(found) - 1)  # one of them found it
 
 
 def test_of_missing_regions_the_one_that_agrees_best_is_no_sample() -> None:
     found, expected = np.zeros((3, 2, 2), np.int64), np.zeros((3, 2, 2), np.int64)
     expected[:, OWN, 0] = 20
     found[1, OWN, 0] = 19
-    assert Regions(found, expected).seen_again(OWN) == (0, 2)
+    assert Regions(found, expected).count_confirmed(OWN) == (0, 2)
 
 
 def test_a_motion_along_the_wall_is_contradicted_everywhere() -> None:
@@ -127,8 +127,8 @@ def test_copies_are_counted_apart_and_say_little() -> None:
     marked = ViewedMapPair(A, B, PARAMETERS).regions(BETWEEN, T_A_B, SQUARES, all_copies)
     np.testing.assert_array_equal(marked.found[:, COPIED], plain.found[:, OWN])
     assert not marked.expected[:, OWN].any()
-    assert marked.seen_again(OWN) == (0, 0)
-    assert marked.seen_again(COPIED) == plain.seen_again(OWN)
+    assert marked.count_confirmed(OWN) == (0, 0)
+    assert marked.count_confirmed(COPIED) == plain.count_confirmed(OWN)
     assert 0 < marked.log10_ratio(TwinShares(0.05, 0.9)) < np.log10(1 / WHOLE) * len(marked)
     assert marked.log10_ratio(TwinShares(0.05, 0.9)) < plain.log10_ratio(TwinShares(0.05, 0.9)) / 2
 

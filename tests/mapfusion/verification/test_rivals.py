@@ -41,15 +41,15 @@ def test_equals_the_slow_twin() -> None:
 def test_a_picture_that_hangs_twice_is_marked_at_both_places_and_nothing_else() -> None:
     wall = Wall(16, seed=1, copies=[(2, 2.0, 9.0)])
     a = ViewedMap(mapped(wall, 1, 14, seed=2))
-    witnesses = ViewedMapPair(a, ViewedMap(mapped(wall, 1, 14, seed=3)), EvidenceParameters())
-    onto_itself = witnesses.copies("a", between(9, 2))
+    viewed_maps = ViewedMapPair(a, ViewedMap(mapped(wall, 1, 14, seed=3)), EvidenceParameters())
+    onto_itself = viewed_maps.copies("a", between(9, 2))
     x = 1 - a.landmarks.position_m[:, 1]  # the map's y is the world's -x
     picture = ((x > 2.2) & (x < 3.8)) | ((x > 9.2) & (x < 10.8))
     away = (x < 1.5) | ((x > 4.5) & (x < 8.5)) | (x > 11.5)
     assert onto_itself.in_a[picture].mean() > 0.95
     assert not onto_itself.in_a[away].any()
     assert not onto_itself.in_b.any()
-    there = witnesses.copies(BETWEEN, np.zeros(3))
+    there = viewed_maps.copies(BETWEEN, np.zeros(3))
     assert there.in_a.mean() > 0.95
     assert there.in_b.mean() > 0.95
 

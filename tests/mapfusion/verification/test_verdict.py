@@ -192,7 +192,7 @@ def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> 
     for _ in range(2):
         for a, b in itertools.permutations(range(3), 2):
             pairs = Pairs(maps[a], maps[b], match(maps[a], maps[b]))
-            found = JUDGE.on(pairs, witnesses=(ready[a], ready[b])).evidence
+            found = JUDGE.on(pairs, viewed_maps=(ready[a], ready[b])).evidence
             n, fresh = len(asked), JUDGE.on(pairs).evidence
             assert len(asked) == n + 2
             del asked[n:]
@@ -204,7 +204,7 @@ def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> 
                 np.testing.assert_equal(asdict(own), asdict(other))
     assert sorted(asked) == ["R0", "R1", "R2"]
     other = replace(JUDGE, acceptance=Acceptance(patch_m=0.5))
-    changed = other.on(pairs, witnesses=(ready[a], ready[b])).evidence
+    changed = other.on(pairs, viewed_maps=(ready[a], ready[b])).evidence
     assert changed is not None
     assert len(asked) == 5
 

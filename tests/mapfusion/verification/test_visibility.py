@@ -122,8 +122,8 @@ def test_what_must_be_seen_was_in_view_for_as_long_as_a_landmark_takes() -> None
 def test_of_the_same_wall_what_lies_before_both_robots_must_be_seen() -> None:
     wall = Wall(12, seed=5)
     a, b = (ViewedMap(mapped(wall, *ends, seed=6)) for ends in ((1, 6), (4, 10)))
-    own = b.seen_from(between(1, 4))
-    rows = np.flatnonzero(classify_visibility(own, a.watch) == MUST)
+    own = b.observed_from(between(1, 4))
+    rows = np.flatnonzero(classify_visibility(own, a.history) == MUST)
     along_wall_m = 1 - own.p[:, 1]  # frame a looks at the wall: its y is the world's -x
     inside = (along_wall_m > 4.5) & (along_wall_m < 5.5)
     assert np.isin(np.flatnonzero(inside), rows).mean() > 0.95
@@ -132,15 +132,15 @@ def test_of_the_same_wall_what_lies_before_both_robots_must_be_seen() -> None:
 
 def test_behind_a_wall_nothing_must_be_seen() -> None:
     a = ViewedMap(mapped(Wall(8, seed=7), 1, 6, seed=8))
-    here = a.seen_from(np.zeros(3))
+    here = a.observed_from(np.zeros(3))
     behind = here._replace(p=here.p + np.array([1.5, 0.0, 0.0]))
     along_wall_m = 1 - here.p[:, 1]
     passed = (along_wall_m > 1) & (along_wall_m < 6)  # what lies at the ends was in view for less
-    assert np.mean(classify_visibility(here, a.watch)[passed] == MUST) > 0.95
-    assert not classify_visibility(behind, a.watch).any()
+    assert np.mean(classify_visibility(here, a.history)[passed] == MUST) > 0.95
+    assert not classify_visibility(behind, a.history).any()
 
 
 def test_from_the_other_side_nothing_must_be_seen() -> None:
     a = ViewedMap(mapped(Wall(8, seed=7), 1, 6, seed=8))
-    here = a.seen_from(np.zeros(3))
-    assert not classify_visibility(here._replace(direction=-here.direction), a.watch).any()
+    here = a.observed_from(np.zeros(3))
+    assert not classify_visibility(here._replace(direction=-here.direction), a.history).any()
