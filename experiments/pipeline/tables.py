@@ -17,7 +17,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Verdict
 from mapfusion.verification.likelihood import TwinShares
-from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.regions import EvidenceParameters
 from mapfusion.verification.rivals import RepeatedLandmarks
 from mapfusion.verification.verdict import PairEvidence, RivalMotion
 

@@ -20,8 +20,13 @@ from mapfusion.verification.likelihood import (
     TwinShares,
     probability_correct,
 )
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import RegionGrid, Regions, ViewedMap, ViewedMapPair
+from mapfusion.verification.regions import (
+    EvidenceParameters,
+    RegionGrid,
+    Regions,
+    ViewedMap,
+    ViewedMapPair,
+)
 from mapfusion.verification.rivals import (
     BETWEEN,
     DISTINCT_M,

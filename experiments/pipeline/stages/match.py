@@ -21,8 +21,7 @@ from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.align.refinement import Refinement
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import ViewedMap
+from mapfusion.verification.regions import EvidenceParameters, ViewedMap
 from mapfusion.verification.verdict import Judge, why_not_sought
 
 # Evaluated iterations a part: small enough that an interruption loses little and two cores end

@@ -7,9 +7,9 @@ from mapfusion.align.nearest_neighbours import Grid
 from mapfusion.geometry import se2
 from mapfusion.verification.fitted_twins import WHOLE
 from mapfusion.verification.likelihood import COPIED, OWN, TwinShares, log10_ratio
-from mapfusion.verification.parameters import EvidenceParameters
 from mapfusion.verification.regions import (
     DescribedLandmarks,
+    EvidenceParameters,
     MatchGates,
     RegionGrid,
     Regions,

@@ -8,8 +8,7 @@ from mapfusion.align.nearest_neighbours import Grid
 from mapfusion.align.refinement import Refinement
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import ViewedMap, ViewedMapPair
+from mapfusion.verification.regions import EvidenceParameters, ViewedMap, ViewedMapPair
 from mapfusion.verification.rivals import (
     BETWEEN,
     RepeatedLandmarks,

@@ -15,8 +15,7 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.registration import Registration
 from mapfusion.verification import verdict as verdict_module
 from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import ViewedMap
+from mapfusion.verification.regions import EvidenceParameters, ViewedMap
 from mapfusion.verification.rivals import BETWEEN, RepeatedLandmarks, self_motions
 from mapfusion.verification.verdict import Judge, RivalMotion, landmark_sigma_m
 from tests.mapfusion.verification.two_rooms import Wall, between, mapped
