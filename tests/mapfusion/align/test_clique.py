@@ -31,7 +31,7 @@ def random_graph(seed, n, density, planted=0):
 
 
 def bron_kerbosch(adjacent):
-    """Size of the largest clique (Bron and Kerbosch 1973, with a pivot)."""
+    """Return the size of the largest clique (Bron and Kerbosch 1973, with a pivot)."""
     neighbours = [set(np.flatnonzero(row)) for row in adjacent]
     largest = 0
 

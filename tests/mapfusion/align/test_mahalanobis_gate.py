@@ -51,7 +51,7 @@ def planar_map(p: np.ndarray, *, named: bool = False) -> LandmarkMap:
 def a_corner_and_one_far(
     turned_rad: float, seed: int = 0, *, named: bool = False
 ) -> tuple[LandmarkMap, LandmarkMap, Correspondences, np.ndarray]:
-    """25 true pairs within 0.3 m, and one 7 m away that is true for a map turned about them."""
+    """25 true pairs lie within 0.3 m; one 7 m away is consistent with a rotation about them."""
     rng = np.random.default_rng(seed)
     p_b = np.vstack([rng.uniform(-0.15, 0.15, (25, 2)), [[7.0, 0.5]]])
     p_a = se2.transform_points(T_TRUE, p_b) + rng.normal(0, SIGMA_M, p_b.shape)
@@ -64,7 +64,7 @@ def a_corner_and_one_far(
 
 @pytest.mark.parametrize("named", [False, True])
 def test_a_false_far_pair_turns_the_map_and_is_found_out(named: bool) -> None:
-    """A name that was misread is a false pair, too."""
+    """A wrong label is a false pair as well."""
     map_a, map_b, pairs, T_turned = a_corner_and_one_far(0.7, named=named)
     found = Refinement().refine(Pairs(map_a, map_b, pairs), T_turned)
     assert np.hypot(*(found.T_a_b - T_turned)[:2]) < 0.1  # it did go there: residuals fit the gate
@@ -100,7 +100,7 @@ def test_leverage_is_the_hat_matrix_s_trace() -> None:
 
 @pytest.mark.parametrize("n", [4, 6, 12])
 def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
-    """Bent maps: all pairs are off alike, and the one of most leverage is as good as the others."""
+    """In bent maps the pair of highest leverage has a residual like the others."""
     rng, called, tried = np.random.default_rng(n), 0, 300
     S = np.tile(np.eye(2) * 1e-6, (n, 1, 1))
     for _ in range(tried):
@@ -122,7 +122,7 @@ def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
 
 @pytest.mark.parametrize("n", [4, 6, 20])
 def test_the_limit_of_a_pair_is_that_of_the_f_distribution(n: int) -> None:
-    """The other n - 1 pairs leave m = 2 (n - 1) - 3 degrees of freedom, so D is 2 F(2, m)."""
+    """The other n - 1 pairs have m = 2 (n - 1) - 3 degrees of freedom, so that D is 2 F(2, m)."""
     rng, sigma_m, k = np.random.default_rng(n), 0.05, 2
     p_b = rng.uniform(0, 9, (n, 2))
     p_a, none, known = se2.transform_points(T_TRUE, p_b), np.zeros((n, 2, 2)), np.zeros((3, 3))
@@ -195,7 +195,7 @@ def test_area_of_a_turned_rectangle():
 
 @pytest.mark.parametrize(("drift_m", "level"), [(0.0, 0), (0.05, 1), (0.1, 2)])
 def test_the_scale_that_the_residuals_have_is_chosen(drift_m, level):
-    """Sixty of three hundred pairs true: the likeliest of three s_drift is the one they have."""
+    """60 of 300 pairs are true; the most likely of three s_drift is the true one."""
     for seed in range(10):
         rng = np.random.default_rng(seed)
         pair = given_pairs(rng, 300, 0.2, 0.03, drift_m, planar=True)

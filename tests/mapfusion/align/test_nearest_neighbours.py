@@ -84,7 +84,7 @@ def test_each_box_holds_its_points_and_halves_those_of_the_one_above(kind):
 
 @pytest.mark.parametrize("n", [1, POINTS_PER_LEAF, 10 * POINTS_PER_LEAF])
 def test_kernels_get_arrays_of_one_layout_from_trees_of_any_size(n: int) -> None:
-    """Of another layout they would be compiled once more."""
+    """Another memory layout would compile the kernels again."""
     tree = BoxTree.of(np.random.default_rng(0).uniform(0, 9, (n, 3)))
     assert all(part.flags.c_contiguous for part in tree)
 
@@ -114,7 +114,7 @@ def test_finds_what_looking_at_all_finds(kind: str, begins: str, n: int) -> None
 
 @pytest.mark.parametrize("apart_m", [0.05, 1.0, 30.0])
 def test_close_groups_find_theirs_in_a_large_tree(apart_m: float) -> None:
-    """Where most of the tree is passed over, and what is passed over matters."""
+    """Most of the tree is excluded, and a wrong exclusion changes the result."""
     rng = np.random.default_rng(1)
     p = rng.uniform(0, [20, 20, 2], (3000, 3))
     asked = rng.permutation(p)[:1600] + rng.normal(0, apart_m, (1600, 3))
@@ -139,7 +139,7 @@ def test_each_point_is_in_a_group_and_the_last_one_is_filled_up(n: int) -> None:
 
 
 def test_groups_lie_close_together() -> None:
-    """On a wall of 512 points each group is a sixteenth or so of the wall's extent."""
+    """On a wall of 512 points a group has about 1/16 of the wall's extent."""
     along = np.random.default_rng(0).permutation(np.linspace(0, 1, 512))
     groups = Groups.of(np.column_stack([along, np.zeros((512, 2))]))
     assert np.ptp(groups.x.reshape(-1, GROUP), axis=1).max() == pytest.approx(15 / 511)

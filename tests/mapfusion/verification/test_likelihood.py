@@ -22,14 +22,14 @@ from mapfusion.verification.likelihood import (
 
 
 def must_own(k: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Regions (R, 2, 2) of nothing but landmarks that must be seen, where nothing is a copy."""
+    """Return regions (R, 2, 2) of landmarks that must be seen, without copies."""
     regions = np.zeros((2, len(k), 2, 2), np.int64)
     regions[:, :, 0, 0] = k, n
     return regions[0], regions[1]
 
 
 def pmf(k: np.ndarray, n: np.ndarray, rates) -> np.ndarray:
-    """(R, 2) of both parts, each a product over both classes."""
+    """Return the likelihoods of both parts (R, 2), each a product over both classes."""
     return np.prod([betabinom.pmf(k[..., c], n[..., c], *rates[c]) for c in (0, 1)], axis=0)
 
 
@@ -67,7 +67,7 @@ def test_a_rate_in_part_has_the_mean_and_spread_of_a_rate_times_any_share(rate: 
 
 
 def test_half_of_a_region_speaks_for_a_twin_in_part() -> None:
-    """What is found throughout is likelier of a right motion; half of it of the edge of a twin."""
+    """A fully matched region favours a right motion, a half-matched one a partial copy."""
     found = np.array([170, 100])
     throughout, half = log10_ratio(*must_own(found, np.full(2, 200)), TwinShares(0.2, 0.2))
     assert throughout > 0.7
@@ -75,7 +75,7 @@ def test_half_of_a_region_speaks_for_a_twin_in_part() -> None:
 
 
 def test_of_a_copy_that_is_found_less_is_learnt_than_of_what_surrounds_it() -> None:
-    """The same picture, its surroundings found, not looked for, and missing."""
+    """Compare a texture with its surroundings matched, not expected, and missing."""
     found, expected = np.zeros((3, 2, 2), np.int64), np.zeros((3, 2, 2), np.int64)
     found[:, 1, 0] = expected[:, 1, 0] = 20
     found[0, 0, 0], expected[[0, 2], 0, 0] = 12, 12
@@ -95,12 +95,12 @@ def test_where_all_is_a_twin_only_that_it_is_one_throughout_speaks_for_a_motion(
 
 
 def of_twin(k: np.ndarray, n: int) -> np.ndarray:
-    """The likelihood of k of n that must be seen where they are their like."""
+    """Return the likelihood of k of n that must be seen in a copy."""
     return WHOLE * betabinom.pmf(k, n, *RIGHT[0]) + (1 - WHOLE) * betabinom.pmf(k, n, *PART[0])
 
 
 def test_the_ratio_s_mean_under_wrong_motions_is_one() -> None:
-    """E[right / wrong] over the wrong model is 1, whatever the numbers: a likelihood ratio."""
+    """E[right / wrong] under the wrong model is 1, as for every likelihood ratio."""
     n, s = 12, 0.15
     k = np.arange(n + 1)
     wrong = s * of_twin(k, n) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
@@ -109,7 +109,7 @@ def test_the_ratio_s_mean_under_wrong_motions_is_one() -> None:
 
 
 def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
-    """The wrong model is enumerated: of two regions either, at even odds, is as if right."""
+    """The wrong model is enumerated: either of two regions, with equal odds, is a copy."""
     n, s = 7, 0.15
     k = np.arange(n + 1)
     wrong = s * of_twin(k, n) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])

@@ -150,7 +150,7 @@ def test_without_supporters_squares_lie_about_the_origin() -> None:
 
 
 def _regions(n_confirmed: int, n_contradicted: int, part: int) -> Regions:
-    """Make regions with twenty landmarks that must be seen; all of them are found, or none."""
+    """Return regions with twenty landmarks that must be seen, all of them matched or none."""
     n = n_confirmed + n_contradicted
     expected, found = np.zeros((n, 2, 2), np.int64), np.zeros((n, 2, 2), np.int64)
     expected[:, part, 0] = 20

@@ -1,4 +1,4 @@
-"""What must have been seen, against a slow twin and a wall that is known."""
+"""Tests of `mapfusion.verification.visibility`, with a slow reference and a known wall."""
 
 import inspect
 import math
@@ -23,7 +23,7 @@ from tests.mapfusion.verification.two_rooms import Wall, between, mapped
 
 
 def slowly(seen: ObservedLandmarks, viewing: Viewing) -> list[int]:
-    """How each lay in view, pose by pose, from angles alone."""
+    """Classify the visibility pose by pose, by angles."""
     how, field = [], viewing.field
     for p, direction, before in zip(*seen, strict=True):
         alike, frames = 0, 0
@@ -65,7 +65,7 @@ def test_equals_the_slow_twin_on_any_places() -> None:
 
 @pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
 def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None:
-    """Stretches of frames in which the robot turns, and a last one that is shorter."""
+    """The robot turns within blocks of frames, and the last block is shorter."""
     rng = np.random.default_rng(1)
     n_frames, n = 100 * LEAST_FRAMES + 3, 3000
     theta = np.cumsum(rng.normal(0, 0.2, n_frames))
@@ -88,7 +88,7 @@ def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None
 
 @pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
 def test_what_is_straight_behind_is_not_in_view(half_view_rad: float) -> None:
-    """Of a robot that turns once, so that its frames are not told all at once to look elsewhere."""
+    """The robot turns once, so that a block contains different headings."""
     n_frames, one = LEAST_FRAMES + 1, np.ones(1)
     path = np.zeros((n_frames, 3))
     path[0, 2] = 3.1
