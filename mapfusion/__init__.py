@@ -71,7 +71,7 @@ _NAMES_OF = {
     ),
     "smoother.joint_smoothing": ("Recording",),
     "verification.false_alarms": ("Acceptance",),
-    "verification.parameters": ("EvidenceParameters",),
+    "verification.regions": ("EvidenceParameters",),
     "verification.verdict": ("Judge",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}

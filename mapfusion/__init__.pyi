@@ -37,7 +37,7 @@ from mapfusion.robot_log import read_log as read_log
 from mapfusion.robot_log import write_log as write_log
 from mapfusion.smoother.joint_smoothing import Recording as Recording
 from mapfusion.verification.false_alarms import Acceptance as Acceptance
-from mapfusion.verification.parameters import EvidenceParameters as EvidenceParameters
+from mapfusion.verification.regions import EvidenceParameters as EvidenceParameters
 from mapfusion.verification.verdict import Judge as Judge
 
 merge_maps = _merge  # `merge` is the module

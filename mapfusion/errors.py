@@ -2,6 +2,8 @@
 
 import difflib
 import itertools
+import re
+import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -109,3 +111,81 @@ def _shortened(word: str) -> str:
         return word
     first = 2 * _MOST_OF_A_WORD // 3
     return word[:first] + _GAP + word[len(word) - _MOST_OF_A_WORD + first + len(_GAP) :]
+
+
+# New modules, and the former modules that plug-ins may import; all names without `mapfusion.`.
+_FORMER_MODULES = {
+    "geometry.se2": "se2 planar",
+    "geometry.se3": "se3",
+    "geometry.camera": "camera calibration_error",
+    "geometry.joint_covariance": "joint_covariance",
+    "geometry.numerics": "kernels one_thread chi_square symmetric align.bits",
+    "parameters": "arguments",
+    "files": "storage sealed",
+    "tables": "open_tables looks",
+    "robot_log": "log_part odometry_covariance stray",
+    "attitude": "attitude_drift",
+    "landmark_map": "joint_files",
+    "viewing": "viewing_files",
+    "registration": "align.registration align.supported align.completion",
+    "align.alignment": "align.result align.pairs",
+    "align.rigid_motion": "align.rigid",
+    "align.method": "align.degeneracy",
+    "align.correspondences": "align.nearest_descriptors",
+    "align.mahalanobis_gate": "align.near_pairs align.leverage",
+    "align.drift": "align.calibration_part",
+    "align.consensus": "align.consistency",
+    "align.clique": "align.max_clique",
+    "align.nearest_neighbours": "align.box_tree align.nearest_points align.closest",
+    "align.icp": "align.impicp",
+    "align.refinement": "align.refine",
+    "align.aligners": "align.registry",
+    "verification": "evidence",
+    "verification.false_alarms": "align.false_alarms align.named_landmarks align.acceptance",
+    "verification.visibility": "evidence.watch evidence.expected",
+    "verification.regions": "evidence.found evidence.regions evidence.parameters",
+    "verification.rivals": "evidence.copies evidence.twins evidence.rivals",
+    "verification.likelihood": "evidence.likelihood evidence.probability",
+    "verification.verdict": "evidence.precision evidence.pair_evidence evidence.judge",
+    "fusion": "fuse team",
+    "fusion.aligned_landmarks": "aligned_landmarks same_point fuse.clusters",
+    "fusion.fused_map": "fused_map name_order fuse.parameters fuse.component",
+    "fusion.fusers": "fuse.fuser fuse.registry",
+    "fusion.kalman": "fuse.sequential fuse.kalman fuse.kalman_drift",
+    "fusion.covariance_intersection": "fuse.covariance_intersection",
+    "fusion.joint": "fuse.jointly_fused fuse.joint",
+    "fusion.joint_estimate": "fuse.joint_map fuse.joint_estimate",
+    "fusion.batch": "fuse.batch",
+    "fusion.pose_graph": "team.relations team.placement",
+    "fusion.team_graph": "team.readings team.alternatives team.team_graph",
+    "fusion.merge": "merge",
+    "smoother.joint_smoothing": "smoother.recording smoother.together",
+    "smoother.optimizer": "smoother.settle",
+    "smoother.odometry_calibration": "smoother.odometry_error smoother.calibrate",
+    "datasets": "recordings",
+    "datasets.log_consistency": "log_consistency",
+}
+MOVED_MODULES = {
+    f"mapfusion.{former}": f"mapfusion.{new}"
+    for new, formers in _FORMER_MODULES.items()
+    for former in formers.split()
+}
+
+
+def moved_module_note(error: BaseException) -> str:
+    """Return the end of a line about a failed import that names the module to import instead.
+
+    It is empty for other errors. Python reports a missing package without the module in the
+    package; the full name is then read from the source line of the import.
+    """
+    if not isinstance(error, ImportError) or not error.name:
+        return ""
+    missing = error.name
+    if attribute := re.match(r"cannot import name '(\w+)'", str(error)):
+        missing = f"{missing}.{attribute[1]}"
+    frames = reversed(traceback.extract_tb(error.__traceback__))
+    imported = (re.findall(rf"{re.escape(missing)}(?:\.\w+)*", each.line or "") for each in frames)
+    for name in (*itertools.chain.from_iterable(imported), missing):
+        if name in MOVED_MODULES:
+            return f"; {name} is now {MOVED_MODULES[name]}: change the import"
+    return ""

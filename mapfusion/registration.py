@@ -16,7 +16,7 @@ from mapfusion.align.alignment import (
     why_too_few,
 )
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.drift import calibration_part, estimate_drift_m
+from mapfusion.align.drift import calibration_covariance, estimate_drift_m
 from mapfusion.align.method import Fit, Method, Needs, Undetermined, supported
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (
@@ -207,7 +207,7 @@ def alignment_of_fit(
         e = residuals(found.T_a_b, fitted.p_a, fitted.p_b)
         drift = estimate_drift_m(e, own, found.gate_m)
         covariance = motion_covariance(gain, own + drift**2 * np.eye(2))
-        covariance = covariance + calibration_part(found.T_a_b, fitted, drift)
+        covariance = covariance + calibration_covariance(found.T_a_b, fitted, drift)
     return Alignment(
         found.T_a_b,
         covariance,

@@ -17,8 +17,8 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Verdict
 from mapfusion.verification.likelihood import TwinShares
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.rivals import Copies
+from mapfusion.verification.regions import EvidenceParameters
+from mapfusion.verification.rivals import RepeatedLandmarks
 from mapfusion.verification.verdict import PairEvidence, RivalMotion
 
 if TYPE_CHECKING:
@@ -217,7 +217,9 @@ def evidence_of(
             row["log10_false_alarms"],
             **{name: row[name] for name in _RIVAL_COUNTS},
             log10_evidence=row["log10_evidence"],
-            copies=Copies(unpacked(row["copied_a"], n_a), unpacked(row["copied_b"], n_b)),
+            copies=RepeatedLandmarks(
+                unpacked(row["copied_a"], n_a), unpacked(row["copied_b"], n_b)
+            ),
         )
         for row in records(rows)
     )

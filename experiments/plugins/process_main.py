@@ -21,7 +21,7 @@ from experiments.plugins.answers import (
     checked_alignment,
 )
 from experiments.plugins.discovery import make_method
-from mapfusion.errors import one_line
+from mapfusion.errors import moved_module_note, one_line
 from mapfusion.registration import Aligner
 
 # The process ends itself this long after the time limit, if a plug-in holds the interpreter's lock
@@ -88,7 +88,7 @@ class MethodRunner:
 def _description(error: BaseException) -> str:
     """Return the error, file and line in one line, without folders, which differ by machine."""
     try:
-        text = str(error)
+        text = f"{error}{moved_module_note(error)}"
     except BaseException:  # an error class of the plug-in may fail as well
         text = ""
     if isinstance(error, InvalidAnswerError):

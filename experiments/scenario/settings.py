@@ -38,7 +38,7 @@ from mapfusion.fusion.fusers import USUAL
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.parameters import Range
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.regions import EvidenceParameters
 from mapfusion.verification.verdict import Judge
 from mapfusion.vision.front_end import FrontEndParameters
 from sim.odometry import OdometryNoise

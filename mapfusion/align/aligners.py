@@ -29,7 +29,7 @@ PEERS: dict[str, type[Method]] = {"opencv": OpenCv, "kiss_matcher": KissMatcher}
 
 
 def make_aligner(name: str, /, **parameters: Any) -> Method:
-    """Build one of our own methods by name.
+    """Construct a built-in method or peer by name.
 
     Raises:
         ValueError: the name or a parameter is unknown, or a parameter is out of range.
@@ -42,12 +42,12 @@ def make_aligner(name: str, /, **parameters: Any) -> Method:
 
 
 def construct(name: str, constructor: Callable[..., Any], parameters: Mapping[str, Any]) -> Any:
-    """Call the constructor of a method with parameters as a scenario file has them.
+    """Call the constructor of a method with parameters from a scenario file.
 
     Raises:
         ValueError: a parameter is unknown or out of range.
     """
-    made: Any = constructor  # else is_dataclass would make an instance of it
+    made: Any = constructor  # untyped, because is_dataclass would narrow the type to an instance
     known = [own.name for own in fields(made)] if is_dataclass(made) else list(parameters)
     wrong = next((key for key in parameters if key not in known), None)
     if wrong is not None:

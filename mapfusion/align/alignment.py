@@ -18,34 +18,34 @@ class Status(StrEnum):
     """Outcome of an alignment."""
 
     ACCEPTED = "accepted"
-    REFUSED = "refused"  # an answer was found and is not to be trusted
-    AMBIGUOUS = "ambiguous"  # it fits, and so may another: the maps do not tell which
-    TOO_UNCERTAIN = "too_uncertain"  # right by its pairs, useless by its covariance
-    DEGENERATE = "degenerate"  # the data do not determine an answer
-    FAILED = "failed"  # the method raised, hung, ended its process or answered nonsense
-    ABSENT = "absent"  # the package behind the method is not installed
+    REFUSED = "refused"  # a motion was found but failed a test
+    AMBIGUOUS = "ambiguous"  # another motion may be the right one
+    TOO_UNCERTAIN = "too_uncertain"  # the covariance is too large
+    DEGENERATE = "degenerate"  # the data do not determine a motion
+    FAILED = "failed"  # the method raised, hung, ended its process or returned an invalid answer
+    ABSENT = "absent"  # the package of the method is not installed
 
 
-NOT_RUN = frozenset({Status.FAILED, Status.ABSENT})  # nothing can be said about the maps
+NOT_RUN = frozenset({Status.FAILED, Status.ABSENT})  # statuses without a result for the maps
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """An estimate of T_a_b (frame b into frame a) from correspondences between two maps.
+    """Estimate of T_a_b (frame b into frame a) from correspondences between two maps.
 
     Attributes:
-        T_a_b: (3,) tx_m, ty_m, theta_rad (counter-clockwise); NaN when degenerate.
-        covariance: (3, 3) of T_a_b for residuals that are independent, s_drift included, and for
-            what the cameras' calibration leaves open; NaN when degenerate. What drift has in common
-            over a whole map leaves no residual and is not in it, so that real errors are larger:
-            the evaluation reports the NEES.
-        inlier: (N,) bool over the correspondences given.
+        T_a_b: tx_m, ty_m, theta_rad (counter-clockwise), shape (3,); NaN if degenerate.
+        covariance: covariance of T_a_b, shape (3, 3); NaN if degenerate. It includes independent
+            residuals, s_drift and the errors of the camera calibration. It excludes drift that is
+            common to a whole map and leaves no residual, so that actual errors are larger; the
+            evaluation reports the NEES (normalised estimation error squared).
+        inlier: supporting correspondences, bool, shape (N,).
         elapsed_s: time of the estimation.
-        status: accepted, refused or degenerate by its method, ambiguous and too uncertain by the
-            verdict; failed and absent come from the harness alone.
-        reason: empty when accepted, else what a person can act on.
-        drift_sigma_m: s_drift, the standard deviation per axis of the residuals of pairs beyond
-            what the landmarks' covariances explain (both maps together); NaN when degenerate.
+        status: outcome. A method accepts, refuses or reports degenerate data; the verification sets
+            ambiguous and too uncertain; the harness sets failed and absent.
+        reason: explanation for a user; empty if accepted.
+        drift_sigma_m: s_drift, the standard deviation per axis of the residuals beyond the
+            landmarks' covariances (both maps together); NaN if degenerate.
     """
 
     T_a_b: Float
@@ -58,19 +58,19 @@ class Alignment:
 
     @property
     def ok(self) -> bool:
-        """Whether the estimate may be used."""
+        """True if the estimate may be used."""
         return self.status is Status.ACCEPTED
 
 
 def degenerate(reason: str, n_correspondences: int, elapsed_s: float = 0.0) -> Alignment:
-    """The result for data that determine no alignment."""
+    """Return the result for data that determine no motion."""
     return without_answer(Status.DEGENERATE, reason, n_correspondences, elapsed_s)
 
 
 def without_answer(
     status: Status, reason: str, n_correspondences: int, elapsed_s: float = float("nan")
 ) -> Alignment:
-    """A result that holds no motion."""
+    """Return a result without a motion."""
     return Alignment(
         np.full(3, np.nan),
         np.full((3, 3), np.nan),
@@ -81,12 +81,12 @@ def without_answer(
     )
 
 
-MIN_PAIRS = 3  # two determine a motion, the third is the first that can contradict it
+MIN_PAIRS = 3  # two pairs determine a motion; a third is needed to contradict it
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """N pairs of landmarks, looked up in their maps.
+    """N pairs of corresponding landmarks with their positions and covariances.
 
     Raises:
         ValueError: an index lies outside its map.
@@ -112,70 +112,70 @@ class Pairs:
 
     @cached_property
     def kept(self) -> dict[type, Any]:
-        """What methods keep of the maps between their calls with these pairs, each by its type."""
+        """Values that methods keep between calls with the same pairs, by type."""
         return {}
 
     @property
     def index_a(self) -> np.ndarray:
-        """(N,) rows of map a."""
+        """Rows of map a, shape (N,)."""
         return self.correspondences.index_a
 
     @property
     def index_b(self) -> np.ndarray:
-        """(N,) rows of map b."""
+        """Rows of map b, shape (N,)."""
         return self.correspondences.index_b
 
     @property
     def distance(self) -> Float:
-        """(N,) of the descriptors, 0 for pairs made by label."""
+        """Descriptor distances, shape (N,); 0 for pairs of labels."""
         return self.correspondences.distance
 
     @property
     def planar(self) -> bool:
-        """Whether heights carry no information."""
+        """True if heights carry no information."""
         return self.map_a.planar or self.map_b.planar
 
     @property
     def by_name(self) -> bool:
-        """Whether both maps carry labels, by which landmarks are then paired."""
+        """True if both maps carry labels, so that landmarks are paired by label."""
         return self.map_a.label is not None and self.map_b.label is not None
 
     @cached_property
     def p_a(self) -> Float:
-        """(N, 3) positions in metres, in frame a."""
+        """Positions in metres in frame a, shape (N, 3)."""
         return self.map_a.position_m.take(self.index_a, axis=0)
 
     @cached_property
     def p_b(self) -> Float:
-        """(N, 3) positions in metres, in frame b."""
+        """Positions in metres in frame b, shape (N, 3)."""
         return self.map_b.position_m.take(self.index_b, axis=0)
 
     @cached_property
     def covariance_a(self) -> Float:
-        """(N, 3, 3) in frame a."""
+        """Covariances in frame a, shape (N, 3, 3)."""
         return self.map_a.covariance_m2.take(self.index_a, axis=0)
 
     @cached_property
     def covariance_b(self) -> Float:
-        """(N, 3, 3) in frame b."""
+        """Covariances in frame b, shape (N, 3, 3)."""
         return self.map_b.covariance_m2.take(self.index_b, axis=0)
 
     @cached_property
     def scale_note(self) -> str:
-        """By what factor one map is larger than the other, in words; empty if by none."""
+        """Factor by which one map is larger than the other, in words; empty if there is none."""
         return scale_note(self.map_a, self.map_b, self.index_a, self.index_b) if len(self) else ""
 
     def note(self, n_support: int) -> str:
-        """Return what about the maps explains that no motion is accepted; empty for nothing.
+        """Return a property of the maps that may explain a refusal; empty if none is found.
 
-        `n_support` is how many pairs support the motion found.
+        `n_support` is the number of pairs that support the motion.
         """
         if self.by_name and not self.scale_note and FEW <= len(self) > 2 * n_support:
             return f"{len(self)} labels are in both maps: do they name the same landmarks?"
         return self.scale_note
 
     def points(self) -> tuple[Float, Float]:
-        """Positions (N, 3) in both frames, (N, 2) where heights carry no information."""
+        """Return the positions in both frames, shape (N, 3), or (N, 2) for planar maps."""
         dimensions = 2 if self.planar else 3
         return (
             np.ascontiguousarray(self.p_a[:, :dimensions]),
@@ -183,11 +183,9 @@ class Pairs:
         )
 
     def in_plan(self) -> PlanarPairs:
-        """The pairs without their heights, for the kernels, which do not change them."""
-        return self._plan
-
-    @cached_property
-    def _plan(self) -> PlanarPairs:
+        """Return the pairs without heights, as arrays for kernels; do not change them."""
+        if PlanarPairs in self.kept:
+            return self.kept[PlanarPairs]
         n = len(self)
         plan = PlanarPairs(*np.empty((2, n, 2)), *np.empty((2, n, 2, 2)))
         for part, whole in zip(plan[:2], (self.p_a, self.p_b), strict=True):
@@ -195,10 +193,11 @@ class Pairs:
         for part, whole in zip(plan[2:], (self.covariance_a, self.covariance_b), strict=True):
             part[:, 0, 0], part[:, 0, 1] = whole[:, 0, 0], whole[:, 0, 1]
             part[:, 1, 0], part[:, 1, 1] = whole[:, 1, 0], whole[:, 1, 1]
+        self.kept[PlanarPairs] = plan
         return plan
 
     def of_one_height(self, gate: HeightGate) -> np.ndarray:
-        """Rows (n,) of the pairs whose heights agree; of planar maps all."""
+        """Return the rows (n,) of the pairs with compatible heights; all rows of planar maps."""
         if self.planar:
             return np.arange(len(self))
         return np.flatnonzero(
@@ -214,9 +213,9 @@ class Pairs:
 def why_too_few(
     map_a: LandmarkMap, map_b: LandmarkMap, n_pairs: int, needed: int, shortage: str = ""
 ) -> str:
-    """Return why there are fewer than `needed` pairs; empty when there are enough.
+    """Return why there are fewer than `needed` pairs; empty if there are enough.
 
-    `shortage` is that of the correspondences, which names the test that left so few.
+    `shortage` is the explanation of the matcher (`Correspondences.shortage`).
     """
     if n_pairs >= needed:
         return ""
@@ -232,8 +231,8 @@ def why_too_few(
 
 
 def undetermined(reason: str, n_pairs: int, started_s: float) -> Alignment:
-    """A degenerate result with its elapsed time since `time.perf_counter()` was started_s."""
+    """Return a degenerate result; `started_s` is `time.perf_counter()` at the start."""
     return degenerate(reason, n_pairs, time.perf_counter() - started_s)
 
 
-gather = Pairs  # by this name packages with the interface `align` import it
+gather = Pairs  # former name, which plug-ins with an `align` method import

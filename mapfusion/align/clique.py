@@ -1,8 +1,9 @@
 """Aligner by a maximum clique of pairwise consistent correspondences.
 
-First the cliques that a greedy walk finds; then branch and bound in the order of degrees, pruned
-by cores and by greedy colouring (Tomita and Seki 2003; San Segundo et al. 2011, BBMC; the order of
-steps is that of Rossi et al. 2015, PMC).
+A greedy search finds large cliques. Branch and bound in the order of degrees, pruned by k-cores and
+by greedy colouring, then finds larger ones (Tomita and Seki 2003; San Segundo et al. 2011, BBMC;
+order of steps as in Rossi et al. 2015, PMC). A graph of N vertices is an array of bits, uint64,
+shape (N, W): bit j of row i is an edge. A set of vertices is an array of bits, shape (W,).
 """
 
 from dataclasses import dataclass
@@ -11,8 +12,13 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.consensus import Consensus, consistency, in_rows
-from mapfusion.align.mahalanobis_gate import PlanarPairs, Spread, settle, settle_at_best_scale
+from mapfusion.align.consensus import Consensus, consistency_graphs, packed_rows
+from mapfusion.align.mahalanobis_gate import (
+    PairSpread,
+    PlanarPairs,
+    refit_at_best_drift,
+    refit_to_support,
+)
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import WORD, chi_square_bound, count_common, kernel, trailing_zeros
@@ -21,7 +27,7 @@ from mapfusion.parameters import Probability, Range
 
 @kernel
 def degrees(graph: np.ndarray) -> np.ndarray:
-    """Number of neighbours (N,) of each vertex of a graph (N, W)."""
+    """Return the number of neighbours of each vertex of a graph (N, W), shape (N,)."""
     degree = np.empty(len(graph), np.int64)
     for v in range(len(graph)):
         degree[v] = count_common(graph[v], graph[v])
@@ -29,14 +35,14 @@ def degrees(graph: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def has(bits: np.ndarray, v: int) -> bool:
-    """Whether v is in a set (W,)."""
+def contains(bits: np.ndarray, v: int) -> bool:
+    """Return True if v is in a set (W,)."""
     return (bits[v // WORD] >> np.uint64(v % WORD)) & np.uint64(1) != 0
 
 
 @kernel
-def members(bits: np.ndarray, into: np.ndarray) -> int:
-    """Write the numbers of a set (W,) into `into`, ascending; returns how many there are."""
+def list_members(bits: np.ndarray, into: np.ndarray) -> int:
+    """Write the members of a set (W,) into `into`, ascending; return their number."""
     count = 0
     for w in range(len(bits)):
         word = bits[w]
@@ -48,10 +54,10 @@ def members(bits: np.ndarray, into: np.ndarray) -> int:
 
 
 @kernel
-def most_first(degree: np.ndarray) -> np.ndarray:
-    """Vertices by descending degree (N,), those of one degree in their order (a counting sort).
+def by_descending_degree(degree: np.ndarray) -> np.ndarray:
+    """Return the vertices by descending degree (N,), by a stable counting sort.
 
-    Those of a negative degree are left out.
+    Vertices of negative degree are left out.
     """
     start = np.zeros(len(degree) + 1, np.int64)
     for d in degree:
@@ -67,52 +73,53 @@ def most_first(degree: np.ndarray) -> np.ndarray:
     return order
 
 
-def set_of(chosen: np.ndarray) -> np.ndarray:
-    """The numbers that are marked (N,) as bits of words (W,)."""
+def bit_set(chosen: np.ndarray) -> np.ndarray:
+    """Return the set (W,) of the marked numbers (N,)."""
     bits = np.zeros(-(-len(chosen) // WORD) * WORD, np.bool_)
     bits[: len(chosen)] = chosen
     return np.packbits(bits, bitorder="little").view("<u8")
 
 
-def everyone(n: int) -> np.ndarray:
-    """The set (W,) of all numbers below n."""
-    return set_of(np.ones(n, np.bool_))
+def full_set(n: int) -> np.ndarray:
+    """Return the set (W,) of all numbers below n."""
+    return bit_set(np.ones(n, np.bool_))
 
 
 @kernel
-def keep_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarray) -> int:
-    """Take away from `chosen` (W,) until all that remain have `least` neighbours among them.
+def reduce_to_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarray) -> int:
+    """Reduce `chosen` (W,) to its k-core with k = `least` (Seidman 1983).
 
-    They are the core of that order (Seidman 1983): all cliques of more vertices than `least` are in
-    it. Their numbers go into `rows`; returns how many, 0 where too few are left to have so many.
+    Each vertex of the k-core has at least k neighbours in it; all cliques of more than k vertices
+    lie in it. The members are written to `rows`. Returns their number, 0 for an empty core.
     """
-    n, before = members(chosen, rows), -1
+    n, before = list_members(chosen, rows), -1
     while n != before:
         before = n
         for i in range(before):
-            if n <= least:  # the others need no look
+            if n <= least:  # too few vertices are left
                 return 0
             v = rows[i]
             if count_common(graph[v], chosen) < least:
                 chosen[v // WORD] &= ~(np.uint64(1) << np.uint64(v % WORD))
                 n -= 1
-        members(chosen, rows)
+        list_members(chosen, rows)
     return n if n > least else 0
 
 
-def may_hold(graph: np.ndarray, among: np.ndarray, size: int) -> bool:
-    """Whether some vertices (W,) have neighbours enough for a clique of more than `size`."""
-    return keep_core(graph, among.copy(), size, np.empty(len(graph), np.int64)) > 0
+def may_contain_clique(graph: np.ndarray, among: np.ndarray, size: int) -> bool:
+    """Return False if the k-core of a set (W,) excludes a clique of more than `size` vertices."""
+    return reduce_to_core(graph, among.copy(), size, np.empty(len(graph), np.int64)) > 0
 
 
 @kernel
 def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
-    """A large clique: from each of the vertices of most neighbours, add the next of most that fits.
+    """Return a large clique (K,) by greedy search.
 
-    From `starts` vertices; of all walks (K,) the largest, the first on a tie.
+    From each of the `starts` vertices of highest degree, vertices are added by descending degree.
+    The largest clique is returned, the first on a tie.
     """
     n, words = graph.shape
-    order = most_first(degrees(graph))
+    order = by_descending_degree(degrees(graph))
     best, clique = np.zeros(n, np.int64), np.zeros(n, np.int64)
     size_of_best = 0
     left = np.empty(words, np.uint64)
@@ -125,7 +132,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
         for v in order:
             if not some:
                 break
-            if has(left, v):
+            if contains(left, v):
                 clique[size] = v
                 size += 1
                 some = np.uint64(0)
@@ -140,7 +147,7 @@ def greedy_clique(graph: np.ndarray, starts: int) -> np.ndarray:
 
 
 @kernel
-def colour(
+def greedy_colouring(
     graph: np.ndarray,
     candidates: np.ndarray,
     at_least: int,
@@ -149,14 +156,24 @@ def colour(
     uncoloured: np.ndarray,
     same: np.ndarray,
 ) -> int:
-    """Colour candidates so that neighbours differ; a clique holds at most one of each colour.
+    """Colour candidates so that neighbours differ; a clique contains at most one of each colour.
 
-    Candidates (W,) are a set of the graph's (n, W) vertices. Those of a colour number `at_least` or
-    less cannot lead on; the others are listed in `vertex`, by ascending colour, with their colours,
-    counted from 1, in `number`. `uncoloured` and `same` (W,) are work space. Returns how many.
+    Candidates with a colour of at most `at_least` cannot extend a clique beyond it.
+
+    Args:
+        graph: graph, shape (n, W).
+        candidates: set of vertices, shape (W,).
+        at_least: number of colours that are left out.
+        vertex: output, the other candidates by ascending colour.
+        number: output, their colours, counted from 1.
+        uncoloured: work space, shape (W,).
+        same: work space, shape (W,).
+
+    Returns:
+        Number of candidates in the output.
     """
     words = len(candidates)
-    for w in range(words):  # a slice would take long to compile, with the wording of its error
+    for w in range(words):  # compiles faster than an assignment of slices
         uncoloured[w] = candidates[w]
     count, k = 0, 0
     while True:
@@ -182,9 +199,9 @@ def colour(
 
 @kernel
 def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np.ndarray, int]:
-    """Maximum clique (K,) of a small graph (n, W) if larger than `at_least`, else empty.
+    """Return a maximum clique (K,) of a small graph (n, W) if larger than `at_least`, else empty.
 
-    Also returns what is left of the budget, in nodes of the search; at 0 it ended early.
+    Also return the remaining budget of search nodes; at 0 the search ended early.
     """
     n, words = graph.shape
     best = np.zeros(0, np.int64)
@@ -196,7 +213,9 @@ def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np
     for v in range(n):
         candidates[0, v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
     depth = 0
-    listed[0] = colour(graph, candidates[0], at_least, vertex[0], number[0], uncoloured, same)
+    listed[0] = greedy_colouring(
+        graph, candidates[0], at_least, vertex[0], number[0], uncoloured, same
+    )
     while depth >= 0 and budget > 0:
         if listed[depth] == 0 or depth + number[depth, listed[depth] - 1] <= at_least:
             depth -= 1
@@ -212,7 +231,7 @@ def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np
         candidates[depth, v // WORD] &= ~(np.uint64(1) << np.uint64(v % WORD))
         if some:
             depth += 1
-            listed[depth] = colour(
+            listed[depth] = greedy_colouring(
                 graph,
                 candidates[depth],
                 at_least - depth,
@@ -228,46 +247,44 @@ def _branch_and_bound(graph: np.ndarray, at_least: int, budget: int) -> tuple[np
 
 
 @kernel
-def _subgraph(graph: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """The graph (n, ceil(n / 64)) of some vertices (n,), numbered 0 to n - 1."""
-    n = len(rows)
-    small = np.zeros((n, (n + WORD - 1) // WORD), np.uint64)
-    for i in range(n):
-        for j in range(n):
-            if has(graph[rows[i]], rows[j]):
-                small[i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
-    return small
-
-
-@kernel
 def larger_clique(
     graph: np.ndarray, among: np.ndarray, at_least: int, budget: int
 ) -> tuple[np.ndarray, bool]:
-    """A maximum clique among some vertices, if there is one of more than `at_least`.
+    """Find a maximum clique among some vertices if it has more than `at_least` vertices.
 
-    Of those that have enough neighbours, from the one of most on; each with its neighbours that
-    came before, which are half of them where degrees are alike, so that every clique is looked for
-    where the last of its vertices is.
+    Vertices of sufficient degree are visited by descending degree. Each vertex is searched together
+    with its earlier neighbours, so that a clique is found at its last vertex.
 
-    The graph (N, W) is symmetric, bit j of row i for an edge, no diagonal; `among` (W,) is the set
-    of vertices. After `budget` nodes of the search the largest found so far is returned. Returns
-    (K,) vertices, none when no clique is larger; and whether the search came to its end.
+    Args:
+        graph: symmetric graph without diagonal, shape (N, W).
+        among: set of vertices, shape (W,).
+        at_least: size that the clique must exceed.
+        budget: largest number of search nodes.
+
+    Returns:
+        Vertices (K,), none if no clique is larger, and True if the search was complete. If it was
+        not, the clique is the largest one found.
     """
     n, words = graph.shape
     best, rows = np.zeros(0, np.int64), np.empty(n, np.int64)
     chosen, before = among.copy(), np.zeros(words, np.uint64)
     degree = np.full(n, -1)
-    for v in rows[: keep_core(graph, chosen, at_least, rows)]:
+    for v in rows[: reduce_to_core(graph, chosen, at_least, rows)]:
         degree[v] = count_common(graph[v], chosen)
-    for v in most_first(degree):
-        if degree[v] < at_least:  # a larger clique was found since
+    for v in by_descending_degree(degree):
+        if degree[v] < at_least:  # a larger clique was found meanwhile
             break
         if count_common(before, graph[v]) >= at_least:
             for w in range(words):
                 chosen[w] = before[w] & graph[v, w]
-            count = keep_core(graph, chosen, at_least - 1, rows)
+            count = reduce_to_core(graph, chosen, at_least - 1, rows)
             if count:
-                small = _subgraph(graph, rows[:count])
+                # subgraph of the vertices rows[:count], numbered from 0
+                small = np.zeros((count, (count + WORD - 1) // WORD), np.uint64)
+                for i in range(count):
+                    for j in range(count):
+                        if contains(graph[rows[i]], rows[j]):
+                            small[i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
                 found, budget = _branch_and_bound(small, at_least - 1, budget)
                 if len(found):
                     at_least = len(found) + 1
@@ -281,36 +298,37 @@ def larger_clique(
     return best, True
 
 
-_GREEDY_STARTS = 100  # a walk costs microseconds, and a large clique spares the search most
-_SAMPLE = 128  # pairs; a graph of all their edges takes a tenth of a millisecond
-# Share in support from which the graph of the others costs half of all pairs' or less. A clique of
-# a sample that comes from so much support holds half that share of the sample at least.
+_GREEDY_STARTS = 100  # start vertices; a large greedy clique prunes most of the search
+_SAMPLE = 128  # pairs of the first, cheap search
+# Share of supporters at which the graph of the other pairs takes half the time of the whole graph.
+# A clique of the sample must contain at least half of this share.
 _WORTH_A_LOOK = 0.3
-# Pairs whose graph is searched at once: it fits the processor's cache, and the time grows with the
-# square. In smaller parts those that agree by chance would be too many beside a part's true ones.
+# Largest number of pairs of one graph, which fits the processor's cache; the time grows with the
+# square. In smaller parts chance agreement would exceed the true pairs.
 _PART = 2500
 
 
 @dataclass(frozen=True)
 class Clique(Consensus):
-    """The largest set of correspondences of which any two agree.
+    """Largest set of pairwise consistent correspondences.
 
-    Two agree when their landmarks lie equally far apart in both maps, as far as covariances and
-    s_drift can tell (PCM: Mangelson et al. 2018; TEASER++: Yang et al. 2021; CLIPPER: Lusk et al.
-    2021). True pairs all agree; false ones rarely do by threes. Both with s_drift and without, a
-    greedy clique is fitted and its support counted, then cliques larger than that are looked for.
+    Two correspondences are consistent if the distance between their landmarks is equal in both maps
+    within the covariances and s_drift (PCM: Mangelson et al. 2018; TEASER++: Yang et al. 2021;
+    CLIPPER: Lusk et al. 2021). True pairs are all consistent; three false ones rarely are. With and
+    without s_drift, the motion of a greedy clique is refitted to its support, and larger cliques
+    are then searched.
 
-    A larger clique need not be looked for where it can only be the same motion again: if the pairs
-    that do not support the motion found hold no clique of half as many as do, every larger clique
-    shares more than half its pairs with the support. That is shown by as few edges as possible.
-    Where most pairs are true, a clique of evenly chosen pairs gives the motion, and the others'
-    graph is small. Of many pairs, parts are searched, of which one would hold its share.
+    The search for a larger clique is omitted if it can only give the same motion: if the pairs that
+    do not support the motion contain no clique of half the number of supporters, every larger
+    clique shares more than half of its pairs with the support. If most pairs are true, a clique of
+    a sample gives the motion and the graph of the other pairs is small. Many pairs are searched in
+    parts, one of which would contain its share of a clique.
 
     Attributes:
-        agreement_probability: of two true pairs to agree (chi-square, 1 degree of freedom). Closer
-            to 1 than `probability`, since a clique needs all its pairs to agree.
-        max_nodes: of branch and bound at each s_drift; beyond them the largest clique found counts.
-            Where most pairs are true the last vertices of a clique take many and change nothing.
+        agreement_probability: probability that two true pairs are consistent (chi-square, 1 degree
+            of freedom); closer to 1 than `probability`, since all pairs of a clique must be.
+        max_nodes: largest number of search nodes for each s_drift; the largest clique found until
+            then is used. The last vertices of a clique take many nodes and hardly change a motion.
     """
 
     randomised: ClassVar[bool] = False
@@ -318,40 +336,36 @@ class Clique(Consensus):
     max_nodes: Annotated[int, Range(1, 10_000_000, "nodes")] = 1000
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
-        """T_a_b under which the residuals are likeliest; nothing is drawn from `rng`."""
+        """Return the motion of largest likelihood among those of cliques; `rng` is not used."""
         del rng
         planar = pairs.in_plan()
-        best = self._likeliest(planar)
-        return self.fit_of(best.T_a_b, best.inside, best.level, pairs, planar)
-
-    def _likeliest(self, pairs: PlanarPairs) -> "CliqueSearch":
-        search, rows = CliqueSearch(self, pairs), np.arange(len(pairs.p_a))
+        search, rows = CliqueSearch(self, planar), np.arange(len(pairs))
+        done = False
         if len(rows) > _SAMPLE:
             sample = rows[:: -(-len(rows) // _SAMPLE)]
             search.offer_greedy(sample, round(_WORTH_A_LOOK / 2 * len(sample)))
-            if search.is_plain():
-                return search
-        if len(rows) > _PART:
+            done = search.is_complete()
+        if len(rows) > _PART and not done:
             parts = -(-len(rows) // _PART)
-            if search.none_in_parts([rows[k::parts] for k in range(parts)]):
-                return search
-        search.exhaust(rows)
-        return search
+            done = search.none_in_parts([rows[k::parts] for k in range(parts)])
+        if not done:
+            search.exhaust(rows)
+        return self.fit_of(search.T_a_b, search.inside, search.level, pairs, planar)
 
 
 class CliqueSearch:
-    """The likeliest of the motions that cliques have.
+    """Search for the motion of largest likelihood among those of cliques.
 
     Attributes:
-        T_a_b: (3,), settled on its support; NaN before there is one.
-        inside: (N,) bool, its support.
-        near: (N,) bool, its support at the largest s_drift.
-        level: of s_drift at which it is likeliest, -1 before there is one.
+        T_a_b: best motion, refitted to its support, shape (3,); NaN initially.
+        inside: support of the motion, bool, shape (N,).
+        near: support at the largest s_drift, bool, shape (N,).
+        level: index of the most likely s_drift, -1 initially.
     """
 
     def __init__(self, clique: Clique, pairs: PlanarPairs) -> None:
         self._pairs, self._bound, self._variances_m2 = pairs, clique.bound, clique.variances_m2
-        self._rows, self._spread = in_rows(pairs), Spread.of(pairs)
+        self._rows, self._spread = packed_rows(pairs), PairSpread.of(pairs)
         self._scales_m2 = float(self._variances_m2[0]), float(self._variances_m2[-1])
         self._agreement = chi_square_bound(clique.agreement_probability, 1)
         self._max_nodes = clique.max_nodes
@@ -361,13 +375,13 @@ class CliqueSearch:
         self.level = -1
 
     def graphs(self, rows: np.ndarray) -> np.ndarray:
-        """Which of some pairs (n,) agree (2, n, W): without s_drift, and with it."""
-        return consistency(self._rows[rows], self._scales_m2, self._agreement)
+        """Return the consistency graphs (2, n, W) of some pairs (n,), without and with s_drift."""
+        return consistency_graphs(self._rows[rows], self._scales_m2, self._agreement)
 
     def offer_greedy(self, rows: np.ndarray, least: int = 2) -> np.ndarray:
-        """Offer a greedy clique of some pairs (n,) at either scale, of no fewer than `least`.
+        """Offer the greedy cliques of some pairs (n,) with at least `least` pairs.
 
-        Returns their graphs.
+        Returns the consistency graphs.
         """
         graphs = self.graphs(rows)
         for graph in graphs:
@@ -377,56 +391,59 @@ class CliqueSearch:
         return graphs
 
     def offer(self, clique: np.ndarray) -> None:
-        """Take the motion of a clique (K,) if it is the likeliest so far.
+        """Keep the motion of a clique (K,) if its likelihood is the largest so far.
 
-        It is the same motion where all support that one, and none where the clique is of one pair.
+        A clique of one pair, or of supporters of the current motion, is ignored.
         """
         if len(clique) < 2 or self.near[clique].all():
             return
         pairs, scales, bound = self._pairs, self._variances_m2, self._bound
         T_a_b, inside = np.array(fit_rigid(pairs.p_a, pairs.p_b, clique)), np.empty_like(self.near)
-        log, level = settle_at_best_scale(T_a_b, pairs, self._spread, scales, bound, inside)
+        log, level = refit_at_best_drift(T_a_b, pairs, self._spread, scales, bound, inside)
         if log > self._log:
             self.T_a_b, self.inside, self.level, self._log = T_a_b, inside, level, log
             self.near = self.support(1)
 
     def support(self, scale: int) -> np.ndarray:
-        """Which pairs (N,) support the likeliest motion, settled at a scale; none before."""
+        """Return the support (N,) of the best motion, refitted with s_drift 0 or the largest."""
         inside = np.zeros(len(self._pairs.p_a), np.bool_)
         if self.level >= 0:
             given = self._pairs, self._spread.own_m2, self._scales_m2[scale], self._bound
-            settle(self.T_a_b.copy(), *given, inside)
+            refit_to_support(self.T_a_b.copy(), *given, inside)
         return inside
 
-    def is_plain(self) -> bool:
-        """Whether so many pairs support the motion that no clique of others comes near."""
+    def is_complete(self) -> bool:
+        """Return True if the other pairs contain no clique of half the number of supporters."""
         support, others = int(np.count_nonzero(self.near)), np.flatnonzero(~self.near)
         if support <= _WORTH_A_LOOK * len(self.near):
             return False
-        return not may_hold(self.graphs(others)[1], everyone(len(others)), support // 2)
+        return not may_contain_clique(self.graphs(others)[1], full_set(len(others)), support // 2)
 
     def none_in_parts(self, parts: list[np.ndarray]) -> bool:
-        """Whether no clique of the pairs that do not support the motion has half as many.
+        """Return True if the other pairs contain no clique of half the number of supporters.
 
-        If it had, one of P parts would hold at least 1 / P of it.
+        At least one of P parts would contain 1 / P of such a clique.
         """
         graphs = [self.offer_greedy(rows) for rows in parts]
         size = int(np.count_nonzero(self.near)) // (2 * len(parts))
         for rows, graph in zip(parts, graphs, strict=True):
-            others = set_of(~self.near[rows])
+            others = bit_set(~self.near[rows])
             clique, finished = larger_clique(graph[1], others, size, self._max_nodes)
             if len(clique) or not finished:
                 return False
         return True
 
     def exhaust(self, rows: np.ndarray) -> None:
-        """Offer the largest clique of all pairs (N,) at either scale if its motion may be new.
+        """Offer the largest clique of all pairs (N,), without and with s_drift.
 
-        One without s_drift is one with it, so that the support with it counts at both.
+        The search is omitted if a clique can only give the current motion. A clique without s_drift
+        is one with s_drift as well, so that the support with s_drift counts for both.
         """
         for scale, graph in enumerate(self.graphs(rows)):
             greedy = greedy_clique(graph, _GREEDY_STARTS)
             self.offer(greedy)
-            if may_hold(graph, set_of(~self.near), int(np.count_nonzero(self.near)) // 2):
+            if may_contain_clique(
+                graph, bit_set(~self.near), int(np.count_nonzero(self.near)) // 2
+            ):
                 at_least = max(int(np.count_nonzero(self.support(scale))), len(greedy))
-                self.offer(larger_clique(graph, everyone(len(rows)), at_least, self._max_nodes)[0])
+                self.offer(larger_clique(graph, full_set(len(rows)), at_least, self._max_nodes)[0])

@@ -1,7 +1,7 @@
 """Consensus of pairs: pairwise consistency, and the support that robust methods share.
 
-A rigid motion keeps distances, so two true correspondences agree in them but for the landmarks'
-noise, whatever the motion (Mangelson et al. 2018, PCM; Lusk et al. 2021, CLIPPER).
+A rigid motion preserves distances. The distance between the landmarks of two true correspondences
+is therefore equal in both maps up to noise (Mangelson et al. 2018, PCM; Lusk et al. 2021, CLIPPER).
 """
 
 import math
@@ -14,12 +14,12 @@ from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.drift import DRIFT_FLOOR_M
 from mapfusion.align.mahalanobis_gate import (
+    PairSpread,
     PlanarPairs,
-    Spread,
     mean_variances,
-    settle_at_best_scale,
+    refit_at_best_drift,
 )
-from mapfusion.align.method import Fit, Undetermined, why_one_place
+from mapfusion.align.method import Fit, Undetermined, why_angle_is_open
 from mapfusion.geometry.numerics import (
     WORD,
     Float,
@@ -31,21 +31,20 @@ from mapfusion.geometry.numerics import (
 )
 from mapfusion.parameters import Probability, Range, require_in_range
 
-# What single precision may add to the difference of two distances: coordinates of at most 1, read
-# to 2^-25, subtracted, squared and added, in two maps, make 15 roundings of 2^-24.
+# Bound of the single-precision error of the difference of two distances: coordinates of at most 1,
+# read to 2^-25, subtracted, squared and added in two maps make 15 roundings of 2^-24.
 _ROUNDING = 16 * 2.0**-24
-# (d + r)^2 is at most (1 + s) d^2 + (1 + 1 / s) r^2: a small share s of the pairs looked at more
-# closely pays for a rounding r that is larger than it.
+# s in (d + r)^2 <= (1 + s) d^2 + (1 + 1 / s) r^2, which bounds a distance d with rounding error r.
 _SHARE = 1 / 16
-_LEAST_EXTENT_M = 1e-6  # of a map: all its landmarks in one place must not divide by zero
+_LEAST_EXTENT_M = 1e-6  # smallest extent of a map, which avoids a division by zero
 
 
 class _Coarse(NamedTuple):
-    """N correspondences (N,) in single precision, in units of the larger map's extent.
+    """N correspondences in single precision, in units of the larger map's extent, arrays (N,).
 
     Attributes:
-        ax, ay, bx, by: positions about the first pair's.
-        most: what each adds to the most that the squared difference of two distances may be.
+        ax, ay, bx, by: positions relative to the first pair.
+        most: contribution to the largest squared difference of two distances.
     """
 
     ax: np.ndarray
@@ -57,13 +56,13 @@ class _Coarse(NamedTuple):
 
 @kernel
 def _worst(xx: float, xy: float, yy: float) -> float:
-    """Larger eigenvalue of a covariance: the variance in the worst direction."""
+    """Return the larger eigenvalue of a covariance."""
     return (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
 
 
 @kernel
 def _coarse(rows: Float, variance_m2: float, bound: float) -> _Coarse:
-    """The pairs under their landmarks' worst variances, so that rounding loses none."""
+    """Return the pairs in single precision, with bounds that include rounding errors."""
     n, extent = len(rows), _LEAST_EXTENT_M
     for i in range(n):
         for k in range(4):
@@ -97,11 +96,10 @@ def _mark_near(
     at: tuple[float, float, float, float, float],
     near: np.ndarray,
 ) -> None:
-    """Mark in `near` (n,) those with (d_a - d_b)^2 <= m, the sum of two `most`, without a root.
+    """Mark in `near` (n,) the pairs with (d_a - d_b)^2 <= m, where m is the sum of two `most`.
 
-    With p = d_a^2 and q = d_b^2 that is (p - q)^2 <= m (2 (p + q) - m) where m <= p + q, and
-    always so beyond. Written so that the compiler compares several at once: no index but the loop's
-    own, no branch.
+    With p = d_a^2 and q = d_b^2 this is (p - q)^2 <= m (2 (p + q) - m) if m <= p + q, and true
+    otherwise. The loop has no branch and no other index, so that it is vectorised.
     """
     ax0, ay0, bx0, by0, most0 = at
     for j in range(len(near)):
@@ -113,14 +111,14 @@ def _mark_near(
 
 @kernel(error_model="numpy")
 def _variance_along(dx: float, dy: float, square: float, xx: float, xy: float, yy: float) -> float:
-    """Variance along the line (dx, dy) of this squared length; 0 where there is no line."""
+    """Return the variance along the direction (dx, dy) with this squared length; 0 for length 0."""
     along = dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy
     return along / square if square > 0 else 0.0
 
 
 @kernel(error_model="numpy")
 def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> float:
-    """`drift_needed` of two correspondences, each a row of `in_rows`."""
+    """Return `drift_needed` for two rows of `packed_rows`."""
     ax, ay, bx, by = other[0] - one[0], other[1] - one[1], other[2] - one[2], other[3] - one[3]
     p, q = ax * ax + ay * ay, bx * bx + by * by
     difference = math.sqrt(p) - math.sqrt(q)
@@ -129,8 +127,8 @@ def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> f
     return (difference * difference / bound - v) / 2
 
 
-def in_rows(pairs: PlanarPairs) -> Float:
-    """The pairs (N, 10): p_a, p_b, and xx, xy, yy of S_a and of S_b; a row is read as one piece."""
+def packed_rows(pairs: PlanarPairs) -> Float:
+    """Return the pairs as rows: p_a, p_b, and xx, xy, yy of S_a and of S_b, shape (N, 10)."""
     rows = np.empty((len(pairs.p_a), 10))
     rows[:, :2], rows[:, 2:4] = pairs.p_a, pairs.p_b
     for k, S in ((4, pairs.S_a), (7, pairs.S_b)):
@@ -146,52 +144,29 @@ def _numbers(rows: Float, i: int) -> tuple[float, ...]:
 
 @kernel
 def drift_needed(rows: Float, i: int, j: int, bound: float) -> float:
-    """s_drift^2 from which on correspondences i and j of `in_rows` agree; negative: even without.
+    """Return the smallest s_drift^2 with which pairs i and j are consistent; it may be negative.
 
-    To first order the difference of the two distances has the variance v that the four landmarks
-    have along the lines between them, and s_drift^2 for each correspondence.
+    To first order the variance of the difference of the two distances is the sum of the four
+    landmarks' variances along the connecting lines, and s_drift^2 for each pair.
     """
     return _needed(_numbers(rows, i), _numbers(rows, j), bound)
 
 
 @kernel
-def _agreeing(
-    near: np.uint64,
-    first: int,
-    one: tuple[float, ...],
-    rows: Float,
-    scales_m2: tuple[float, float],
-    bound: float,
-) -> tuple[np.uint64, np.uint64]:
-    """Which of the 64 correspondences from `first` on agree with `one` at two s_drift^2.
+def consistency_graphs(rows: Float, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
+    """Return the graphs of consistent correspondences for a small and a large s_drift.
 
-    Only those in the set `near` are looked at.
-    """
-    low = high = np.uint64(0)
-    while near:
-        needed = _needed(one, _numbers(rows, first + trailing_zeros(near)), bound)
-        rest = near & (near - np.uint64(1))
-        low |= near ^ rest if needed <= scales_m2[0] else np.uint64(0)
-        high |= near ^ rest if needed <= scales_m2[1] else np.uint64(0)
-        near = rest
-    return low, high
-
-
-@kernel
-def consistency(rows: Float, scales_m2: tuple[float, float], bound: float) -> np.ndarray:
-    """Graphs of consistent correspondences, for a small and a large s_drift.
-
-    Every two are first compared coarsely, under the landmarks' worst variances; only the few that
-    pass are looked at along their own lines.
+    All pairs of correspondences are first compared in single precision with the landmarks' largest
+    variances. The few that pass are compared with the variances along their connecting lines.
 
     Args:
-        rows: N correspondences as `in_rows` has them.
-        scales_m2: two s_drift^2, the smaller one first.
-        bound: most for the squared difference of distances over its variance.
+        rows: N correspondences as `packed_rows`.
+        scales_m2: two values of s_drift^2, the smaller first.
+        bound: largest squared difference of distances over its variance.
 
     Returns:
-        (2, N, ceil(N / 64)) uint64: bit j of row i tells whether i and j agree; symmetric, without
-        the diagonal.
+        Adjacency as bits, uint64, shape (2, N, ceil(N / 64)): bit j of row i is set if i and j are
+        consistent; symmetric, without the diagonal.
     """
     n = len(rows)
     words = (n + WORD - 1) // WORD
@@ -206,28 +181,33 @@ def consistency(rows: Float, scales_m2: tuple[float, float], bound: float) -> np
         one = _numbers(rows, i)
         for w in range(i // WORD, words):
             word = packed(eights, w)
-            if word:
-                low, high = _agreeing(word, w * WORD, one, rows, scales_m2, bound)
-                graphs[0, i, w], graphs[1, i, w] = low, high
+            low = high = np.uint64(0)
+            while word:
+                needed = _needed(one, _numbers(rows, w * WORD + trailing_zeros(word)), bound)
+                rest = word & (word - np.uint64(1))
+                low |= word ^ rest if needed <= scales_m2[0] else np.uint64(0)
+                high |= word ^ rest if needed <= scales_m2[1] else np.uint64(0)
+                word = rest
+            graphs[0, i, w], graphs[1, i, w] = low, high
     mirror(graphs[0])
     mirror(graphs[1])
     return graphs
 
 
-# Shares of the largest s_drift that are tried as well: maps without drift deserve the narrow gate
-# that their covariances allow, and half-way steps lose little between.
+# Values of s_drift relative to the largest: maps without drift allow the narrow gate of their
+# covariances, and finer steps gain little.
 _SCALES = np.array([0.0, 0.5, 1.0])
 
 
 @dataclass(frozen=True)
 class Consensus:
-    """What counts as support of a motion follows from the landmarks' covariances and s_drift.
+    """Support of a motion by a gate from the landmarks' covariances and s_drift.
 
     Attributes:
-        drift_sigma_m: largest s_drift expected, per axis, of both maps together: 0.1 m is usual
-            between two maps of one loop. Half of it and none are tried, too.
-        probability: of a true pair to lie inside its gate.
-        height: which pairs can be true by their heights (not for planar maps).
+        drift_sigma_m: largest expected s_drift per axis of both maps together; 0.1 m is usual
+            between two maps of one loop. Half of this value and 0 are tried as well.
+        probability: probability that a true pair lies inside the gate.
+        height: test of compatible heights (not for planar maps).
     """
 
     drift_sigma_m: Annotated[float, Range(0, 100, "m")] = 0.1
@@ -239,50 +219,51 @@ class Consensus:
 
     @property
     def bound(self) -> float:
-        """Most for e^T C^-1 e of a true pair (chi-square, 2 degrees of freedom)."""
+        """Largest e^T C^-1 e of a true pair (chi-square, 2 degrees of freedom)."""
         return chi_square_bound(self.probability, 2)
 
     @property
     def variances_m2(self) -> Float:
-        """(L,) s_drift^2 of the scales tried, ascending."""
+        """Values of s_drift^2 that are tried, ascending, shape (L,)."""
         return np.unique(np.maximum(self.drift_sigma_m * _SCALES, DRIFT_FLOOR_M) ** 2)
 
-    def settled(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
-        """T_a_b (3,) fitted to its support at the likeliest s_drift; NaN when there is none.
+    def refitted(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
+        """Refit T_a_b (3,) to its support with the most likely s_drift.
 
-        What was settled of these pairs before is not settled again: repetitions find the same.
+        The result is undetermined for T_a_b of NaN. Results are kept with the pairs, because
+        repetitions of a method find the same motions.
         """
         fits: dict[tuple, Fit | Undetermined] = pairs.kept.setdefault(Consensus, {})
         key = self, T_a_b.tobytes()
         if key not in fits:
-            fits[key] = self._settle(T_a_b, pairs, planar)
+            inlier, level = np.zeros(len(pairs), dtype=bool), -1
+            if np.all(np.isfinite(T_a_b)):
+                given = planar, pair_spread(pairs), self.variances_m2, self.bound
+                _, level = refit_at_best_drift(T_a_b, *given, inlier)
+            fits[key] = self.fit_of(T_a_b, inlier, level, pairs, planar)
         return fits[key]
-
-    def _settle(self, T_a_b: Float, pairs: Pairs, planar: PlanarPairs) -> Fit | Undetermined:
-        inlier, level = np.zeros(len(pairs), dtype=bool), -1
-        if np.all(np.isfinite(T_a_b)):
-            given = planar, spread_of(pairs), self.variances_m2, self.bound
-            _, level = settle_at_best_scale(T_a_b, *given, inlier)
-        return self.fit_of(T_a_b, inlier, level, pairs, planar)
 
     def fit_of(
         self, T_a_b: Float, inlier: np.ndarray, level: int, pairs: Pairs, planar: PlanarPairs
     ) -> Fit | Undetermined:
-        """The fit of a settled motion: its support (N,) at that level of s_drift, -1 for none."""
+        """Return the fit of a refitted motion with its support (N,).
+
+        `level` is the index of s_drift in `variances_m2`, -1 without support.
+        """
         if not np.all(np.isfinite(T_a_b)):
             return Undetermined(f"no two of {len(pairs)} correspondences agree on a motion")
         if level < 0:
             return Undetermined("fewer than 2 correspondences support the motion found")
         variance_m2, support = self.variances_m2[level], pairs[inlier]
-        reason = why_one_place(support, variance_m2)
+        reason = why_angle_is_open(support, variance_m2)
         if reason:
             return Undetermined(reason)
         weight = 1 / mean_variances(planar, variance_m2)[inlier]
         return Fit(T_a_b, inlier, weight=weight, fitted=support)
 
 
-def spread_of(pairs: Pairs) -> Spread:
-    """What no motion changes, of the last call with these pairs if there was one."""
-    if Spread not in pairs.kept:
-        pairs.kept[Spread] = Spread.of(pairs.in_plan())
-    return pairs.kept[Spread]
+def pair_spread(pairs: Pairs) -> PairSpread:
+    """Return the `PairSpread` of the pairs, which is kept with them."""
+    if PairSpread not in pairs.kept:
+        pairs.kept[PairSpread] = PairSpread.of(pairs.in_plan())
+    return pairs.kept[PairSpread]

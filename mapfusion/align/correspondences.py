@@ -1,7 +1,7 @@
 """Correspondences: pairs of landmarks of two maps that may be the same point of the world.
 
-Distances come from products of matrices: of a block of landmarks of like heights in one map with
-all those of the other map that can have such a height.
+Descriptor distances are computed by matrix products of a block of landmarks of similar height in
+one map with all landmarks of compatible height in the other map.
 """
 
 import math
@@ -23,30 +23,39 @@ from mapfusion.parameters import Probability, Range, require_finite, require_in_
 from mapfusion.robot_log import FILTERED_STRAY_M
 from mapfusion.tables import NO_LABEL
 
-_BLOCK_ROWS = 256  # rows of the descriptor distance matrix held at once: 5 MB at 5000 columns
-# What single precision may make of a squared distance or a height, as a share of it: a handful of
-# roundings of 2^-24.
+_BLOCK_ROWS = 256  # rows of the descriptor distance matrix in memory: 5 MB at 5000 columns
+# Bound of the relative single-precision error of a squared distance or a height: a few roundings of
+# 2^-24.
 _ROUNDING = 2.0**-20
-# (d + r)^2 is at most (1 + s) d^2 + (1 + 1 / s) r^2: a small share s of the pairs looked at more
-# closely pays for a rounding r that is larger than it.
+# s in (d + r)^2 <= (1 + s) d^2 + (1 + 1 / s) r^2, which bounds a distance d with rounding error r.
 _SHARE = 1 / 16
-_WIDE = 4.0  # times the median variance of heights: a block would take the widest gate of its rows
-# stands for the NaN of a landmark without a descriptor, far from all others
+# Ratio to the median variance of heights above which landmarks get blocks of their own, since the
+# gate of a block is the widest of its rows.
+_WIDE = 4.0
+# replaces the NaN of a landmark without a descriptor, far from all descriptors
 _ABSENT = 1e9
 
 
-def nearest_both_ways(
+def nearest_descriptors(
     map_a: LandmarkMap,
     map_b: LandmarkMap,
     height_bound: float,
     floor_m2: float,
     elsewhere_m: float = 0.0,
 ) -> tuple[np.ndarray, Float, np.ndarray]:
-    """Nearest b of each a, its squared distance (infinite: none fits), and nearest a of each b.
+    """Find the nearest descriptor in the other map for all landmarks of two maps.
 
-    Two fit when the squared difference of their heights is at most `height_bound`, infinite for
-    planar maps, times its variance, in which `floor_m2` is what landmarks' own variances leave out.
-    Nor do they fit that lie nearer to each other than `elsewhere_m`, of a map beside itself.
+    Args:
+        map_a: map with descriptors.
+        map_b: map with descriptors.
+        height_bound: largest squared difference of two heights over its variance; infinite for
+            planar maps.
+        floor_m2: variance of a height difference beyond the landmarks' own variances.
+        elsewhere_m: smallest distance in the plane of two landmarks, if both maps are the same.
+
+    Returns:
+        Nearest b of each a, its squared distance (infinite without a compatible landmark), and
+        nearest a of each b.
     """
     a, b = _Side.of(map_a, _ABSENT, 0.0), _Side.of(map_b, -_ABSENT, floor_m2)
     for rows in a.blocks(height_bound):
@@ -57,15 +66,15 @@ def nearest_both_ways(
 
 
 class _Side(NamedTuple):
-    """The N landmarks of one map, and the nearest of the other map so far, for the kernel."""
+    """N landmarks of one map with the nearest of the other map so far, as arrays for kernels."""
 
     descriptor: np.ndarray  # (N, D)
     square: np.ndarray  # (N,) squared norms of the descriptors
     place_m: Float  # (N, 2) in the plane
     z_m: Float  # (N,)
     variance_m2: Float  # (N,) of the heights
-    nearest: np.ndarray  # (N,)
-    distance2: Float  # (N,) to that
+    nearest: np.ndarray  # (N,) row of the other map
+    distance2: Float  # (N,) squared distance to the nearest
 
     @classmethod
     def of(cls, landmarks: LandmarkMap, absent: float, floor_m2: float) -> "_Side":
@@ -83,7 +92,7 @@ class _Side(NamedTuple):
         )
 
     def blocks(self, bound: float) -> list[np.ndarray]:
-        """All rows in blocks of alike heights; those of wide gates are in blocks of their own."""
+        """Return all rows in blocks of similar height; wide gates are in blocks of their own."""
         rows = np.arange(len(self.z_m))
         if np.isfinite(bound):
             wide = self.variance_m2 > _WIDE * np.median(self.variance_m2)
@@ -91,14 +100,14 @@ class _Side(NamedTuple):
         return [rows[k : k + _BLOCK_ROWS] for k in range(0, len(rows), _BLOCK_ROWS)]
 
     def interval(self, rows: np.ndarray, bound: float) -> tuple[float, float]:
-        """From where to where the heights of some rows can be."""
+        """Return the interval of the possible heights of some rows."""
         if not np.isfinite(bound):
             return -np.inf, np.inf
         reach = np.sqrt(bound * self.variance_m2[rows])
         return float(np.min(self.z_m[rows] - reach)), float(np.max(self.z_m[rows] + reach))
 
     def of_heights(self, low_m: float, high_m: float, bound: float) -> np.ndarray:
-        """Rows whose heights can lie in an interval: all that one of it is compatible with."""
+        """Return the rows whose heights can lie in an interval."""
         if not np.isfinite(bound):
             return np.arange(len(self.z_m))
         reach = np.sqrt(bound * self.variance_m2)
@@ -111,12 +120,12 @@ class _Coarse(NamedTuple):
     square: np.ndarray  # squared norms of the descriptors
     best: np.ndarray  # squared distance to the nearest so far
     z: np.ndarray  # heights in m
-    most: np.ndarray  # what each adds to the most that the squared difference of heights may be
+    most: np.ndarray  # contribution to the largest squared difference of heights
 
 
 @kernel
 def _coarse(side: _Side, rows: np.ndarray, height_bound: float) -> _Coarse:
-    """Some landmarks (n,) in single precision, with what its rounding needs."""
+    """Return some landmarks (n,) in single precision, with bounds that include rounding."""
     n = len(rows)
     square, best = np.empty(n, np.float32), np.empty(n, np.float32)
     z, most = np.empty(n, np.float32), np.empty(n, np.float32)
@@ -143,9 +152,9 @@ def _mark_nearer(
     own: tuple[Any, Any, Any, Any],
     near: np.ndarray,
 ) -> None:
-    """Mark the columns that may be nearer than the nearest so far of theirs or of their row's.
+    """Mark the columns that may be nearer than the nearest so far of the column or of the row.
 
-    Written so that the compiler compares several at once: no index but the loop's own, no branch.
+    The loop has no branch and no other index, so that it is vectorised.
     """
     square0, best0, z0, most0 = own
     for k in range(len(near)):
@@ -164,13 +173,11 @@ def _take_nearer(
     height_bound: float,
     elsewhere_m: float,
 ) -> None:
-    """Update the nearest both ways from scalar products of descriptors.
+    """Update the nearest landmarks of both maps from scalar products of descriptors.
 
-    `product` (n, m) is of some `rows` of map a with some `columns` of map b, `height_bound` the
-    most for the squared difference of heights over its variance; pairs nearer than `elsewhere_m`
-    are none. Of equally near ones the first row
-    of its map counts. All are compared coarsely, by pieces that double, since few are nearer than
-    the nearest of many; those that pass are compared as exactly as they were given.
+    `product` (n, m) is of some `rows` of map a with some `columns` of map b. Of equal distances the
+    first row counts. All columns are compared in single precision, in ranges of doubling length,
+    since few are nearer than the nearest of many; the others are compared in full precision.
     """
     m = len(columns)
     coarse_a = _coarse(a, rows, height_bound)
@@ -193,7 +200,8 @@ def _take_nearer(
                     c = w * WORD + trailing_zeros(word)
                     word &= word - np.uint64(1)
                     j = columns[c]
-                    if _apart_by_less(a.place_m, i, b.place_m, j, elsewhere_m):
+                    dx, dy = a.place_m[i, 0] - b.place_m[j, 0], a.place_m[i, 1] - b.place_m[j, 1]
+                    if dx * dx + dy * dy < elsewhere_m * elsewhere_m:
                         continue
                     dz = a.z_m[i] - b.z_m[j]
                     if dz * dz > height_bound * (a.variance_m2[i] + b.variance_m2[j]):
@@ -206,44 +214,36 @@ def _take_nearer(
 
 
 @kernel
-def _apart_by_less(p: Float, i: int, q: Float, j: int, distance_m: float) -> bool:
-    """Whether point i of (N, 2) and point j of others are less than a distance apart."""
-    dx, dy = p[i, 0] - q[j, 0], p[i, 1] - q[j, 1]
-    return dx * dx + dy * dy < distance_m * distance_m
-
-
-@kernel
 def _take(side: _Side, i: int, j: int, distance2: float) -> None:
-    """Take j for the nearest of i if it is; of equally near ones the first."""
+    """Replace the nearest of i by j if j is nearer, or equally near and earlier."""
     known = side.distance2[i]
     if distance2 < known or (distance2 == known and j < side.nearest[i]):
         side.nearest[i], side.distance2[i] = j, distance2
 
 
-FEW = 3  # correspondences: fewer can contradict no motion, and `match` tells why they are few
-_NORM_FACTOR = 2.0  # by which a descriptor's norm may differ from 1, that of a unit vector
-# Of `scale_note`. Lengths of two maps differ by a few percent (calibration, drift); a window that
-# wide holds some 5 % of the ratios of false pairs, whose logarithms spread by 0.7, so that a
-# quarter of the ratios in it are no chance.
+FEW = 3  # correspondences; fewer cannot contradict a motion, and `match` explains the shortage
+_NORM_FACTOR = 2.0  # largest ratio of a descriptor's norm to 1
+# Constants of `scale_note`. Lengths of two maps differ by a few percent (calibration, drift). An
+# interval of this width contains about 5 % of the ratios of false pairs, whose logarithms have a
+# spread of 0.7; a quarter of the ratios in it cannot be chance.
 _RATIO_WIDTH = 0.05
 _RATIO_SHARE = 0.25
 _FEWEST_RATIOS = 20
-_SHIFTS = 8  # others that each pair is compared with
-_SAME_SCALE = 1.2  # less may be calibration or drift
-_OTHER_WORLD = 100.0  # ratio of extents that a room and a street do not have
+_SHIFTS = 8  # number of other pairs that each pair is compared with
+_SAME_SCALE = 1.2  # smaller factors may be calibration or drift
+_OTHER_WORLD = 100.0  # ratio of extents that differs in units rather than in the world
 _UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
 
 
 @dataclass(frozen=True)
 class Correspondences:
-    """N pairs, one to one.
+    """N correspondences, one to one.
 
     Attributes:
-        index_a: (N,) rows of map a.
-        index_b: (N,) rows of map b.
-        distance: (N,) Euclidean distance of the descriptors; 0 for pairs made by label.
-        shortage: why `match` found fewer than three; empty if it found more, and of pairs that it
-            did not make.
+        index_a: rows of map a, shape (N,).
+        index_b: rows of map b, shape (N,).
+        distance: Euclidean distances of the descriptors, shape (N,); 0 for pairs of labels.
+        shortage: why `match` found fewer than three pairs; empty otherwise.
     """
 
     index_a: np.ndarray
@@ -270,17 +270,16 @@ class Correspondences:
 
 @dataclass(frozen=True)
 class HeightGate:
-    """Whether two landmarks can have the same height.
+    """Test of compatible heights.
 
-    The maps share the height axis: robots drive on one floor, and a landmark's height does not
-    drift with the path. So the landmarks' own height variances decide, plus a floor for what these
-    leave out.
+    The maps share the height axis: robots drive on one floor, and heights do not drift with the
+    path. The test uses the landmarks' height variances and an additional variance.
 
     Attributes:
-        probability: of keeping a pair that is one point (chi-square, 1 degree of freedom).
-        floor_m: standard deviation of what the difference of two heights has beside: the stray of
-            both landmarks' tracks, which no number of sightings averages out. How a body stood when
-            it saw them is in the landmarks' own variances, with what is not known of it.
+        probability: probability of keeping a true pair (chi-square, 1 degree of freedom).
+        floor_m: additional standard deviation of a height difference: the constant offsets of both
+            landmarks' tracks, which do not average out. The attitude of the robot is part of the
+            landmarks' variances.
     """
 
     probability: Probability = 0.999
@@ -291,26 +290,26 @@ class HeightGate:
 
     @property
     def bound(self) -> float:
-        """Most for the squared difference of two heights over its variance."""
+        """Largest squared difference of two heights over its variance."""
         return chi_square_bound(self.probability, 1)
 
     def agrees(
         self, z_a_m: Float, variance_a_m2: Float, z_b_m: Float, variance_b_m2: Float
     ) -> np.ndarray:
-        """Bool array: heights that agree; arguments broadcast."""
+        """Return True for compatible heights; arguments broadcast."""
         variance = variance_a_m2 + variance_b_m2 + self.floor_m**2
         return (z_a_m - z_b_m) ** 2 <= self.bound * variance
 
 
 @dataclass(frozen=True)
 class MatchParameters:
-    """How landmarks are paired.
+    """Parameters of the matching of landmarks.
 
     Attributes:
-        max_descriptor_distance: between unit vectors, so 0 is equal and sqrt(2) unrelated. The
-            default offers almost every mutual nearest neighbour, as the paper does: sorting out
-            the false ones is the aligner's part.
-        height: which heights can be the same.
+        max_descriptor_distance: largest distance of two unit vectors; 0 is equal, sqrt(2)
+            orthogonal. The default keeps almost every mutual nearest neighbour, as in the paper;
+            the aligner rejects the false ones.
+        height: test of compatible heights.
     """
 
     max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.6
@@ -323,56 +322,55 @@ class MatchParameters:
 def match(
     map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters = MatchParameters()
 ) -> Correspondences:
-    """Pair the landmarks of two maps: by label where both carry labels, else by descriptor.
+    """Pair the landmarks of two maps: by label if both maps have labels, else by descriptor.
 
-    By descriptor a pair is kept when each is the other's nearest among the landmarks of compatible
-    height (planar maps: among all), and near enough. Maps with neither give no pairs.
+    A pair of descriptors is kept if each is the other's nearest among the landmarks of compatible
+    height (among all landmarks of planar maps), and near enough. Maps with neither labels nor
+    descriptors give no pairs.
     """
-    empty = not len(map_a) or not len(map_b)
-    if map_a.label is not None and map_b.label is not None and not empty:
-        return _match_labels(map_a, map_b)
-    if map_a.descriptor is None or map_b.descriptor is None or empty:
-        none = np.zeros(0, np.int64)
-        return Correspondences(none, none, np.zeros(0), _nothing_to_match_by(map_a, map_b))
-    return _match_descriptors(map_a, map_b, parameters)
-
-
-def _nothing_to_match_by(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
+    if map_a.label is not None and map_b.label is not None and len(map_a) and len(map_b):
+        labels_a, rows_a = _row_of_label(map_a)
+        labels_b, rows_b = _row_of_label(map_b)
+        common, at_a, at_b = np.intersect1d(labels_a, labels_b, return_indices=True)
+        shortage = ""
+        if len(common) < FEW:
+            both = "are labels of both maps" if len(common) != 1 else "is a label of both maps"
+            a, b = (
+                f"{len(labels)} from {labels[0]} to {labels[-1]}" if len(labels) else "none"
+                for labels in (labels_a, labels_b)
+            )
+            shortage = (
+                f"{len(common) or 'none'} {both} (map {map_a.name}: {a}; map {map_b.name}: {b}); "
+                "where both maps have labels, landmarks are matched by them alone"
+            )
+        return Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
     for landmarks in (map_a, map_b):
+        name = landmarks.name
         if not len(landmarks):
-            return f"map {landmarks.name} is empty"
+            return _no_pairs(f"map {name} is empty")
         if landmarks.descriptor is None and landmarks.label is None:
-            return f"map {landmarks.name} has neither descriptors nor labels to match by"
-    described, labelled = (
-        next(m.name for m in (map_a, map_b) if getattr(m, what) is None)
-        for what in ("label", "descriptor")
-    )
-    return (
-        f"map {described} has descriptors, map {labelled} only labels; give both maps descriptors, "
-        "or both labels"
-    )
+            return _no_pairs(f"map {name} has neither descriptors nor labels to match by")
+    if map_a.descriptor is None or map_b.descriptor is None:
+        described, labelled = (map_b, map_a) if map_a.descriptor is None else (map_a, map_b)
+        return _no_pairs(
+            f"map {described.name} has descriptors, map {labelled.name} only labels; give both "
+            "maps descriptors, or both labels"
+        )
+    height_bound = math.inf if map_a.planar or map_b.planar else parameters.height.bound
+    floor_m2 = parameters.height.floor_m**2
+    rows, nearest_b, distance = _mutually_nearest(map_a, map_b, height_bound, floor_m2)
+    kept = distance <= parameters.max_descriptor_distance
+    shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
+    return Correspondences(rows[kept], nearest_b[kept], distance[kept], shortage)
 
 
-def _match_labels(map_a: LandmarkMap, map_b: LandmarkMap) -> Correspondences:
-    labels_a, rows_a = _row_of_label(map_a)
-    labels_b, rows_b = _row_of_label(map_b)
-    common, at_a, at_b = np.intersect1d(labels_a, labels_b, return_indices=True)
-    shortage = ""
-    if len(common) < FEW:
-        both = "are labels of both maps" if len(common) != 1 else "is a label of both maps"
-        a, b = (
-            f"{len(labels)} from {labels[0]} to {labels[-1]}" if len(labels) else "none"
-            for labels in (labels_a, labels_b)
-        )
-        shortage = (
-            f"{len(common) or 'none'} {both} (map {map_a.name}: {a}; map {map_b.name}: {b}); where "
-            "both maps have labels, landmarks are matched by them alone"
-        )
-    return Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
+def _no_pairs(shortage: str) -> Correspondences:
+    none = np.zeros(0, np.int64)
+    return Correspondences(none, none, np.zeros(0), shortage)
 
 
 def _row_of_label(landmarks: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
-    """Labels in use and for each the row that was observed most often (the first, on a tie)."""
+    """Return all labels and for each the row observed most often (the first, on a tie)."""
     assert landmarks.label is not None
     rows = np.flatnonzero(landmarks.label != NO_LABEL)
     rows = rows[np.argsort(-landmarks.count[rows].astype(np.int64), kind="stable")]
@@ -380,37 +378,26 @@ def _row_of_label(landmarks: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
     return labels, rows[first]
 
 
-def _match_descriptors(
-    map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters
-) -> Correspondences:
-    planar = map_a.planar or map_b.planar
-    height_bound = math.inf if planar else parameters.height.bound
-    rows, nearest_b, distance = _mutually_nearest(
-        map_a, map_b, height_bound, parameters.height.floor_m**2
-    )
-    kept = distance <= parameters.max_descriptor_distance
-    shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
-    return Correspondences(rows[kept], nearest_b[kept], distance[kept], shortage)
-
-
 def _mutually_nearest(
     map_a: LandmarkMap, map_b: LandmarkMap, height_bound: float, floor_m2: float
 ) -> tuple[np.ndarray, np.ndarray, Float]:
     """Return rows (N,) of both maps, each the other's nearest, and their descriptors' distances."""
-    nearest_b, distance2, nearest_a = nearest_both_ways(map_a, map_b, height_bound, floor_m2)
+    nearest_b, distance2, nearest_a = nearest_descriptors(map_a, map_b, height_bound, floor_m2)
     rows = np.flatnonzero(nearest_a[nearest_b] == np.arange(len(map_a)))
     return rows, nearest_b[rows], np.sqrt(np.maximum(distance2[rows], 0.0))
 
 
 def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters) -> str:
-    """Return which test of `match` left few of the pairs that descriptors offer.
+    """Return which test of `match` removed most pairs of two maps with descriptors.
 
-    Both maps have descriptors, and landmarks. Counts and medians are of the pairs that are mutually
-    nearest among all landmarks, whatever their heights: of these, `match` keeps all whose heights
-    agree.
+    Counts and medians are of the pairs that are mutually nearest among all landmarks, without the
+    test of heights; `match` keeps those with compatible heights.
     """
     rows, nearest, distance = _mutually_nearest(map_a, map_b, math.inf, 0.0)
-    known_a, known_b = (_has_descriptor(each) for each in (map_a, map_b))
+    known_a, known_b = (
+        np.logical_not(np.any(np.isnan(each.descriptor), axis=1))  # type: ignore[arg-type]
+        for each in (map_a, map_b)
+    )
     described = known_a[rows] & known_b[nearest]
     rows, nearest, distance = rows[described], nearest[described], distance[described]
     said = f"{len(rows)} mutually nearest descriptors"
@@ -447,24 +434,22 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
     return f"{said}; {scale}" if scale else said
 
 
-def _has_descriptor(landmarks: LandmarkMap) -> np.ndarray:
-    """Return which landmarks (N,) of a map with descriptors have one, as bool."""
-    assert landmarks.descriptor is not None
-    return np.logical_not(np.any(np.isnan(landmarks.descriptor), axis=1))
-
-
 def scale_note(
     map_a: LandmarkMap, map_b: LandmarkMap, index_a: np.ndarray, index_b: np.ndarray
 ) -> str:
-    """Return in words by what factor one map is larger than the other; empty if none is seen.
+    """Return the factor by which one map is larger than the other, in words; empty without one.
 
-    True pairs have one ratio of the distances between their landmarks, false pairs any. So the
-    factor is the ratio that many pairs of pairs share. Without such a ratio the extents are
-    compared.
+    The ratio of the distances between landmarks is equal for all true pairs and differs for false
+    pairs. The factor is the ratio that many pairs of pairs share. Without such a ratio the extents
+    of the maps are compared.
     """
     scale = _common_ratio(map_a.position_m[index_a, :2], map_b.position_m[index_b, :2])
     if math.isnan(scale):
-        extents = [_extent_m(landmarks) for landmarks in (map_a, map_b)]
+        extents = []  # twice the median distance of the landmarks to their median, in plan
+        for landmarks in (map_a, map_b):
+            plan = landmarks.position_m[:, :2]
+            off = np.linalg.norm(plan - np.median(plan, axis=0), axis=1)
+            extents.append(2 * float(np.median(off)))
         if not min(extents) > 0 or max(extents) < _OTHER_WORLD * min(extents):
             return ""
         return (
@@ -484,15 +469,15 @@ def scale_note(
 
 
 def _short(value: float) -> str:
-    """Return two digits after the point of small numbers, and none of large ones."""
+    """Return a number with two digits if it is small, and without decimals if it is large."""
     return f"{value:.2g}" if abs(value) < 10 else f"{value:.0f}"
 
 
 def _common_ratio(p_a: Float, p_b: Float) -> float:
     """Return the ratio |p_b - q_b| / |p_a - q_a| that many of N pairs (N, 2) share, NaN if none.
 
-    Each pair is compared with a few others. Ratios of false pairs spread over a factor of two and
-    more, so that few fall by chance into the densest interval.
+    Each pair is compared with a few others. Ratios of false pairs spread over a factor of two or
+    more, so that few are in the densest interval by chance.
     """
     n = len(p_a)
     shifts = range(1, min(_SHIFTS, n - 1) + 1)
@@ -511,9 +496,3 @@ def _common_ratio(p_a: Float, p_b: Float) -> float:
     if size < _RATIO_SHARE * len(logs):
         return math.nan
     return math.exp(float(np.median(logs[first : first + size])))
-
-
-def _extent_m(landmarks: LandmarkMap) -> float:
-    """Return twice the median distance of the landmarks to their median, in plan."""
-    plan = landmarks.position_m[:, :2]
-    return 2 * float(np.median(np.linalg.norm(plan - np.median(plan, axis=0), axis=1)))

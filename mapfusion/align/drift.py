@@ -1,7 +1,8 @@
-"""Drift of two maps beyond their landmarks' covariances, and its share in an alignment's.
+"""Drift of two maps beyond their landmarks' covariances, and its effect on an alignment.
 
-A landmark's covariance in the best particle's map is conditional on that one path, so between two
-maps the residuals of true pairs have the covariance S_a + R S_b R^T + s_drift^2 I.
+The covariance of a landmark in the map of the best particle is conditional on the path of this
+particle. Residuals of true pairs of two maps therefore have the covariance
+S_a + R S_b R^T + s_drift^2 I.
 """
 
 import math
@@ -13,11 +14,11 @@ from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import rotation
 
-# Below this nothing is measured: it only keeps the weights of noise-free data finite.
+# Lower bound of s_drift, which keeps the weights of noise-free data finite.
 DRIFT_FLOOR_M = 1e-6
 _TOLERANCE = 1e-9  # relative step of s_drift^2 that ends the search
 _MAX_STEPS = 100  # a dozen are the rule
-# g^2 / 2v from which on the gate's term is lost in rounding: x exp(-x) is below 2^-53
+# g^2 / 2v above which the gate's term is below rounding: x exp(-x) < 2^-53
 _BEYOND = 41.0
 _MOTION_PARAMETERS = 3
 
@@ -26,14 +27,13 @@ _MOTION_PARAMETERS = 3
 def _scoring(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:
-    """How far Fisher scoring moves s_drift^2, the variance per axis common to all residuals.
+    """Return the Fisher scoring step of s_drift^2, the variance per axis of all residuals.
 
-    The log-likelihood of a residual e with C = S + s_drift^2 I, given that it fell inside a gate of
-    radius g, is -log|C|/2 - e' C^-1 e/2 - log(1 - exp(-g^2 / 2v)) with v = tr C / 2. The last term
-    is exact for isotropic C and small otherwise, since a gate is wide. The three parameters that
-    the fitted motion took from the 2N numbers are made good by their share.
-    S = S_a + R S_b R^T is (N, 2, 2), `weight` (N,) 0 to 1 how surely each pair is true; what has
-    no weight is not read.
+    The log-likelihood of a residual e with C = S + s_drift^2 I inside a gate of radius g is
+    -log|C|/2 - e' C^-1 e/2 - log(1 - exp(-g^2 / 2v)) with v = tr C / 2. The last term is exact for
+    isotropic C, and small otherwise. The score is scaled for the three degrees of freedom of the
+    fitted motion among the 2N coordinates. S = S_a + R S_b R^T has the shape (N, 2, 2); `weight`
+    (N,) is the probability of each pair to be true. Pairs of weight 0 are skipped.
     """
     numbers = 0.0
     for i in range(len(weight)):
@@ -64,19 +64,19 @@ def _scoring(
 def drift_step(
     residual_m: Float, covariance_m2: Float, weight: Float, variance_m2: float, gate_m: float
 ) -> float:
-    """s_drift^2 after one step of Fisher scoring, at least DRIFT_FLOOR_M squared."""
+    """Return s_drift^2 after one step of Fisher scoring, at least DRIFT_FLOOR_M squared."""
     step = _scoring(residual_m, covariance_m2, weight, variance_m2, gate_m)
     return max(variance_m2 + step, DRIFT_FLOOR_M * DRIFT_FLOOR_M)
 
 
 @kernel
-def _climb(residual_m: Float, covariance_m2: Float, variance_m2: float, gate_m: float) -> float:
-    """s_drift^2 (at least the floor) where Fisher scoring takes no step.
+def _drift_fixed_point(
+    residual_m: Float, covariance_m2: Float, variance_m2: float, gate_m: float
+) -> float:
+    """Return s_drift^2 (at least the floor) at which the Fisher scoring step is zero.
 
-    Of landmarks known to a micrometre and to a decimetre, the sure ones make the information and
-    the others the score: plain steps creep, or go to and fro for ever. The secant through the last
-    two of them meets zero soon, and between a place that is too low and one that is too high there
-    is one.
+    If some landmarks are far more precise than others, plain steps converge slowly or oscillate.
+    The zero is therefore found by the secant method with a bracket.
     """
     floor, weight = DRIFT_FLOOR_M * DRIFT_FLOOR_M, np.ones(len(residual_m))
     low, high = 0.0, math.inf
@@ -89,7 +89,7 @@ def _climb(residual_m: Float, covariance_m2: Float, variance_m2: float, gate_m: 
             low = variance_m2
         else:
             high = variance_m2
-        # of a constant, which all landmarks equally sure leave, the slope is -1
+        # the slope is -1 for equal covariances
         slope = (step - step_before) / (variance_m2 - before) if before < math.inf else -1.0
         before, step_before = variance_m2, step
         variance_m2 = max(variance_m2 - step / (slope if slope < 0 else -1.0), floor)
@@ -99,45 +99,46 @@ def _climb(residual_m: Float, covariance_m2: Float, variance_m2: float, gate_m: 
 
 
 def estimate_drift_m(residual_m: Float, covariance_m2: Float, gate_m: float = math.inf) -> float:
-    """Most likely s_drift in metres for the residuals of pairs about a fitted motion.
+    """Return the most likely s_drift in metres for residuals of pairs about a fitted motion.
 
-    Residuals are (N, 2), S_a + R S_b R^T (N, 2, 2), those beyond `gate_m` were dropped. It is
-    DRIFT_FLOOR_M where the covariances explain the residuals, or there are none.
+    Residuals have the shape (N, 2), their covariances S_a + R S_b R^T the shape (N, 2, 2); none
+    exceeds `gate_m`. The result is DRIFT_FLOOR_M if the covariances explain the residuals, or
+    without residuals.
     """
     if len(residual_m) == 0:
         return DRIFT_FLOOR_M
     start = max(float(np.mean(residual_m**2)), DRIFT_FLOOR_M**2)
-    return math.sqrt(_climb(residual_m, covariance_m2, start, gate_m))
+    return math.sqrt(_drift_fixed_point(residual_m, covariance_m2, start, gate_m))
 
 
 def whole_map_covariance(
     T_a_b: Float, covariance: Float, drift_sigma_m: float, p_a: Float
 ) -> Float:
-    """(3, 3) of an alignment with what drift has in common over a map, which leaves no residual.
+    """Return the covariance (3, 3) of an alignment with the drift that is common to a whole map.
 
-    The pairs, at p_a (n, 2) in the frame of a, are off by s_drift each; if neighbours are alike,
-    as they are where a path bends, all of them shift by as much, and turn by as much as that is
-    seen from their middle. An alignment's own covariance takes them for independent.
+    Common drift leaves no residual, and the alignment's own covariance treats residuals as
+    independent. The pairs, at p_a (n, 2) in frame a, are assumed to shift together by s_drift, and
+    to turn about their centroid by the corresponding angle.
     """
     if drift_sigma_m == 0 or not len(p_a):
         return covariance
     middle = p_a.mean(axis=0)
     arm_m2 = np.sum((p_a - middle) ** 2, axis=1).mean()
-    turn = np.array([middle[1] - T_a_b[1], T_a_b[0] - middle[0], 1.0])  # about the middle
+    turn = np.array([middle[1] - T_a_b[1], T_a_b[0] - middle[0], 1.0])  # about the centroid
     common = np.diag([1.0, 1.0, 0.0]) + np.outer(turn, turn) / max(arm_m2, drift_sigma_m**2)
     return covariance + drift_sigma_m**2 * common
 
 
-def calibration_part(T_a_b: Float, pairs: Pairs, drift_sigma_m: float) -> Float:
-    """Covariance (3, 3) that T_a_b has of it, beside that of independent residuals.
+def calibration_covariance(T_a_b: Float, pairs: Pairs, drift_sigma_m: float) -> Float:
+    """Return the covariance (3, 3) of T_a_b from errors of the camera calibration.
 
-    To first order: an error that moves all points of a map at once moves the least squares of
-    residuals p_a - T p_b, weighed by (S_a + R S_b R^T + s_drift^2 I)^-1, by the sum of their gains.
-    The errors of two maps are independent, unless both are of one camera.
+    To first order, an error that moves all points of a map moves the weighted least squares of the
+    residuals p_a - T p_b, with weights (S_a + R S_b R^T + s_drift^2 I)^-1, by the sum of their
+    gains. The errors of two maps are independent unless both maps are from one camera.
 
     Args:
-        T_a_b: (3,) the motion.
-        pairs: N that made it, not all in one place; of fewer than two nothing is said.
+        T_a_b: motion, shape (3,).
+        pairs: fitted pairs, not all on one point; the result is 0 for fewer than two.
         drift_sigma_m: s_drift.
     """
     of_maps = pairs.map_a.calibration, pairs.map_b.calibration

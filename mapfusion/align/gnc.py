@@ -20,29 +20,29 @@ _MAX_ROUNDS = 1000  # from a residual of 1 km at 1 mm of noise it takes 90
 
 @dataclass(frozen=True)
 class Gnc(Consensus):
-    """Truncated least squares, approached from a convex cost (Yang et al. 2020).
+    """Truncated least squares by graduated non-convexity (Yang et al. 2020).
 
-    Minimises the sum of min(r^2, c^2), r the residual over its standard deviation and c^2 a
-    chi-square quantile. It starts with all pairs and weighs down, round by round, those that do not
-    fit, so a majority of false pairs that pull one way leads it astray: no sampling, no guarantee.
+    Minimises the sum of min(r^2, c^2), with the residual r over its standard deviation and the
+    chi-square quantile c^2. It starts with all pairs and reduces the weights of large residuals in
+    each round. There is no guarantee: a consistent majority of false pairs determines the result.
     """
 
     randomised: ClassVar[bool] = False
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
-        """T_a_b at the largest s_drift, settled; nothing is drawn from `rng`."""
+        """Estimate T_a_b with the largest s_drift and refit to the support; `rng` is not used."""
         del rng
         planar = pairs.in_plan()
         mean_m2 = mean_variances(planar, self.variances_m2[-1])
-        return self.settled(anneal(planar, mean_m2, self.bound)[0], pairs, planar)
+        return self.refitted(anneal(planar, mean_m2, self.bound)[0], pairs, planar)
 
 
 @kernel
 def anneal(pairs: PlanarPairs, mean_m2: Float, bound: float) -> tuple[Float, Float]:
-    """Alternate closed-form fits and weights while the cost goes from convex to truncated.
+    """Alternate closed-form fits and weights while the cost changes from convex to truncated.
 
-    `mean_m2` (N,) is the variance of each residual per axis, `bound` c^2. Returns T_a_b (3,), NaN
-    when all pairs lost their weight, and the weights (N,).
+    `mean_m2` (N,) is the variance of each residual per axis, `bound` is c^2. Returns T_a_b (3,),
+    NaN if all weights are 0, and the weights (N,).
     """
     p_a, p_b = pairs.p_a, pairs.p_b
     n = len(p_a)

@@ -14,26 +14,26 @@ from mapfusion.align.nearest_neighbours import (
     GROUP,
     BoxTree,
     Groups,
-    look_up_group,
-    room_for_groups,
+    find_nearest_of_group,
+    new_search_state,
 )
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.parameters import Range, require_in_range
 
-MAX_ROUNDS = 200  # of pairing and solving
+MAX_ROUNDS = 200  # rounds of pairing and fitting
 
 
 @dataclass(frozen=True)
 class Icp:
     """Iterative closest point.
 
-    Starts from the motion of two correspondences drawn at random, then pairs every landmark of
-    map b with its nearest in map a and solves in closed form, until no pair changes. Descriptors
-    only decide the start. A correspondence is an inlier when the last pairing holds it too.
+    It starts from the motion of two random correspondences. Each round pairs every landmark of map
+    b with its nearest in map a and fits a motion in closed form, until no pair changes. Descriptors
+    only affect the start. A correspondence is an inlier if the last pairing contains it.
 
     Attributes:
-        max_rounds: an estimate that still changes then is refused.
+        max_rounds: largest number of rounds; an estimate that has not converged is refused.
     """
 
     randomised: ClassVar[bool] = True
@@ -44,19 +44,19 @@ class Icp:
         require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
-        """T_a_b of the last pairing."""
+        """Estimate T_a_b as the fit to the last pairing."""
         start = draw_motion(pairs, np.arange(len(pairs)), rng)
         return ClosestPoints.of(pairs).descend(start, self.max_rounds)
 
 
 def draw_motion(pairs: Pairs, rows: np.ndarray, rng: np.random.Generator) -> Float:
-    """T_a_b (3,) of two of the pairs `rows` drawn at random."""
+    """Return T_a_b (3,) of two pairs drawn from `rows`."""
     chosen = rng.choice(rows, size=2, replace=False)
     return np.array(fit_rigid(pairs.p_a, pairs.p_b, chosen))
 
 
 class ClosestPoints:
-    """Pairs each landmark of map b with the nearest of map a (planar maps: in the plane)."""
+    """Pairing of each landmark of map b with the nearest in map a (planar maps: in the plane)."""
 
     def __init__(self, pairs: Pairs) -> None:
         upright = np.array([1.0, 1.0, 0.0 if pairs.planar else 1.0])
@@ -67,20 +67,20 @@ class ClosestPoints:
 
     @classmethod
     def of(cls, pairs: Pairs) -> "ClosestPoints":
-        """Those of the last call with these pairs, if there was one."""
+        """Return the value kept with the pairs, made at the first call."""
         if cls not in pairs.kept:
             pairs.kept[cls] = cls(pairs)
         return pairs.kept[cls]
 
     def cost_m2(self, T_a_b: Float, most_m2: float = math.inf) -> float:
-        """Summed squared distance of map b's landmarks under T_a_b to their nearest in map a.
+        """Return the sum of squared distances from map b's landmarks to their nearest in map a.
 
-        Beyond `most_m2` it is not summed up: what comes back is more than that.
+        The sum may be incomplete if it exceeds `most_m2`.
         """
         return summed_square_distance(T_a_b, self._groups, self._tree, most_m2)
 
     def nearest_of(self, starts: Sequence[Float]) -> Float:
-        """The first of the motions with the least cost."""
+        """Return the motion with the smallest cost, the first if several have it."""
         nearest, least_m2 = starts[0], math.inf
         for T_a_b in starts:
             cost_m2 = self.cost_m2(T_a_b, least_m2)
@@ -89,7 +89,7 @@ class ClosestPoints:
         return nearest
 
     def descend(self, T_a_b: Float, max_rounds: int) -> Fit:
-        """Pair and solve, starting from T_a_b, until the pairing repeats.
+        """Iterate from T_a_b until the pairing repeats.
 
         The fit is the least-squares motion of the last pairing.
         """
@@ -108,14 +108,14 @@ class ClosestPoints:
 
 @kernel
 def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: float) -> float:
-    """Sum over all points of the squared distance under T_a_b to the nearest point of the tree.
+    """Return the sum over all points of the squared distance to the nearest point of the tree.
 
-    It ends with the first group that makes it exceed `most`.
+    The sum ends after the group with which it exceeds `most`.
     """
-    room, nobody = room_for_groups(), np.full(len(groups.row), -1)
+    room, nobody = new_search_state(), np.full(len(groups.row), -1)
     total = 0.0
     for first in range(0, groups.n, GROUP):
-        look_up_group(T_a_b, first, groups, tree, nobody, room)
+        find_nearest_of_group(T_a_b, first, groups, tree, nobody, room)
         for q in range(min(GROUP, groups.n - first)):
             total += room.square[q]
         if total > most:
@@ -127,20 +127,20 @@ def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: fl
 def pair_and_solve(
     T_start: Float, max_rounds: int, p_b: Float, groups: Groups, tree: BoxTree
 ) -> tuple[Float, np.ndarray, bool]:
-    """Pair p_b (N, 3), in groups, with the nearest of a tree and solve, until no pair changes.
+    """Pair points p_b (N, 3) with the nearest of a tree and fit a motion, until no pair changes.
 
     Returns:
-        T_a_b (3,), index into the tree's points of each point's nearest (N,), and True if the last
+        T_a_b (3,), the index of the nearest tree point of each point (N,), and True if the last
         round changed no pair.
     """
     p, n = tree.p, len(p_b)
-    T_a_b, everyone, room = T_start.copy(), np.arange(n), room_for_groups()
+    T_a_b, everyone, room = T_start.copy(), np.arange(n), new_search_state()
     row_of, found = groups.row, room.nearest
     nearest, in_group, matched = np.full(n, -1), np.full(len(row_of), -1), np.empty((n, 3))
     for rounds in range(max_rounds + 1):
         changed = False
         for first in range(0, len(in_group), GROUP):
-            look_up_group(T_a_b, first, groups, tree, in_group, room)
+            find_nearest_of_group(T_a_b, first, groups, tree, in_group, room)
             for q in range(GROUP):
                 i, k = first + q, int(found[q])
                 if k != in_group[i]:
@@ -156,17 +156,17 @@ def pair_and_solve(
 
 @dataclass(frozen=True)
 class ImpIcp:
-    """ICP with a better start.
+    """ICP from the best of a few starts.
 
-    The paper says only that ImpICP is an ad hoc change of ICP that makes a good estimate more
-    probable. Our reading: draw a few minimal sets among the correspondences whose descriptors match
-    best, and go on from the one after which map b's landmarks lie nearest to map a's (root mean
-    square, what ICP itself minimises). Many sets, scored by support, would be RANSAC again.
+    The paper describes ImpICP only as an ad hoc modification of ICP that makes a good estimate more
+    probable. This implementation draws a few minimal sets among the correspondences with the
+    smallest descriptor distances, and starts from the motion with the smallest RMS distance of map
+    b's landmarks to their nearest in map a, the cost of ICP.
 
     Attributes:
-        sets: minimal sets drawn.
-        best_share: of the correspondences, by descriptor distance, from which they are drawn.
-        max_rounds: an estimate that still changes then is refused.
+        sets: number of minimal sets.
+        best_share: share of the correspondences, by descriptor distance, that sets are drawn from.
+        max_rounds: largest number of rounds; an estimate that has not converged is refused.
     """
 
     randomised: ClassVar[bool] = True
@@ -179,8 +179,8 @@ class ImpIcp:
         require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
-        """T_a_b of the last pairing."""
-        # equal distances (labels) are all as good as the last one taken
+        """Estimate T_a_b as the fit to the last pairing."""
+        # pairs at the limiting distance are all included (labels have equal distances)
         last = np.sort(pairs.distance)[max(int(self.best_share * len(pairs)), 2) - 1]
         best = np.flatnonzero(pairs.distance <= last)
         closest = ClosestPoints.of(pairs)

@@ -1,11 +1,11 @@
 """Mahalanobis gate: the pairs that support a motion, given the landmarks' covariances.
 
-The residual of a true pair has the covariance C = S_a + R S_b R^T + s_drift^2 I, so it lies inside
-e^T C^-1 e <= chi-square with a stated probability. How large s_drift is, nobody says; of a few the
-one is taken under which the residuals, true and false ones mixed, are most likely.
+The residual of a true pair has the covariance C = S_a + R S_b R^T + s_drift^2 I and satisfies
+e^T C^-1 e <= bound with a given probability (chi-square). The unknown s_drift is the one of a few
+values with the largest likelihood of all residuals, a mixture of true and false pairs.
 
-A false pair far from all others turns the map about them and finds itself confirmed: its residual
-is small because the motion follows it.
+A false pair far from all others has high leverage: the motion follows it and its residual is small.
+The module therefore also tests whether a motion rests on one pair.
 """
 
 import math
@@ -17,18 +17,18 @@ from mapfusion.align.rigid_motion import fit_weighted, residual_covariances
 from mapfusion.geometry.numerics import Float, kernel, source_of
 from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points
 
-_ROUNDS = 20  # of fit and support; two to five are the rule
-# e^T C^-1 e from which on a density, e^-100 of its peak, is lost in rounding beside the false ones'
+_ROUNDS = 20  # rounds of fit and support; two to five usually suffice
+# e^T C^-1 e above which the density of true pairs (e^-100 of its peak) is negligible
 _BEYOND = 200.0
-_LARGE = 1e100  # where a product of likelihood ratios goes into the logarithm, far from overflow
+_LARGE = 1e100  # product of likelihood ratios at which its logarithm is taken, to avoid overflow
 
 
 class PlanarPairs(NamedTuple):
-    """N correspondences in plan, for the kernels.
+    """N correspondences in plan, as arrays for kernels.
 
     Attributes:
-        p_a, p_b: (N, 2) positions in metres, each in its own frame.
-        S_a, S_b: (N, 2, 2) covariances.
+        p_a, p_b: positions in metres, each in its own frame, shape (N, 2).
+        S_a, S_b: covariances, shape (N, 2, 2).
     """
 
     p_a: Float
@@ -38,7 +38,7 @@ class PlanarPairs(NamedTuple):
 
 
 def mean_variances(pairs: PlanarPairs, variance_m2: float = 0.0) -> Float:
-    """Half the trace of C (N,): the residuals' variance per axis, the same for every theta."""
+    """Return the mean variances per axis of residuals, half the trace of C, shape (N,)."""
     S_a, S_b = pairs.S_a, pairs.S_b
     return (S_a[:, 0, 0] + S_a[:, 1, 1] + S_b[:, 0, 0] + S_b[:, 1, 1]) / 2 + variance_m2
 
@@ -47,7 +47,7 @@ def mean_variances(pairs: PlanarPairs, variance_m2: float = 0.0) -> Float:
 def residual_covariance(
     cos: float, sin: float, S_a: Float, S_b: Float, i: int, variance_m2: float
 ) -> tuple[float, float, float]:
-    """Entries xx, xy, yy of C = S_a + R S_b R^T + s_drift^2 I of pair i; covariances (N, 2, 2)."""
+    """Return the entries xx, xy, yy of C = S_a + R S_b R^T + s_drift^2 I of pair i."""
     axx, axy, ayy = S_a[i, 0, 0], S_a[i, 0, 1], S_a[i, 1, 1]
     bxx, bxy, byy = S_b[i, 0, 0], S_b[i, 0, 1], S_b[i, 1, 1]
     xx, xy, yy = add_turned(axx, axy, ayy, cos, sin, bxx, bxy, byy)
@@ -56,7 +56,7 @@ def residual_covariance(
 
 @kernel
 def _square_and_det(ex: float, ey: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
-    """e^T C^-1 e and |C| of one residual."""
+    """Return e^T C^-1 e and |C| of one residual."""
     det = xx * yy - xy * xy
     return (yy * ex * ex - 2 * xy * ex * ey + xx * ey * ey) / det, det
 
@@ -72,8 +72,8 @@ def mark_supporters(
 ) -> tuple[int, float]:
     """Mark the pairs with e^T C^-1 e <= bound in `inside` (N,).
 
-    `own_m2` are the `mean_variances` without s_drift. Returns the number of supporters, and the
-    sum of what each stays below the bound: up to a constant, minus the truncated squares of all.
+    `own_m2` are the `mean_variances` without s_drift. Returns the number of supporters and their
+    sum of bound - e^T C^-1 e, which is minus the truncated cost up to a constant.
     """
     p_a, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -81,7 +81,7 @@ def mark_supporters(
     for i in range(len(p_a)):
         ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
         inside[i] = False
-        # no direction's variance is above the trace, so this loses none and spares most
+        # cheap exclusion: no direction has a variance above the trace
         if ex * ex + ey * ey > 2 * bound * (own_m2[i] + variance_m2):
             continue
         xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
@@ -97,10 +97,10 @@ def mark_supporters(
 def log_likelihood(
     T_a_b: Float, pairs: PlanarPairs, variance_m2: float, share: float, area_m2: float
 ) -> float:
-    """Of the residuals when `share` of the pairs are true, less that when none are.
+    """Return the log-likelihood ratio of all residuals, `share` of true pairs over none.
 
-    True ones have covariance C, false ones lie anywhere in an area (MLESAC: Torr and Zisserman
-    2000, eq. 9).
+    True pairs have residuals of covariance C, false ones are uniform over an area (MLESAC: Torr and
+    Zisserman 2000, eq. 9).
     """
     p_a, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -109,7 +109,7 @@ def log_likelihood(
         ex, ey = residual(T_a_b, cos, sin, p_a, p_b, i)
         xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
         ratio = 1 - share
-        if ex * ex + ey * ey <= _BEYOND * (xx + yy):  # no direction's variance is above the trace
+        if ex * ex + ey * ey <= _BEYOND * (xx + yy):
             square, det = _square_and_det(ex, ey, xx, xy, yy)
             density = math.exp(-square / 2) / (2 * math.pi * math.sqrt(det))
             ratio += share * area_m2 * density
@@ -121,7 +121,7 @@ def log_likelihood(
 
 
 @kernel
-def settle(
+def refit_to_support(
     T_a_b: Float,
     pairs: PlanarPairs,
     own_m2: Float,
@@ -129,10 +129,10 @@ def settle(
     bound: float,
     inside: np.ndarray,
 ) -> int:
-    """Fit to the support and take the support again until it repeats; T_a_b, inside are changed.
+    """Alternate fit and support until the support repeats; T_a_b and inside are changed.
 
-    `own_m2` are the `mean_variances` without s_drift. Returns the number of supporters; below two
-    T_a_b is not fitted again.
+    `own_m2` are the `mean_variances` without s_drift. Returns the number of supporters; with fewer
+    than two, T_a_b is unchanged.
     """
     weight = np.empty(len(own_m2))
     count, _ = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
@@ -152,44 +152,43 @@ def settle(
 
 
 def spread_area_m2(p: Float) -> float:
-    """Area of the rectangle over which points (N, 2) with this spread would be uniform."""
+    """Return the area of a rectangle with uniform points of the covariance of points (N, 2)."""
     x, y = p.T - np.mean(p, axis=0)[:, None]
     determinant = np.mean(x * x) * np.mean(y * y) - np.mean(x * y) ** 2
     return 12 * math.sqrt(max(determinant, 0.0))  # a side L has the variance L^2 / 12
 
 
-class Spread(NamedTuple):
-    """What of N pairs no motion changes.
+class PairSpread(NamedTuple):
+    """Properties of N pairs that do not depend on the motion.
 
     Attributes:
-        own_m2: (N,) the `mean_variances` without s_drift.
-        area_m2: over which the landmarks are spread in the map in which it is larger.
+        own_m2: `mean_variances` without s_drift, shape (N,).
+        area_m2: larger `spread_area_m2` of the two maps.
     """
 
     own_m2: Float
     area_m2: float
 
     @classmethod
-    def of(cls, pairs: PlanarPairs) -> "Spread":
-        """Of pairs, one or more."""
+    def of(cls, pairs: PlanarPairs) -> "PairSpread":
+        """Return the properties of at least one pair."""
         area_m2 = max(spread_area_m2(pairs.p_a), spread_area_m2(pairs.p_b))
         return cls(mean_variances(pairs), area_m2)
 
 
 @kernel
-def settle_at_best_scale(
+def refit_at_best_drift(
     T_a_b: Float,
     pairs: PlanarPairs,
-    spread: Spread,
+    spread: PairSpread,
     variances_m2: Float,
     bound: float,
     inside: np.ndarray,
 ) -> tuple[float, int]:
-    """Settle T_a_b at every scale, coarse to fine, and keep the likeliest.
+    """Refit T_a_b with each s_drift, from large to small, and keep the most likely result.
 
-    T_a_b (3,) and inside (N,) are changed; `spread` is that of the pairs. Scales (L,) are
-    s_drift^2, ascending. Returns the log-likelihood and the scale chosen; -1 when fewer than two
-    pairs support any.
+    T_a_b (3,) and inside (N,) are changed. `variances_m2` (L,) are ascending values of s_drift^2.
+    Returns the log-likelihood and the index of s_drift, -1 if no value has two supporters.
     """
     n = len(pairs.p_a)
     own_m2, area = spread.own_m2, spread.area_m2
@@ -198,7 +197,7 @@ def settle_at_best_scale(
         inside[i] = False
     best, best_level = -math.inf, -1
     for level in range(len(variances_m2) - 1, -1, -1):
-        count = settle(T, pairs, own_m2, variances_m2[level], bound, marks)
+        count = refit_to_support(T, pairs, own_m2, variances_m2[level], bound, marks)
         if count < 2:
             break
         # one false pair counted before any is seen keeps the share below 1
@@ -212,20 +211,27 @@ def settle_at_best_scale(
     return best, best_level
 
 
-# How seldom a true pair may be called false, among all pairs of two maps: as seldom as the test
-# against chance accepts a false alignment.
+# Probability that a true pair among all pairs of two maps is called false, equal to the false-alarm
+# bound of the test against chance.
 _CALLED_FALSE = 1e-3
 
 
-def is_unlike_the_others(
+def is_outlier_to_others(
     T_without: Float, covariance: Float, variance_m2: float, pairs: PlanarPairs, left_out: int
 ) -> bool:
-    """Whether a pair lies farther from where the others put it than they explain.
+    """Return True if the residual of a pair is an outlier to the fit of the other pairs.
 
-    Its squared distance D under the motion without it, in units of S + s_drift^2 I + J cov J' with
-    an s_drift that m = 2 (n - 1) - 3 numbers of the others leave, is 2 F(2, m) for a true pair
-    (the externally studentised residual; Cook and Weisberg 1982), beyond D with the probability
-    (1 + D / m)^(-m / 2). Any of the n pairs might have been the one.
+    The test is the externally studentised residual (Cook and Weisberg 1982). D is the squared
+    residual under the motion without the pair, in units of S + s_drift^2 I + J cov J', with
+    m = 2 (n - 1) - 3 degrees of freedom of s_drift. For a true pair D is distributed as 2 F(2, m),
+    with the tail (1 + D / m)^(-m / 2). The bound allows for n tests (Bonferroni).
+
+    Args:
+        T_without: motion without the pair, shape (3,).
+        covariance: covariance of T_without, shape (3, 3).
+        variance_m2: s_drift^2 without the pair.
+        pairs: all n pairs.
+        left_out: row of the pair.
     """
     _, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_without[2]), math.sin(T_without[2])
@@ -240,14 +246,19 @@ def is_unlike_the_others(
     return -m / 2 * math.log1p(D / m) < math.log(_CALLED_FALSE / len(p_b))
 
 
-def why_one_pair(
+def why_rests_on_one_pair(
     T_a_b: Float, T_without: Float | None, pairs: PlanarPairs, truth: Float, gate_m: float
 ) -> str:
-    """Why the motion rests on the pair of most leverage; empty when it does not.
+    """Return why the motion rests on the pair of highest leverage; empty if it does not.
 
-    Left out, it must not let the motion go further than the gate: other pairs would be true then.
-    T_without is None where the others determine no motion; `truth` (N,) is the probability of being
-    true, `gate_m` the distance up to which pairs take part.
+    Without this pair the motion must not move true pairs by more than the gate.
+
+    Args:
+        T_a_b: motion, shape (3,).
+        T_without: motion without the pair; None if the other pairs determine none.
+        pairs: all N pairs.
+        truth: probability of each pair to be true, shape (N,).
+        gate_m: distance up to which pairs take part.
     """
     if T_without is None:
         return "rests on one correspondence: without it there is no motion"
@@ -260,14 +271,14 @@ def why_one_pair(
 
 
 @kernel
-def most_leverage(
+def highest_leverage_pair(
     T_a_b: Float, pairs: PlanarPairs, variance_m2: float, truth: Float, covariance: Float
 ) -> int:
-    """The pair whose residual moves its own fit most: the largest trace of J cov J' W.
+    """Return the pair of highest leverage, the largest trace of J cov J' W.
 
-    The hat matrix of weighted least squares (Hoaglin and Welsch 1978), with W = truth C^-1 and
-    C = S_a + R S_b R^T + s_drift^2 I.
-    `truth` (N,) is the probability of being true, `covariance` (3, 3) that of T_a_b.
+    This is the block of the hat matrix of weighted least squares (Hoaglin and Welsch 1978), with
+    W = truth C^-1 and C = S_a + R S_b R^T + s_drift^2 I. `truth` (N,) is the probability of each
+    pair to be true, `covariance` (3, 3) that of T_a_b.
     """
     _, p_b, S_a, S_b = pairs
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
@@ -277,7 +288,7 @@ def most_leverage(
     for i in range(len(p_b)):
         xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
         jx, jy = lever(cos, sin, p_b, i)
-        # J cov J': what the motion's own uncertainty makes of this point
+        # J cov J': covariance of the point from the uncertainty of the motion
         txx = cxx + 2 * jx * cxt + jx * jx * ctt
         tyy = cyy + 2 * jy * cyt + jy * jy * ctt
         txy = cxy + jx * cyt + jy * cxt

@@ -9,22 +9,27 @@ import numpy as np
 from mapfusion.align.alignment import Pairs
 from mapfusion.geometry.numerics import Float, chi_square_bound
 
-# probability that points without extent pass for a shape by their noise alone
+# probability that points without extent seem to have one because of noise
 SHAPE_FALSE_ALARM = 1e-3
 
 
 def lacks_extent(p: Float, covariance_m2: Float, drift_m2: float, dimensions: int) -> bool:
     """Return True if points may lie on one point of the plane (dimensions 1) or on one line (2).
 
-    Points are (N, 2 or more), N at least 1, with covariances (N, 2 or more, likewise) and s_drift^2
-    on top of each. Exact zeros never occur: the squared deviations along the weakest of the
-    strongest `dimensions` principal axes, each over its own variance, are compared with the
-    chi-square distribution that noise alone gives them (Cochran 1954, the Q statistic). So an
-    uncertain landmark counts little, and does not hide the extent of the others.
+    The squared deviations along the weakest of the strongest `dimensions` principal axes, each over
+    its own variance, are compared with their chi-square distribution under noise alone (Cochran
+    1954, Q statistic). An uncertain landmark therefore counts little and does not hide the extent
+    of the others.
+
+    Args:
+        p: positions, shape (N, 2 or more), N at least 1.
+        covariance_m2: covariances, shape (N, 2 or more, 2 or more).
+        drift_m2: s_drift^2, added to each covariance.
+        dimensions: 1 or 2.
     """
     in_plan = np.ascontiguousarray(p.T[:2])
-    off = in_plan - in_plan[:, :1]  # far from the origin as exact as near it
-    # rounding alone leaves this much, as in numpy.linalg.matrix_rank
+    off = in_plan - in_plan[:, :1]  # avoids cancellation far from the origin
+    # rounding error, as in numpy.linalg.matrix_rank
     rounding = len(p) * np.finfo(np.float64).eps * np.abs(in_plan).max()
     floor_m2 = drift_m2 + rounding**2 + np.finfo(np.float64).tiny
     xx, xy, yy = (covariance_m2[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
@@ -38,11 +43,11 @@ def lacks_extent(p: Float, covariance_m2: Float, drift_m2: float, dimensions: in
     return bool(weight @ along**2 <= chi_square_bound(1 - SHAPE_FALSE_ALARM, freedom))
 
 
-def why_one_place(pairs: Pairs, drift_m2: float = 0.0, which: str = " that agree") -> str:
+def why_angle_is_open(pairs: Pairs, drift_m2: float = 0.0, which: str = " that agree") -> str:
     """Return why the angle between the maps is open; empty if the pairs (1 or more) determine it.
 
-    The angle is open if all pairs lie on one point of either map. `which` pairs they are, the
-    reason says.
+    The angle is open if all pairs lie on one point of either map. `which` describes the pairs in
+    the text.
     """
     for name, p, covariance in (
         ("a", pairs.p_a, pairs.covariance_a),
@@ -57,10 +62,10 @@ def why_one_place(pairs: Pairs, drift_m2: float = 0.0, which: str = " that agree
     return ""
 
 
-def why_one_line(pairs: Pairs) -> str:
+def why_affine_map_is_open(pairs: Pairs) -> str:
     """Return why an affine map from b to a is open; empty if the pairs determine it.
 
-    It is open if in plan all landmarks of map b that have a pair lie on one line.
+    The affine map is open if all paired landmarks of map b lie on one line in plan.
     """
     if lacks_extent(pairs.p_b, pairs.covariance_b, 0.0, 2):
         n = len(pairs)
@@ -70,37 +75,41 @@ def why_one_line(pairs: Pairs) -> str:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a method asks of the pairs; with less it is not called.
+    """Requirements of a method on the pairs; a method is not called without them.
 
     Attributes:
-        pairs: how many at least.
-        dimensions: 1 when they must not lie on one point of either map, 2 when those of map b must
-            not lie on one line; 0 when the method sees to it itself.
+        pairs: smallest number of pairs.
+        dimensions: 1 if the pairs must not lie on one point of either map, 2 if the landmarks of
+            map b must not lie on one line, 0 if the method tests the extent itself.
     """
 
     pairs: int = 2
     dimensions: int = 0
 
     def why_without_extent(self, pairs: Pairs) -> str:
-        """Why the pairs span too little; empty when they do not."""
+        """Return why the extent of the pairs is too small; empty if it is large enough."""
         if self.dimensions == 0:
             return ""
-        return why_one_place(pairs, which="") if self.dimensions == 1 else why_one_line(pairs)
+        return (
+            why_angle_is_open(pairs, which="")
+            if self.dimensions == 1
+            else why_affine_map_is_open(pairs)
+        )
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A motion that a method found, and the residuals that made it.
+    """Motion that a method found, with the pairs that it was fitted to.
 
     Attributes:
-        T_a_b: (3,) finite.
-        inlier: (N,) bool, which of the pairs given support it.
-        weight: (n,) of the fitted pairs in the least squares; all equal by default.
-        gain: how much each fitted pair's residual moved the motion (n, 3, 2), where that is not the
-            least squares of `weight`.
-        fitted: the n pairs whose residuals made it; the inliers by default.
-        gate_m: radius beyond which residuals were not fitted.
-        refusal: why the motion is not to be trusted, if so.
+        T_a_b: motion, shape (3,), finite.
+        inlier: given pairs that support the motion, bool, shape (N,).
+        weight: weights of the fitted pairs in the least squares, shape (n,); equal by default.
+        gain: derivative of the motion by each fitted residual, shape (n, 3, 2); by default that of
+            the least squares with `weight`.
+        fitted: the n fitted pairs; the inliers by default.
+        gate_m: largest residual of a fitted pair.
+        refusal: why the motion must not be used; empty if it may.
     """
 
     T_a_b: Float
@@ -114,35 +123,39 @@ class Fit:
 
 @dataclass(frozen=True)
 class Undetermined:
-    """The pairs determine no motion; the reason is one a person can act on."""
+    """Result of a method if the pairs determine no motion, with the reason for a user."""
 
     reason: str
 
 
 class Method(Protocol):
-    """An alignment method.
+    """Alignment method.
 
-    It may also have `needs`, a `Needs` (with less it is not called), and `height`, a `HeightGate`
-    (it is given only the pairs whose heights agree).
+    Optional attributes: `needs`, a `Needs`; `height`, a `HeightGate`, restricts the pairs that the
+    method receives to those with compatible heights.
+
+    Attributes:
+        randomised: True if the result depends on the generator.
     """
 
-    randomised: ClassVar[bool]  # whether another generator can give another answer
+    randomised: ClassVar[bool]
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
-        """T_a_b of the pairs, and which of them support it."""
+        """Estimate T_a_b and mark the pairs that support it."""
         ...
 
 
 def supported(
     pairs: Pairs, inlier: np.ndarray, T_a_b: Float, refusal: str = ""
 ) -> Fit | Undetermined:
-    """A motion that is the least squares, equally weighted, of the pairs marked (N,) bool.
+    """Return the fit of a motion that is the unweighted least squares of the pairs marked (N,).
 
-    Fewer than two are a refusal; all in one place, they leave the angle open.
+    A motion with fewer than two pairs is refused. The angle is undetermined if all lie on one
+    point.
     """
     n = int(np.count_nonzero(inlier))
     if n < 2:
         return Fit(T_a_b, inlier, refusal=refusal or f"{n} correspondences support the motion")
     support = pairs[inlier]
-    reason = why_one_place(support)
+    reason = why_angle_is_open(support)
     return Undetermined(reason) if reason else Fit(T_a_b, inlier, fitted=support, refusal=refusal)

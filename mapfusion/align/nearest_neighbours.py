@@ -1,13 +1,12 @@
 """Nearest-neighbour search among landmarks: a tree of boxes, and a grid.
 
-Landmarks lie on walls. A box about a piece of wall is flat, so a point that is far from all of them
-(as under a motion that is wrong) still finds its nearest in few boxes; a grid looks at all the
-empty cells between.
+Landmarks lie on walls, and a box around a piece of wall is flat. A point far from all landmarks (as
+under a wrong motion) therefore finds its nearest landmark in few boxes, while a grid visits all
+empty cells between them.
 
-A group goes down the tree together: a box that is farther from the box about the group than each
-point from what it has found so far is nobody's, and so is a point of a leaf. Distances of a whole
-group to a point of the tree, and of a leaf's points to the group's box, are a few instructions, as
-the processor takes several numbers at once.
+Query points search the tree in groups. A box, or a point of a leaf, is excluded if it is farther
+from the bounding box of the group than the nearest points found so far. The distances of a group to
+a point, and of a leaf's points to a bounding box, are computed by vector instructions.
 """
 
 import math
@@ -18,22 +17,22 @@ import numpy as np
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import moved_point
 
-# At most. To ask a box costs as much as to pass over some ten points of a leaf.
+# Largest number; the test of a box costs as much as that of about ten points.
 POINTS_PER_LEAF = 64
 
 
 class BoxTree(NamedTuple):
-    """N points, in the order of the leaves, and boxes about them, for the kernels.
+    """Binary tree of bounding boxes over N points, as arrays for kernels.
 
-    Node 0 holds all points; the halves of node k are nodes 2k + 1 and 2k + 2. The first leaves are
-    full, those behind the last point are empty.
+    Node 0 contains all points; the children of node k are nodes 2k + 1 and 2k + 2. Points are in
+    the order of the leaves. Leaves are full, except the last one with points; the others are empty.
 
     Attributes:
-        p: (N, 3) the points.
-        x, y, z: (N,) their coordinates, each by itself.
-        row: (N,) where each was in the array given.
-        box: (M, 6) lower corner and upper corner of each node; of an empty one inf and -inf.
-        first, end: (M,) first point of each node, and one behind the last.
+        p: points, shape (N, 3).
+        x, y, z: coordinates of the points, shape (N,).
+        row: row of each point in the given array, shape (N,).
+        box: lower and upper corner of each node, shape (M, 6); inf and -inf for empty nodes.
+        first, end: first point of each node, and one past the last, shape (M,).
     """
 
     p: Float
@@ -47,32 +46,32 @@ class BoxTree(NamedTuple):
 
     @classmethod
     def of(cls, p: Float) -> "BoxTree":
-        """Tree over points (N, 3)."""
-        rows, boxes, ends = in_leaves(p, -(-len(p) // n_leaves_of(len(p), POINTS_PER_LEAF)))
+        """Build the tree over points (N, 3)."""
+        rows, boxes, ends = split_into_leaves(p, -(-len(p) // n_leaves_of(len(p), POINTS_PER_LEAF)))
         in_order = p[rows]
         x, y, z = np.ascontiguousarray(in_order.T)
         return cls(in_order, x, y, z, rows, boxes, ends[0], ends[1])
 
 
 def n_leaves_of(n: int, size: int) -> int:
-    """How many leaves n points take if each may hold so many: a power of two."""
+    """Return the number of leaves for n points with at most `size` each, a power of two."""
     n_leaves = 1
     while n > n_leaves * size:
         n_leaves *= 2
     return n_leaves
 
 
-def in_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarray]:
-    """Points (N, 3) halved along the longest side of their box until `size` are left or fewer.
+def split_into_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarray]:
+    """Split points (N, 3) along the longest side of their box until leaves hold at most `size`.
 
-    The lower half is filled first, so that of all leaves with points only the last is not full.
+    The lower half is filled first, so that only the last leaf with points is not full.
 
     Returns:
-        (N,) rows of p, leaf by leaf; and of all nodes, the root first, the boxes (M, 6) and from
-        where to where their points are (2, M).
+        Rows of p, leaf by leaf (N,); boxes of all nodes, the root first (M, 6); and the first point
+        and one past the last of each node (2, M).
     """
     n_leaves = n_leaves_of(len(p), max(size, 1))
-    # what there are too few of is beyond all others
+    # NaN pads the array; padding sorts behind all points
     held = np.full((4, 1, n_leaves * max(size, 1)), np.nan)
     held[:3, 0, : len(p)], held[3, 0, : len(p)] = p.T, np.arange(len(p))
     boxes, ranges = list[Float](), list[np.ndarray]()
@@ -93,17 +92,17 @@ def in_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarray]:
     return rows[~np.isnan(rows)].astype(np.int64), box, np.concatenate(ranges, axis=1)
 
 
-GROUP = 16  # points; of fewer the compiler makes no vectors, more lie farther from each other
-_DEEPEST = 64  # no array has 2^64 points
+GROUP = 16  # points; enough for vector instructions, few enough to lie close together
+_DEEPEST = 64  # largest depth of the tree
 
 
 class Groups(NamedTuple):
-    """N points in groups that move as one body; the last one is filled up with its first point.
+    """N query points in M groups; the last group is padded with its first point.
 
     Attributes:
-        n: how many they are.
-        row: (M GROUP,) where each was in the array given.
-        x, y, z: (M GROUP,) their coordinates.
+        n: number of points.
+        row: row of each point in the given array, shape (M GROUP,).
+        x, y, z: coordinates, shape (M GROUP,).
     """
 
     n: int
@@ -114,23 +113,24 @@ class Groups(NamedTuple):
 
     @classmethod
     def of(cls, p: Float) -> "Groups":
-        """Groups of points (N, 3)."""
-        row, _, _ = in_leaves(p, GROUP)
+        """Divide points (N, 3) into groups of neighbours."""
+        row, _, _ = split_into_leaves(p, GROUP)
         row = np.append(row, np.full(-len(p) % GROUP, row[len(p) // GROUP * GROUP :][:1]))
         return cls(len(p), row, *np.ascontiguousarray(p[row].T))
 
 
-class Room(NamedTuple):
-    """Of one group: where its points are, what each has found, and the boxes still to be asked.
+class SearchState(NamedTuple):
+    """Work space of the search for one group.
 
     Attributes:
-        x, y, z: (GROUP,) coordinates in the tree's frame.
-        nearest: (GROUP,) number of the tree's point, as a float: vectors are of one width.
-        square: (GROUP,) its squared distance.
-        node: nodes to be asked.
-        away: their squared distances.
-        near: points of a leaf that may be somebody's nearest.
-        far: squared distances of all of the leaf's.
+        x, y, z: coordinates in the frame of the tree, shape (GROUP,).
+        nearest: nearest tree point of each point, shape (GROUP,); float, so that all vectors have
+            the same width.
+        square: squared distances to the nearest points, shape (GROUP,).
+        node: stack of nodes to visit.
+        away: squared distances of these nodes.
+        near: candidates among the points of a leaf.
+        far: squared distances of all points of a leaf.
     """
 
     x: Float
@@ -145,33 +145,33 @@ class Room(NamedTuple):
 
 
 @kernel
-def room_for_groups() -> Room:
-    """One for any number of groups, one after the other."""
+def new_search_state() -> SearchState:
+    """Return a work space, which any number of groups may use in turn."""
     x, y, z, nearest = np.empty(GROUP), np.empty(GROUP), np.empty(GROUP), np.empty(GROUP)
     node, away = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)
     near, far = np.empty(POINTS_PER_LEAF, np.int64), np.empty(POINTS_PER_LEAF)
-    return Room(x, y, z, nearest, np.empty(GROUP), node, away, near, far)
+    return SearchState(x, y, z, nearest, np.empty(GROUP), node, away, near, far)
 
 
 @kernel
-def look_up_group(
-    T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: Room
+def find_nearest_of_group(
+    T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: SearchState
 ) -> None:
-    """Fill in what a group, moved by T_a_b, has nearest, from what was nearest before.
+    """Find the nearest tree points of a group under T_a_b.
 
     Args:
-        T_a_b: (3,).
-        first: number of the group's first point.
-        groups: of which it is one.
-        tree: the points.
-        nearest: (M GROUP,) a point of the tree for each point of the groups, -1: none yet.
-        room: filled in.
+        T_a_b: motion, shape (3,).
+        first: index of the first point of the group.
+        groups: all groups.
+        tree: tree of points.
+        nearest: initial tree point of each point of all groups, shape (M GROUP,); -1 for none.
+        room: work space; its `nearest` and `square` hold the result.
     """
     x, y, z, found, square, _, _, _, _ = room
     _, _, own_x, own_y, own_z = groups
     _, px, py, pz, _, _, _, _ = tree
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    # indices without a sign, else the compiler would take one point at a time
+    # unsigned indices allow vector instructions
     begin = np.uint64(first)
     for q in range(GROUP):
         i = begin + np.uint64(q)
@@ -196,13 +196,13 @@ def _largest(values: Float) -> float:
 
 @kernel
 def _between(low: float, high: float, box_low: float, box_high: float) -> float:
-    """How far two intervals are apart."""
+    """Return the distance between two intervals, 0 if they overlap."""
     return max(box_low - high, low - box_high, 0.0)
 
 
 @kernel
-def _descend(tree: BoxTree, room: Room) -> None:
-    """Go down the tree with a group, to the nearest boxes first."""
+def _descend(tree: BoxTree, room: SearchState) -> None:
+    """Search the tree for a group, nearest boxes first."""
     _, px, py, pz, _, box, starts, ends = tree
     x, y, z, found, square, nodes, aways, near, far = room
     low_x, high_x, low_y, high_y, low_z, high_z = x[0], x[0], y[0], y[0], z[0], z[0]
@@ -238,11 +238,11 @@ def _descend(tree: BoxTree, room: Room) -> None:
                 dy = _between(low_y, high_y, py[k], py[k])
                 dz = _between(low_z, high_z, pz[k], pz[k])
                 far[c] = dx * dx + dy * dy + dz * dz
-            for c in range(n):  # all are written, those that are too far over one another
+            for c in range(n):  # without a branch: candidates that are too far are overwritten
                 near[n_near] = c
                 n_near += far[c] < most
             for c in range(n_near):
-                # let each of the group take point k for its nearest if it is
+                # update the nearest points of the group with point k
                 k = starts[node] + near[c]
                 at_x, at_y, at_z = px[k], py[k], pz[k]
                 for q in range(GROUP):
@@ -260,20 +260,20 @@ def _descend(tree: BoxTree, room: Room) -> None:
         node = nodes[n_todo]
 
 
-_WIDER = 1 + 1e-6  # than the radius asked for, so that rounding leaves out no point on its edge
-_LANDMARKS_PER_CELL = 2.0  # on average; few enough to look at all, enough to skip empty space
+_WIDER = 1 + 1e-6  # factor on a query radius, so that rounding excludes no point on its edge
+_LANDMARKS_PER_CELL = 2.0  # average; a compromise between points and empty cells per query
 
 
 class Grid(NamedTuple):
-    """N points sorted into square cells of the plane, for the kernels.
+    """N points sorted into square cells of the plane, as arrays for kernels.
 
     Attributes:
-        p: (N, 2 or 3) the points, cell by cell.
-        row: (N,) where each was in the array given.
-        start: (nx ny + 1,) first point of each cell.
-        corner_m: (2,) lower corner of the first cell.
+        p: points, cell by cell, shape (N, 2 or 3).
+        row: row of each point in the given array, shape (N,).
+        start: first point of each cell, shape (nx ny + 1,).
+        corner_m: lower corner of the first cell, shape (2,).
         cell_m: side of a cell.
-        shape: (2,) cells along x and y.
+        shape: number of cells along x and y, shape (2,).
     """
 
     p: Float
@@ -285,20 +285,20 @@ class Grid(NamedTuple):
 
     @classmethod
     def of(cls, p: Float) -> "Grid":
-        """Grid over points (N, 2 or 3)."""
+        """Build the grid over points (N, 2 or 3)."""
         n, (x, y) = len(p), np.ascontiguousarray(p[:, :2].T)
         corner_m, extent_m, cell_m = np.zeros(2), np.zeros(2), 1.0
         if n:
             corner_m = np.array([x.min(), y.min()])
             extent_m = np.array([x.max(), y.max()]) - corner_m
         if extent_m.any():
-            # a line or a point has no area; cells as long as its share of the longer side do
+            # points on a line have no area: bound the cell by their spacing along the longer side
             area = extent_m[0] * extent_m[1]
             cell_m = max(math.sqrt(area * _LANDMARKS_PER_CELL / n), float(extent_m.max()) / n)
         shape = (extent_m / cell_m).astype(np.int64) + 1
         column = ((x - corner_m[0]) / cell_m).astype(np.int64)
         cell = ((y - corner_m[1]) / cell_m).astype(np.int64) * shape[0] + column
-        # of short numbers NumPy sorts by digits
+        # NumPy uses the faster radix sort for short integers
         row = np.argsort(cell.astype(np.min_scalar_type(shape[0] * shape[1])), kind="stable")
         start = np.zeros(shape[0] * shape[1] + 1, np.int64)
         np.cumsum(np.bincount(cell, minlength=len(start) - 1), out=start[1:])
@@ -307,7 +307,7 @@ class Grid(NamedTuple):
 
 @kernel
 def _cells(middle: float, radius: float, corner: float, cell: float, cells: int) -> tuple[int, int]:
-    """First cell that an interval meets along one axis, and one behind the last."""
+    """Return the first cell that an interval meets along one axis, and one past the last."""
     wider = radius * _WIDER
     first = max(math.floor((middle - wider - corner) / cell), 0.0)
     last = min(math.floor((middle + wider - corner) / cell), cells - 1.0)
@@ -315,10 +315,11 @@ def _cells(middle: float, radius: float, corner: float, cell: float, cells: int)
 
 
 @kernel
-def runs_about(x: float, y: float, radius_m: float, grid: Grid, runs: np.ndarray) -> int:
-    """Ranges of grid.p with all points within a radius of (x, y), and others.
+def ranges_within(x: float, y: float, radius_m: float, grid: Grid, runs: np.ndarray) -> int:
+    """Find ranges of grid.p that contain all points within a radius of (x, y), and others.
 
-    They go into `runs` (ny, 2), first and one behind the last of each; returns how many.
+    The first point and one past the last of each range are written to `runs` (ny, 2). Returns the
+    number of ranges.
     """
     nx, ny = grid.shape[0], grid.shape[1]
     left, right = _cells(x, radius_m, grid.corner_m[0], grid.cell_m, nx)

@@ -1,4 +1,4 @@
-"""The best that correspondences allow: what is left over is the drift of the maps."""
+"""Oracle: alignment from the true correspondences, the best result that the maps allow."""
 
 import time
 from dataclasses import dataclass, field, replace
@@ -13,10 +13,10 @@ from mapfusion.parameters import require_shape
 
 @dataclass(frozen=True)
 class Oracle:
-    """Aligns with the true pairs alone. Only for evaluation: it is told which ones are true.
+    """Aligner that receives the true pairs, for evaluation only.
 
     Attributes:
-        refinement: the same least squares that every aligner's estimate goes through.
+        refinement: least squares, as for the estimate of every aligner.
     """
 
     refinement: Refinement = field(default_factory=Refinement)

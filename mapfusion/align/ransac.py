@@ -1,4 +1,4 @@
-"""RANSAC: of the motions of random minimal sets, the one with the most support (section 5)."""
+"""RANSAC: the motion of a random minimal set with the most support (section 5)."""
 
 import math
 from dataclasses import dataclass, field
@@ -14,24 +14,24 @@ from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import residual
 from mapfusion.parameters import Probability, Range, require_in_range
 
-_LOCAL_ROUNDS = 10  # of fit and support; two or three are the rule
+_LOCAL_ROUNDS = 10  # rounds of fit and support; two or three usually suffice
 
 
 @dataclass(frozen=True)
 class Ransac:
     """Motion with the largest support among those of random pairs of correspondences.
 
-    Two pairs whose landmarks are not equally far apart in both maps cannot both be true, and a
-    pair whose heights disagree cannot be; neither costs a look at its support.
+    Pairs with incompatible heights, and minimal sets with different distances in the two maps, are
+    rejected before their support is counted.
 
     Attributes:
-        gate_m: a pair supports a motion that brings its landmarks this close (in 3-D; in the plane
-            for planar maps). Three times 0.1 m, the drift between two maps of one loop.
-        min_baseline_m: minimal sets closer together are passed over: at 1 m an error of 0.1 m
-            turns the map by 6 degrees already.
-        confidence: that at least one set of two supporters of the answer was drawn.
-        max_draws: ends the search where there is next to no support.
-        height: which pairs can be true by their heights.
+        gate_m: largest distance of a supporting pair under the motion (in 3-D; in the plane for
+            planar maps): three times 0.1 m, the drift between two maps of one loop.
+        min_baseline_m: smallest distance within a minimal set; at 1 m an error of 0.1 m turns the
+            map by 6 degrees.
+        confidence: probability that at least one set of two supporters of the result was drawn.
+        max_draws: largest number of minimal sets.
+        height: test of compatible heights.
     """
 
     randomised: ClassVar[bool] = True
@@ -45,7 +45,7 @@ class Ransac:
         require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
-        """T_a_b of the minimal set with the most support, fitted to it."""
+        """Estimate T_a_b from the minimal set with the most support, and refit to the support."""
         seed = rng.integers(1, 2**64, dtype=np.uint64)
         log_miss = math.log1p(-self.confidence)
         _, T_a_b, support = most_supported(
@@ -63,7 +63,7 @@ class Ransac:
 
 @kernel
 def next_random(state: np.uint64) -> np.uint64:
-    """Next state of a xorshift generator with 64 bits (Marsaglia 2003); state must not be 0."""
+    """Return the next state of a 64-bit xorshift generator (Marsaglia 2003); never 0."""
     state ^= state << np.uint64(13)
     state ^= state >> np.uint64(7)
     state ^= state << np.uint64(17)
@@ -72,8 +72,8 @@ def next_random(state: np.uint64) -> np.uint64:
 
 @kernel
 def draw_pair(state: np.uint64, n: int) -> tuple[np.uint64, int, int]:
-    """The state after drawing two different numbers below n, and the numbers."""
-    # the upper 32 bits, scaled, are uneven by n / 2^32 at most
+    """Draw two different numbers below n; return the new state and the numbers."""
+    # scaling the upper 32 bits has a bias of at most n / 2^32
     state = next_random(state)
     i = int(np.int64(((state >> np.uint64(32)) * np.uint64(n)) >> np.uint64(32)))
     state = next_random(state)
@@ -82,26 +82,12 @@ def draw_pair(state: np.uint64, n: int) -> tuple[np.uint64, int, int]:
 
 
 @kernel
-def _two_point_motion(
-    p_a: Float, p_b: Float, i: int, j: int, gate_m: float, min_baseline_m: float, T_a_b: Float
-) -> bool:
-    """Fill T_a_b from pairs i and j, or return False when they cannot both support one motion."""
-    ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
-    bx, by = p_b[j, 0] - p_b[i, 0], p_b[j, 1] - p_b[i, 1]
-    difference = math.sqrt(ax * ax + ay * ay) - math.sqrt(bx * bx + by * by)
-    # the fit leaves half the difference at either end, so beyond 2 gates neither end is a supporter
-    if abs(difference) > 2 * gate_m:
-        return False
-    return fit_two(p_a, p_b, i, j, T_a_b) >= min_baseline_m
-
-
-@kernel
 def list_supporters(
     T_a_b: Float, p_a: Float, p_b: Float, gate_m: float, to_beat: int, rows: np.ndarray
 ) -> tuple[int, float]:
-    """Number of supporters, which go into `rows`, and their summed squared distance.
+    """Write the supporters to `rows`; return their number and the sum of squared distances.
 
-    Gives up, with the number so far, when `to_beat` is out of reach.
+    The count stops early if `to_beat` cannot be reached.
     """
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     n, dimensions = p_a.shape
@@ -126,12 +112,12 @@ def list_supporters(
 def refit(
     p_a: Float, p_b: Float, gate_m: float, T_a_b: Float, rows: np.ndarray, count: int
 ) -> tuple[int, float]:
-    """Fit to the support and take the support again until it repeats; T_a_b and rows are changed.
+    """Alternate fit and support until the support repeats; T_a_b and rows are changed.
 
-    Motions are compared only after this: a raw minimal set can gain a false supporter by leaning
-    towards it, with its true ones at the gate's edge.
+    Motions are compared after this local optimisation, since the motion of a minimal set is noisy
+    and can gain false supporters near the gate.
     """
-    cost, none_to_beat = 0.0, np.int64(0)  # a plain 0 is a type of its own, and compiled for
+    cost, none_to_beat = 0.0, np.int64(0)  # a literal 0 would compile a second specialisation
     before = np.empty(len(rows), np.int64)
     for _ in range(_LOCAL_ROUNDS):
         T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, rows[:count])
@@ -157,24 +143,39 @@ def most_supported(
     max_draws: int,
     seed: np.uint64,
 ) -> tuple[int, Float, np.ndarray]:
-    """Draw minimal sets until two supporters of the best motion would have come up by now.
+    """Draw minimal sets until two supporters of the best motion were drawn with the confidence.
 
-    A motion with as much support as the best so far is settled on its support before it counts.
-    Points are (N, 2 or 3), N at least 2, `seed` is not 0, `log_miss` the logarithm of the chance
-    accepted of never drawing two supporters. Returns the number of draws, T_a_b (3,), rows of its
-    supporters; none when no motion was found.
+    A motion with at least as much support as the best one is refitted to its support first.
+
+    Args:
+        p_a: points of frame a, shape (N, 2 or 3), N at least 2.
+        p_b: points of frame b, shape (N, 2 or 3).
+        gate_m: largest distance of a supporter.
+        min_baseline_m: smallest distance within a minimal set.
+        log_miss: logarithm of the accepted probability of drawing no two supporters.
+        max_draws: largest number of draws.
+        seed: state of the generator, not 0.
+
+    Returns:
+        Number of draws, T_a_b (3,) and the rows of its supporters, none without a motion.
     """
     n = len(p_a)
     best_T, T_a_b = np.full(3, np.nan), np.empty(3)
     rows, best_rows = np.empty(n, np.int64), np.empty(n, np.int64)
-    best_count, best_cost = np.int64(0), math.inf  # a plain 0 is of a type of its own at first
+    best_count, best_cost = np.int64(0), math.inf
     needed = float(max_draws)
     draws = 0
     state = seed
     while draws < needed:
         draws += 1
         state, i, j = draw_pair(state, n)
-        if not _two_point_motion(p_a, p_b, i, j, gate_m, min_baseline_m, T_a_b):
+        ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
+        bx, by = p_b[j, 0] - p_b[i, 0], p_b[j, 1] - p_b[i, 1]
+        difference = math.sqrt(ax * ax + ay * ay) - math.sqrt(bx * bx + by * by)
+        # the fit leaves half the difference at either end: beyond 2 gates there is no supporter
+        if abs(difference) > 2 * gate_m:
+            continue
+        if fit_two(p_a, p_b, i, j, T_a_b) < min_baseline_m:
             continue
         count, _ = list_supporters(T_a_b, p_a, p_b, gate_m, best_count, rows)
         if count < max(best_count, 2):

@@ -1,4 +1,4 @@
-"""RANSAC whose gate comes from the landmarks' covariances."""
+"""RANSAC with a gate from the landmarks' covariances."""
 
 import math
 from dataclasses import dataclass
@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.consensus import Consensus, drift_needed, in_rows, spread_of
-from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, settle
+from mapfusion.align.consensus import Consensus, drift_needed, packed_rows, pair_spread
+from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, refit_to_support
 from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.ransac import draw_pair
 from mapfusion.align.rigid_motion import fit_two
@@ -18,18 +18,18 @@ from mapfusion.parameters import Probability, Range
 
 @dataclass(frozen=True)
 class RansacMahalanobis(Consensus):
-    """Motion of random pairs of correspondences with the least truncated squared residuals.
+    """Motion of a random minimal set with the smallest sum of truncated squared residuals.
 
-    A pair supports a motion when e^T (S_a + R S_b R^T + s_drift^2 I)^-1 e is below a chi-square
-    quantile, so sharp landmarks are held to more than blurred ones. Motions are compared by how far
-    their supporters stay below it (MSAC: Torr and Zisserman 2000): a count alone would let many
-    loose supporters beat fewer exact ones.
+    A pair supports a motion if e^T (S_a + R S_b R^T + s_drift^2 I)^-1 e is below a chi-square
+    quantile, so that the gate is narrow for precise landmarks. Motions are compared by the
+    truncated cost (MSAC: Torr and Zisserman 2000), since a count would prefer many loose supporters
+    to fewer exact ones.
 
     Attributes:
-        min_baseline_m: minimal sets closer together are passed over: at 1 m an error of 0.1 m
-            turns the map by 6 degrees already.
-        confidence: that at least one set of two supporters of the answer was drawn.
-        max_draws: ends the search where there is next to no support.
+        min_baseline_m: smallest distance within a minimal set; at 1 m an error of 0.1 m turns the
+            map by 6 degrees.
+        confidence: probability that at least one set of two supporters of the result was drawn.
+        max_draws: largest number of minimal sets.
     """
 
     randomised: ClassVar[bool] = True
@@ -38,13 +38,13 @@ class RansacMahalanobis(Consensus):
     max_draws: Annotated[int, Range(1, 100_000_000, "draws")] = 100_000
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
-        """T_a_b of the best minimal set at the largest s_drift, settled on its support."""
+        """Estimate T_a_b with the largest s_drift, and refit to the support."""
         planar = pairs.in_plan()
         if RansacMahalanobis not in pairs.kept:
-            pairs.kept[RansacMahalanobis] = in_rows(planar)
+            pairs.kept[RansacMahalanobis] = packed_rows(planar)
         _, T_a_b = least_truncated_squares(
             planar,
-            spread_of(pairs).own_m2,
+            pair_spread(pairs).own_m2,
             pairs.kept[RansacMahalanobis],
             self.variances_m2[-1],
             self.bound,
@@ -54,7 +54,7 @@ class RansacMahalanobis(Consensus):
             self.max_draws,
             rng.integers(1, 2**64, dtype=np.uint64),
         )
-        return self.settled(T_a_b, pairs, planar)
+        return self.refitted(T_a_b, pairs, planar)
 
 
 @kernel
@@ -70,12 +70,22 @@ def least_truncated_squares(
     max_draws: int,
     seed: np.uint64,
 ) -> tuple[int, Float]:
-    """Draw minimal sets until two supporters of the best motion would have come up by now.
+    """Draw minimal sets until two supporters of the best motion were drawn with the confidence.
 
-    `own_m2` are the `mean_variances` without s_drift, `rows` the pairs as `in_rows` has them,
-    `bound` is the most for e^T C^-1 e of a supporter, `agreement` for the squared difference of a
-    set's two lengths over its variance, `log_miss` the logarithm of the chance accepted of never
-    drawing two supporters, `seed` not 0. Returns the number of draws and T_a_b (3,), NaN for none.
+    Args:
+        pairs: N correspondences.
+        own_m2: `mean_variances` without s_drift, shape (N,).
+        rows: the pairs as `packed_rows`.
+        variance_m2: s_drift^2.
+        bound: largest e^T C^-1 e of a supporter.
+        agreement: largest squared difference of the two lengths of a set over its variance.
+        min_baseline_m: smallest distance within a minimal set.
+        log_miss: logarithm of the accepted probability of drawing no two supporters.
+        max_draws: largest number of draws.
+        seed: state of the generator, not 0.
+
+    Returns:
+        Number of draws and T_a_b (3,), NaN without a motion.
     """
     p_a, p_b = pairs.p_a, pairs.p_b
     n = len(p_a)
@@ -93,7 +103,7 @@ def least_truncated_squares(
         if count < 2 or score <= best_raw:
             continue
         best_raw = score
-        count = settle(T_a_b, pairs, own_m2, variance_m2, bound, inside)
+        count = refit_to_support(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         count, score = mark_supporters(T_a_b, pairs, own_m2, variance_m2, bound, inside)
         if count >= 2 and score > best_score:
             for k in range(3):

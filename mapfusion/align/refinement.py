@@ -9,52 +9,51 @@ import numpy as np
 
 from mapfusion.align.alignment import MIN_PAIRS, Alignment, Pairs, Status, undetermined
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.drift import calibration_part, drift_step
+from mapfusion.align.drift import calibration_covariance, drift_step
 from mapfusion.align.mahalanobis_gate import (
     PlanarPairs,
-    is_unlike_the_others,
-    most_leverage,
-    why_one_pair,
+    highest_leverage_pair,
+    is_outlier_to_others,
+    why_rests_on_one_pair,
 )
-from mapfusion.align.method import why_one_place
+from mapfusion.align.method import why_angle_is_open
 from mapfusion.geometry.numerics import Float, invert, kernel
 from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points, wrap
 from mapfusion.parameters import Range, require_in_range, require_shape
 
-# A gate of three standard deviations keeps 99 % of a plane's residuals; a larger s_drift could not
-# be told from false pairs spread over the gate.
+# A gate of three standard deviations contains 99 % of planar residuals. A larger s_drift could not
+# be distinguished from false pairs that are uniform over the gate.
 _GATE_SIGMAS = 3.0
-_TOLERANCE_M = 1e-8  # movement of the landmarks that counts as none
-# A pair on the gate's edge could go in and out for ever, and s_drift swing to and fro between two
-# values; from this round on the pair stays where it is, and steps of s_drift are halved.
+_TOLERANCE_M = 1e-8  # movement of the landmarks at convergence
+# Round from which on the pairs inside the gate are fixed and oscillating steps of s_drift are
+# halved, so that neither a pair on the gate's edge nor s_drift oscillates forever.
 _SETTLING_ROUNDS = 50
-_SWINGING = 0.9  # of the last change of s_drift^2, turned back: it hardly settles by itself
-# False pairs in the gate counted before any is seen: a share of exactly 1 could never be revised,
-# and is approached without end.
+_SWINGING = 0.9  # reversed share of the last change of s_drift^2 that counts as an oscillation
+# Prior number of false pairs in the gate: a share of true pairs of exactly 1 could not decrease.
 _PRIOR_FALSE = 1.0
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """Weighted least squares within a fixed gate, repeated to a fixed point.
+    """Weighted least squares within a fixed gate, iterated to convergence.
 
-    The pairs inside the gate are a mixture: true ones with covariance S_a + R S_b R^T +
-    s_drift^2 I, and false ones spread evenly over the gate. Each round weighs the pairs by their
-    probability of being true, then takes a step for the motion (Gauss-Newton on the weighted normal
-    equations), for s_drift (Fisher scoring) and for the share of true ones (expectation
-    maximisation, Dempster et al. 1977); steps of s_drift that swing to and fro are halved.
+    The pairs inside the gate are a mixture of true pairs with covariance S_a + R S_b R^T +
+    s_drift^2 I and false pairs that are uniform over the gate. Expectation maximisation (Dempster
+    et al. 1977): each round weights the pairs by their probability of being true, and takes a
+    Gauss-Newton step of the motion and a Fisher scoring step of s_drift. Oscillating steps of
+    s_drift are halved.
 
-    An answer that rests on one pair is refused: without the pair of most leverage the motion has to
+    A result that rests on one pair is refused: without the pair of highest leverage the motion must
     stay within the gate.
 
     Attributes:
-        gate_m: distance in the plane under the estimate up to which a pair takes part. Between two
-            maps drift displaces true pairs by 0.1 to 0.3 m, and the estimate adds its own error.
-        least_drift_m: pairs are judged true or false with an s_drift of at least this. Drift is
-            common to neighbours: a part of a map that moved as one, by the 0.1 m that are usual,
-            would else pass for false pairs, and the answer depend on where the search began.
-        max_rounds: an estimate that still moves then is refused.
-        height: which pairs can be true by their heights (not for planar maps).
+        gate_m: largest distance in the plane of a pair under the estimate. Drift displaces true
+            pairs of two maps by 0.1 to 0.3 m, and the estimate has an error as well.
+        least_drift_m: smallest s_drift for the probability that a pair is true. Drift is common to
+            neighbours; without this bound a part of a map that is displaced by 0.1 m would count as
+            false, and the result would depend on the initial estimate.
+        max_rounds: largest number of rounds; an estimate that has not converged is refused.
+        height: test of compatible heights (not for planar maps).
     """
 
     gate_m: Annotated[float, Range(1e-3, 1000, "m")] = 0.5
@@ -66,7 +65,7 @@ class Refinement:
         require_in_range(self)
 
     def refine(self, pairs: Pairs, T_a_b: Float) -> Alignment:
-        """Improve T_a_b (3,); an estimate of NaN stays degenerate.
+        """Refine T_a_b (3,); the result for NaN is degenerate.
 
         Raises:
             ValueError: T_a_b has another shape.
@@ -76,9 +75,18 @@ class Refinement:
         require_shape("T_a_b", T_a_b, (3,))
         if not np.all(np.isfinite(T_a_b)):
             return undetermined("there is no estimate to refine", len(pairs), started_s)
+        gate_m = self.gate_m
+        if pairs.by_name and len(pairs):
+            # Labels are rarely false, and a gate that excludes the bent part of a map would align
+            # the other part only. s_drift starts at a third of the gate, three times the RMS
+            # residual; no residual of n exceeds sqrt(n) times the RMS, so that up to 81 labels all
+            # take part.
+            off = pairs.p_a[:, :2] - transform_points(T_a_b, pairs.p_b[:, :2])
+            rms_m = math.sqrt(np.mean(np.sum(off**2, axis=1)))
+            gate_m = max(self.gate_m, _GATE_SIGMAS**2 * rms_m)
         rows = pairs.of_one_height(self.height)
         planar = pairs[rows].in_plan()
-        limits = (self._widest_m(pairs, T_a_b), self.least_drift_m, self.max_rounds)
+        limits = (gate_m, self.least_drift_m, self.max_rounds)
         solved, moved_m, T_a_b, covariance, variance, truth, left_out = maximise_likelihood(
             planar, T_a_b, *limits
         )
@@ -87,7 +95,7 @@ class Refinement:
             return undetermined(reason, len(pairs), started_s)
         inlier = np.zeros(len(pairs), dtype=bool)
         inlier[rows] = truth > 0.5
-        reason = why_one_place(pairs[inlier], variance) if np.any(inlier) else ""
+        reason = why_angle_is_open(pairs[inlier], variance) if np.any(inlier) else ""
         if reason:
             return undetermined(reason, len(pairs), started_s)
         if moved_m > _TOLERANCE_M:
@@ -97,14 +105,16 @@ class Refinement:
         else:
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
             solved, _, T_without, sure, drift_m2, *_ = maximise_likelihood(others, T_a_b, *limits)
-            may_move_m = limits[0]
-            # a known identity that the motion rests on is false only if it is unlike all others
+            may_move_m = gate_m
+            # a labelled pair of high leverage is false only if it is an outlier to the others
             if pairs.by_name and solved:
                 rest = (T_without, sure, drift_m2)
-                if is_unlike_the_others(*rest, planar, left_out):
+                if is_outlier_to_others(*rest, planar, left_out):
                     may_move_m = self.gate_m
-            reason = why_one_pair(T_a_b, T_without if solved else None, planar, truth, may_move_m)
-        covariance = covariance + calibration_part(T_a_b, pairs[inlier], math.sqrt(variance))
+            reason = why_rests_on_one_pair(
+                T_a_b, T_without if solved else None, planar, truth, may_move_m
+            )
+        covariance = covariance + calibration_covariance(T_a_b, pairs[inlier], math.sqrt(variance))
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
             T_a_b,
@@ -116,30 +126,17 @@ class Refinement:
             math.sqrt(variance),
         )
 
-    def _widest_m(self, pairs: Pairs, T_a_b: Float) -> float:
-        """The gate, for landmarks known by name so wide that it leaves out none that maps bend.
-
-        None of them is false but by a name that was misread, and that lies farther off; a gate that
-        cuts what is bent lays one part of such maps onto its like, and nothing else.
-        """
-        if not pairs.by_name or not len(pairs):
-            return self.gate_m
-        off = pairs.p_a[:, :2] - transform_points(T_a_b, pairs.p_b[:, :2])
-        # s_drift starts at a third of the gate, three times the RMS, and none of up to 81 names is
-        # left out there: no residual of n is more than sqrt(n) times their RMS
-        return max(self.gate_m, _GATE_SIGMAS**2 * math.sqrt(np.mean(np.sum(off**2, axis=1))))
-
 
 @kernel
 def maximise_likelihood(
     pairs: PlanarPairs, T_start: Float, gate_m: float, least_drift_m: float, max_rounds: int
 ) -> tuple[bool, float, Float, np.ndarray, float, Float, int]:
-    """Expectation maximisation for motion, s_drift and share of true pairs.
+    """Estimate the motion, s_drift and the share of true pairs by expectation maximisation.
 
     Returns:
-        Whether the pairs determine a motion and its covariance, how far the last step moved a
-        landmark (m), T_a_b (3,), its covariance (3, 3), s_drift^2, each pair's probability of being
-        true (N,), and which one has most leverage.
+        True if the pairs determine a motion and its covariance; the largest movement of a landmark
+        in the last step (m); T_a_b (3,); its covariance (3, 3); s_drift^2; the probability of each
+        pair to be true (N,); and the row of the pair of highest leverage.
     """
     p_a, p_b, S_a, S_b = pairs
     n = len(p_a)
@@ -206,7 +203,7 @@ def maximise_likelihood(
             break
         share = total / (count + _PRIOR_FALSE)
         change = min(drift_step(e, S, truth, variance, gate_m), widest) - variance
-        # few pairs far surer than the rest can throw it from one side to the other
+        # a few pairs that are far more precise than the others can cause oscillation
         turned_back = change * last_change < 0 and abs(change) > _SWINGING * abs(last_change)
         if turned_back and rounds >= _SETTLING_ROUNDS:
             step_share /= 2
@@ -214,7 +211,7 @@ def maximise_likelihood(
         last_change = change
         for k in range(3):
             step[k] = covariance[k, 0] * rx + covariance[k, 1] * ry + covariance[k, 2] * rt
-        # how far the step moves the landmark that it moves farthest
+        # largest movement of a landmark
         farthest2 = 0.0
         for i in range(n):
             if truth[i] > 0:
@@ -227,9 +224,9 @@ def maximise_likelihood(
         if moved <= _TOLERANCE_M:
             break
     if determined:
-        # Take from the information what not knowing which pairs are true takes (Louis 1982). When
-        # the motion moves, so do the probabilities: d truth / de = -truth (1 - truth) C^-1 e, and a
-        # normal matrix with certain weights would promise too much.
+        # Subtract the missing information about which pairs are true (Louis 1982). The
+        # probabilities depend on the motion, d truth / de = -truth (1 - truth) C^-1 e; the normal
+        # matrix with constant weights would underestimate the covariance.
         missing, pull, turn = np.zeros((3, 3)), np.empty(3), np.empty(3)
         for i in range(n):
             unsure = truth[i] * (1 - truth[i])
@@ -251,5 +248,5 @@ def maximise_likelihood(
             for column in range(3):
                 normal[row, column] -= missing[row, column]
         determined = invert(normal, covariance)
-    most = most_leverage(T_a_b, pairs, variance, truth, covariance)
+    most = highest_leverage_pair(T_a_b, pairs, variance, truth, covariance)
     return determined, moved, T_a_b, covariance, variance, truth, most

@@ -7,17 +7,17 @@ import numpy as np
 from mapfusion.geometry.numerics import Float, kernel, source_of
 from mapfusion.geometry.se2 import add_turned, lever, residual, rotation
 
-_ALL = slice(None)  # as the number of a pair: of all of them at once, in NumPy
+_ALL = slice(None)  # index of all pairs, for kernels that run as NumPy functions
 
 
 @kernel
 def _fit_rows(
     p_a: Float, p_b: Float, rows: np.ndarray, weight: Float
 ) -> tuple[float, float, float]:
-    """tx, ty, theta that minimise the sum of weight times |p_a - T p_b|^2 in the plane.
+    """Return tx, ty, theta that minimise the sum of weight times |p_a - T p_b|^2 in the plane.
 
-    The closed form for the plane (Arun et al. 1987): theta from the summed dot and cross products
-    about the centroids. Rows (n,) are the pairs to use, each with its weight (n,).
+    Closed form for the plane (Arun et al. 1987): theta follows from the sums of dot and cross
+    products about the centroids. `rows` (n,) are the pairs, `weight` (n,) their weights.
     """
     total = ax = ay = bx = by = 0.0
     for k in range(len(rows)):
@@ -41,22 +41,22 @@ def _fit_rows(
 
 @kernel
 def fit_rigid(p_a: Float, p_b: Float, rows: np.ndarray) -> tuple[float, float, float]:
-    """tx, ty, theta that minimise the summed squared distance in the plane of p_a to T p_b.
+    """Return tx, ty, theta that minimise the sum of |p_a - T p_b|^2 in the plane.
 
-    Points are (N, 2 or more), rows (n,) the pairs to use.
+    Points have the shape (N, 2 or more); `rows` (n,) are the pairs to use.
     """
     return _fit_rows(p_a, p_b, rows, np.ones(len(rows)))
 
 
 @kernel
 def fit_weighted(p_a: Float, p_b: Float, weight: Float, T_a_b: Float) -> None:
-    """Fill T_a_b (3,) that minimises the sum of weight (N,) times |p_a - T p_b|^2."""
+    """Write T_a_b (3,) that minimises the sum of weight (N,) times |p_a - T p_b|^2."""
     T_a_b[0], T_a_b[1], T_a_b[2] = _fit_rows(p_a, p_b, np.arange(len(weight)), weight)
 
 
 @kernel
 def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
-    """Fill T_a_b (3,) with the motion of pairs i and j; returns the shorter of their distances."""
+    """Write T_a_b (3,) of pairs i and j; return the shorter distance of their points."""
     ax, ay = p_a[j, 0] - p_a[i, 0], p_a[j, 1] - p_a[i, 1]
     bx, by = p_b[j, 0] - p_b[i, 0], p_b[j, 1] - p_b[i, 1]
     theta = math.atan2(ay * bx - ax * by, ax * bx + ay * by)
@@ -69,13 +69,13 @@ def fit_two(p_a: Float, p_b: Float, i: int, j: int, T_a_b: Float) -> float:
 
 
 def residuals(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
-    """p_a - T_a_b p_b in the plane (N, 2)."""
+    """Return p_a - T_a_b p_b in the plane, shape (N, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     return np.stack(source_of(residual)(T_a_b, cos, sin, p_a, p_b, _ALL), axis=1)
 
 
 def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float) -> Float:
-    """S_a + R S_b R^T in the plane (N, 2, 2): what the landmarks' own noise makes of a residual."""
+    """Return the covariances of residuals from the landmarks, S_a + R S_b R^T, shape (N, 2, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     a, b = (S.T[[0, 0, 1], [0, 1, 1]] for S in (covariance_a, covariance_b))
     xx, xy, yy = source_of(add_turned)(*a, cos, sin, *b)
@@ -86,32 +86,28 @@ def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float)
 
 
 def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) -> Float:
-    """How much each residual moves the motion that minimises sum of weight |p_a - T p_b|^2.
+    """Return the derivatives of the least-squares motion by each residual, shape (N, 3, 2).
 
-    To first order T_a_b's error is the sum of the gains (N, 3, 2) times the residuals.
-    p_b are (N, 2 or more), not all in one place; weights (N,) are all equal by default.
+    To first order the error of T_a_b is the sum of the gains times the residuals. Points p_b
+    (N, 2 or more) must not coincide; `weight` (N,) is equal by default.
     """
     given = np.ones(len(p_b)) if weight is None else weight
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     of_turn = np.stack(source_of(lever)(cos, sin, p_b, _ALL), axis=1)
-    inverse = np.linalg.inv(_normal_matrix(of_turn, given))
+    # normal matrix: sum of weight J'J with J = `motion_jacobian`, summed in the order of kernels
+    x, y = of_turn.T
+    terms = np.stack([given, given * x, given * y, given * (x * x + y * y)])
+    total, x, y, square = np.cumsum(terms, axis=1)[:, -1]
+    inverse = np.linalg.inv(np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]]))
     gain = inverse[:, :2] + inverse[:, 2, None] * of_turn[:, None]
     return given[:, None, None] * gain
 
 
-def _normal_matrix(lever: Float, weight: Float) -> Float:
-    """Sum of weight J'J (3, 3), J the `motion_jacobian` of points with levers (N, 2)."""
-    x, y = lever.T
-    terms = np.stack([weight, weight * x, weight * y, weight * (x * x + y * y)])
-    total, x, y, square = np.cumsum(terms, axis=1)[:, -1]  # in their order, as kernels add
-    return np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]])
-
-
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
-    """Covariance (3, 3) of a motion from its gains (N, 3, 2) and independent residuals' (N, 2, 2).
+    """Return the covariance (3, 3) of a motion from gains (N, 3, 2) and covariances (N, 2, 2).
 
-    Weights that are not the inverse covariances make it larger than the inverse of the normal
-    matrix: this is the sandwich of the two.
+    Residuals are independent. The sandwich form is valid for weights that are not inverse
+    covariances.
     """
     if not len(gain):
         return np.zeros((3, 3))
@@ -124,7 +120,7 @@ def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
 
 
 def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:
-    """d(T_a_b p_b) / d(tx, ty, theta) in the plane (N, 2, 3)."""
+    """Return d(T_a_b p_b) / d(tx, ty, theta) in the plane, shape (N, 2, 3)."""
     turned = p_b[:, :2] @ rotation(T_a_b[2]).T
     jacobian = np.zeros((len(p_b), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0

@@ -16,15 +16,15 @@ Translation = Literal["printed", "solved"]
 
 @dataclass(frozen=True)
 class Svd:
-    """Algorithm 1: the unconstrained T that minimises |T m' - m| over all pairs, by pseudo-inverse.
+    """Algorithm 1: affine least squares |T m' - m| over all pairs, by pseudo-inverse.
 
-    m and m' are homogeneous points of the plane, one pair a row. T's block for the rotation is any
-    2x2 matrix: theta is that of the nearest rotation. False pairs pull at full strength, and noise
-    in m' shrinks the block and with it the printed translation.
+    m and m' are homogeneous points of the plane, one pair per row. The linear part of T is any 2x2
+    matrix; theta is the angle of the nearest rotation. False pairs have full weight. Noise in m'
+    shrinks the linear part and biases the printed translation.
 
     Attributes:
-        translation: "printed" takes T's last column as it is, "solved" brings the centroids
-            together under theta.
+        translation: "printed" is the last column of T, as in the paper; "solved" aligns the
+            centroids under theta.
     """
 
     randomised: ClassVar[bool] = False
@@ -37,19 +37,19 @@ class Svd:
             raise ValueError(f"translation: is {self.translation!r}, expected one of {known}")
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit:
-        """T_a_b of all pairs; nothing is drawn from `rng`."""
+        """Fit T_a_b to all pairs; `rng` is not used."""
         del rng
         T_a_b, gain = solve(pairs.p_a[:, :2], pairs.p_b[:, :2], self.translation)
         return Fit(T_a_b, np.ones(len(pairs), dtype=bool), gain=gain)
 
 
 def solve(m: Float, m_prime: Float, translation: Translation) -> tuple[Float, Float]:
-    """Algorithm 1 for points (N, 2) of frame a and b.
+    """Solve algorithm 1 for points (N, 2) of frames a and b.
 
-    The listing's z = u' m, w = z / sv, T = (v w)' is the pseudo-inverse of m' times m.
+    The steps z = u' m, w = z / sv, T = (v w)' of the paper are the pseudo-inverse of m' times m.
 
     Returns:
-        tx, ty, theta (3,), and to first order how much each residual moves them (N, 3, 2).
+        tx, ty, theta, shape (3,), and their derivatives by each residual, shape (N, 3, 2).
     """
     inverse = np.linalg.pinv(np.hstack([m_prime, np.ones((len(m), 1))]))
     T = (inverse @ m).T

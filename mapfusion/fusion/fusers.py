@@ -8,7 +8,7 @@ import importlib
 from importlib.metadata import entry_points
 from typing import Protocol
 
-from mapfusion.errors import did_you_mean
+from mapfusion.errors import did_you_mean, moved_module_note
 from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
 
 
@@ -68,7 +68,8 @@ def make_fuser(name: str = USUAL) -> Fuser:
     try:
         made = getattr(importlib.import_module(module), attribute)()
     except Exception as error:
-        raise ValueError(f"fuser {name}: {target} cannot be made: {error}") from error
+        told = f"{error}{moved_module_note(error)}"
+        raise ValueError(f"fuser {name}: {target} cannot be made: {told}") from error
     for wanted in ("fuse", "smoothed"):
         if not hasattr(made, wanted):
             raise ValueError(f"fuser {name}: {target} has no {wanted}")

@@ -1,18 +1,15 @@
-"""Number of false alarms (NFA): would chance give an alignment as much support?
+"""A-contrario test of an alignment: expected number of false alarms (NFA).
 
-Pairs are independent of each other and ordered by how well they match, best first.
-
-No correspondence can be false then. What chance could do is lay k of n named landmarks on their
-namesakes by geometry alone: under a motion that is wrong, as of a map that is distorted, each of
-them lies anywhere on the ground that the landmarks span, and so within r of its namesake with the
-probability p = pi r^2 / A. A motion that two of them determine finds k - 2 supporters among the
-others with the binomial's tail B(k - 2; n - 2, p); it is one motion however many pairs of its
-supporters determine it, so that of all n (n - 1) / 2 pairs
+Desolneux, Moisan and Morel (2000); Moisan and Stival (2004). The test of unlabelled landmarks is
+described in `Acceptance`. Of labelled landmarks no correspondence is false; chance can only bring k
+of n namesakes together under a wrong motion, as of a distorted map. Each landmark then lies
+anywhere on the area A of the landmarks, and within r of its namesake with p = pi r^2 / A. A motion
+of two of them finds k - 2 supporters among the others with the binomial tail B(k - 2; n - 2, p).
+The same motion follows from each pair of its supporters, so that of n (n - 1) / 2 pairs
 
     NFA = gates * n (n - 1) / (k (k - 1)) * B(k - 2; n - 2, p).
 
-Three of three that agree to a decimetre on 100 m^2 are evidence. So are nine of nine that agree to
-0.7 m, as in maps whose paths bend: a gate twice the widest for unnamed landmarks is tried as well.
+An additional gate of twice the widest one admits maps with bent paths.
 """
 
 import math
@@ -23,28 +20,29 @@ import numpy as np
 
 from mapfusion.align.alignment import MIN_PAIRS, Alignment, Pairs, Status
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.nearest_neighbours import Grid, runs_about
+from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import moved_point
 from mapfusion.parameters import Range, require_in_range
 
-# Best supporters among whose pairs the motion to be judged is sought: of that many one is near it.
+# Number of best supporters whose pairs are candidates for the motion that is tested. One of these
+# motions is close to the alignment.
 _CANDIDATES = 20
-# Halving ends above this: p is not known from fewer pairs, and 8 of them could hardly be accepted.
+# Smallest selection of pairs: p is not estimated from fewer, and 8 pairs are hardly ever accepted.
 _SMALLEST_SELECTION = 16
-_ROUNDING = 1e-12  # share of a squared distance that rounding may make it larger
+_ROUNDING = 1e-12  # relative rounding error of a squared distance
 
 
 class IndependentPairs(NamedTuple):
-    """Pairs that are independent of each other, best match first, for the kernels.
+    """Independent pairs, best match first, as arrays for kernels.
 
     Attributes:
-        p_a, p_b: (N, 2) positions in metres, each in its own frame.
-        heights: (N, 4) z of a and of b, and the most that the squared difference of two heights may
-            be, as the sum of a part of a's and one of b's.
-        possible: (N,) `possible_repairings`.
-        near_a: the grid over p_a.
+        p_a, p_b: positions in metres, each in its own frame, shape (N, 2).
+        heights: z of a, z of b, and the contributions of a and of b to the largest squared
+            difference of heights, shape (N, 4).
+        possible: `possible_repairings`, shape (N,).
+        near_a: grid over p_a.
     """
 
     p_a: Float
@@ -55,51 +53,41 @@ class IndependentPairs(NamedTuple):
 
 
 def independent_pairs(p_a: Float, p_b: Float, heights: Float) -> IndependentPairs:
-    """Of positions (N, 2) and heights (N, 4), with all that no motion changes."""
+    """Return the pairs of positions (N, 2) and heights (N, 4), with their counts and grid."""
     return IndependentPairs(p_a, p_b, heights, possible_repairings(heights), Grid.of(p_a))
 
 
-def thin(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
-    """Rows (n,) of the pairs (N, 2 or 3), in order, that are no neighbours of a kept one.
-
-    Neighbours are less than patch_m apart in both maps.
-    """
-    return np.flatnonzero(_mark_thinned(p_a, p_b, patch_m, Grid.of(p_a)))
-
-
 @kernel
-def _mark_thinned(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.ndarray:
+def _mark_independent(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.ndarray:
+    """Mark the pairs (N,) of `independent_rows`; `near_a` is the grid over p_a."""
     kept = np.zeros(len(p_a), np.bool_)
-    runs = np.empty((near_a.shape[1], 2), np.int64)
+    ranges = np.empty((near_a.shape[1], 2), np.int64)
     for i in range(len(p_a)):
-        n_runs = runs_about(p_a[i, 0], p_a[i, 1], patch_m, near_a, runs)
-        kept[i] = not _has_neighbour(i, p_a, p_b, patch_m, near_a.row, runs[:n_runs], kept)
+        is_neighbour = False
+        for r in range(ranges_within(p_a[i, 0], p_a[i, 1], patch_m, near_a, ranges)):
+            for k in range(ranges[r, 0], ranges[r, 1]):
+                j = near_a.row[k]
+                if kept[j] and is_closer(p_a, i, j, patch_m) and is_closer(p_b, i, j, patch_m):
+                    is_neighbour = True
+                    break
+            if is_neighbour:
+                break
+        kept[i] = not is_neighbour
     return kept
 
 
-@kernel
-def _has_neighbour(
-    i: int,
-    p_a: Float,
-    p_b: Float,
-    patch_m: float,
-    row_of: np.ndarray,
-    runs: np.ndarray,
-    kept: np.ndarray,
-) -> bool:
-    """Whether a kept pair in some ranges (R, 2) of the grid is a neighbour of pair i."""
-    for run in range(len(runs)):
-        for k in range(runs[run, 0], runs[run, 1]):
-            j = row_of[k]
-            if kept[j] and apart_by_less(p_a, i, j, patch_m) and apart_by_less(p_b, i, j, patch_m):
-                return True
-    return False
+def independent_rows(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
+    """Return the rows (n,) of the pairs (N, 2 or 3) without neighbours among earlier kept pairs.
+
+    Neighbours are closer than patch_m in both maps.
+    """
+    return np.flatnonzero(_mark_independent(p_a, p_b, patch_m, Grid.of(p_a)))
 
 
 @kernel
-def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
-    """Whether points i and j of (N, D) are less than a distance apart."""
-    if abs(p[i, 0] - p[j, 0]) >= distance_m:  # most are already told apart by this
+def is_closer(p: Float, i: int, j: int, distance_m: float) -> bool:
+    """Return True if points i and j of (N, D) are closer than a distance."""
+    if abs(p[i, 0] - p[j, 0]) >= distance_m:  # excludes most points early
         return False
     square = 0.0
     for axis in range(p.shape[1]):
@@ -109,10 +97,10 @@ def apart_by_less(p: Float, i: int, j: int, distance_m: float) -> bool:
 
 @kernel
 def log10_tail(k: int, n: int, p: float) -> float:
-    """log10 of the probability of k or more successes in n trials; 0 up to the mean.
+    """Return log10 of the probability of k or more successes in n trials; 0 up to the mean.
 
-    The first term in logarithms and the others relative to it: tails far below the smallest
-    number a float can hold.
+    The first term is computed as a logarithm and the others relative to it, so that tails far below
+    the smallest float are represented.
     """
     if k <= n * p:
         return 0.0
@@ -131,7 +119,7 @@ def log10_tail(k: int, n: int, p: float) -> float:
 
 @kernel
 def moved_points(T_a_b: Float, p_b: Float) -> Float:
-    """T p_b (n, 2)."""
+    """Return T p_b, shape (n, 2)."""
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     moved = np.empty((len(p_b), 2))
     for i in range(len(p_b)):
@@ -141,7 +129,7 @@ def moved_points(T_a_b: Float, p_b: Float) -> Float:
 
 @kernel
 def residuals_m(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
-    """Distances (n,) in the plane between p_a and T p_b."""
+    """Return the distances in the plane between p_a and T p_b, shape (n,)."""
     moved = moved_points(T_a_b, p_b)
     distance = np.empty(len(p_a))
     for i in range(len(p_a)):
@@ -151,9 +139,10 @@ def residuals_m(T_a_b: Float, p_a: Float, p_b: Float) -> Float:
 
 @kernel
 def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float) -> Float:
-    """The motion (3,) of two pairs nearest to T_a_b: least displacement of the supporters (RMS).
+    """Return the motion (3,) of two supporters that is nearest to T_a_b.
 
-    Supporters (k,) are rows of the pairs (n, 2), those that T_a_b fits best first.
+    The distance is the RMS displacement of the supporters. Supporters (k,) are rows of the pairs
+    (n, 2), ordered by their residual under T_a_b.
     """
     k = len(supporters)
     mean_x = mean_y = square = 0.0
@@ -183,16 +172,16 @@ def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float)
 
 @kernel
 def same_height(heights: Float, i: int, j: int) -> bool:
-    """Whether landmark a of pair i and landmark b of pair j can have one height."""
+    """Return True if landmark a of pair i and landmark b of pair j may have the same height."""
     dz = heights[i, 0] - heights[j, 1]
     return dz * dz <= heights[i, 2] + heights[j, 3]
 
 
 @kernel
 def possible_repairings(heights: Float) -> np.ndarray:
-    """How many (i, j), i not j, can have one height, both among the first m + 1 pairs: (N,)."""
+    """Count the (i, j), i != j, of compatible height among the first m + 1 pairs, shape (N,)."""
     counts = np.zeros(len(heights), np.int64)
-    # a column as one piece, so that the compiler compares several at once
+    # contiguous columns, so that the loop is vectorised
     z_a, z_b = heights[:, 0].copy(), heights[:, 1].copy()
     most_a, most_b = heights[:, 2].copy(), heights[:, 3].copy()
     total = 0
@@ -209,9 +198,9 @@ def possible_repairings(heights: Float) -> np.ndarray:
 def agreeing_repairings(
     T_a_b: Float, pairs: IndependentPairs, gates_m: Float, first: int
 ) -> np.ndarray:
-    """How many (i, j), i not j, of one height agree under T_a_b within each gate.
+    """Count the (i, j), i != j, of compatible height that agree under T_a_b within each gate.
 
-    Counts (2, G), for ascending gates: among the `first` pairs only, among all.
+    Gates ascend. Returns counts, shape (2, G): among the `first` pairs, and among all pairs.
     """
     _, p_b, heights, _, near_a = pairs
     moved = moved_points(T_a_b, p_b)
@@ -221,10 +210,10 @@ def agreeing_repairings(
     beyond = widest * widest * (1 + _ROUNDING)
     for j in range(len(p_b)):
         x, y = moved[j, 0], moved[j, 1]
-        for run in range(runs_about(x, y, widest, near_a, runs)):
+        for run in range(ranges_within(x, y, widest, near_a, runs)):
             for k in range(runs[run, 0], runs[run, 1]):
                 dx, dy = near_a.p[k, 0] - x, near_a.p[k, 1] - y
-                if dx * dx + dy * dy > beyond:  # without the root, most are told already
+                if dx * dx + dy * dy > beyond:  # excludes most points without a square root
                     continue
                 i, distance = near_a.row[k], math.hypot(dx, dy)
                 if distance > widest or i == j or not same_height(heights, i, j):
@@ -239,10 +228,10 @@ def agreeing_repairings(
 
 @kernel
 def chance_of_agreeing(agreeing: np.ndarray, g: int, possible: int, of_all: int) -> float:
-    """The larger p of the selection's and all pairs', from counts (2, G) at gate g and of possible.
+    """Return the larger estimate of p, from the selection and from all pairs, at gate g.
 
-    One more than was counted, as in a test by permutations: that none of a few re-pairings agrees
-    does not make p zero.
+    As in a permutation test, one is added to both counts, so that p is not 0 if no re-pairing
+    agrees. `agreeing` (2, G) counts re-pairings that agree; `possible` and `of_all` count all.
     """
     return max((agreeing[0, g] + 1) / (possible + 1), (agreeing[1, g] + 1) / (of_all + 1))
 
@@ -251,10 +240,10 @@ def chance_of_agreeing(agreeing: np.ndarray, g: int, possible: int, of_all: int)
 def fewest_false_alarms(
     pairs: IndependentPairs, T_a_b: Float, gates_m: Float
 ) -> tuple[float, float, int, int]:
-    """The smallest NFA over gates and selections of the best-matching pairs.
+    """Return the smallest NFA over gates and selections of the best-matching pairs.
 
-    Gates (G,) are ascending. Returns log10 of the NFA, and the gate, number of pairs and of
-    supporters it came from.
+    Gates (G,) ascend. Returns log10 of the NFA, the gate, the number of pairs and the number of
+    supporters.
     """
     p_a, p_b, _, possible, _ = pairs
     total = len(p_a)
@@ -265,9 +254,9 @@ def fewest_false_alarms(
     best, best_gate, best_n, best_k = math.inf, 0.0, total, 0
     for s in range(selections):
         n = total >> s
-        # Rows (k,) among the first n whose distance (N,) is within the gate.
-        # The nearest, as many as `minimal_motion` seeks among, come first, by ascending distance;
-        # they are kept by insertion, since Numba takes seconds to compile its sorts.
+        # rows among the first n within the widest gate; the nearest ones, the candidates of
+        # `minimal_motion`, come first in ascending distance (insertion, since Numba takes seconds
+        # to compile a sort)
         gate_m = gates_m[-1]
         rows = np.empty(n, np.int64)
         k = 0
@@ -306,24 +295,25 @@ def fewest_false_alarms(
     return best, best_gate, best_n, best_k
 
 
-# Times the widest gate: the next of gates that double. Either map may be bent by what the widest
-# allows for both; and what a gate more costs is counted, as chance has one more to try.
+# Ratio of the additional gate of labelled landmarks to the widest gate: each of the two maps may be
+# bent by the width of this gate. The additional gate is counted in the NFA.
 _BENT = 2.0
 
 
 def named_false_alarms(
     p_a: Float, p_b: Float, T_a_b: Float, gates_m: Float
 ) -> tuple[float, float, int, int]:
-    """log10 of the smallest NFA over the gates, and the gate, number and supporters behind it.
+    """Return the smallest NFA of labelled landmarks over the gates.
 
     Args:
-        p_a: (N, 2) positions in metres, in frame a.
-        p_b: (N, 2) of their namesakes, in frame b.
-        T_a_b: (3,).
-        gates_m: (G,) ascending.
+        p_a: positions in metres in frame a, shape (N, 2).
+        p_b: positions of their namesakes in frame b, shape (N, 2).
+        T_a_b: motion, shape (3,).
+        gates_m: ascending gates, shape (G,).
 
     Returns:
-        Infinite, the widest gate, N and the supporters within it where these are too few.
+        log10 of the NFA, the gate, N and the number of supporters; infinite with the widest gate if
+        there are too few supporters.
     """
     gates_m = np.append(gates_m, _BENT * gates_m[-1])
     n, distance = len(p_a), residuals_m(T_a_b, p_a, p_b)
@@ -341,23 +331,23 @@ def named_false_alarms(
     return best
 
 
-_MAX_GATES = 20  # each is another pass over all pairs
+_MAX_GATES = 20  # each gate is a pass over all pairs
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether an alignment may be used.
+    """Decision on the use of an alignment.
 
     Attributes:
-        status: accepted, or why not; that of the alignment where it failed before.
-        log10_false_alarms: decimal logarithm of how many alignments at least this well supported
-            chance is expected to give for these two maps; NaN where there was none to judge.
-        reason: what a person can act on, or has to know of an accepted one; else empty.
-        log10_evidence: decimal logarithm of how much likelier what both robots saw is if it is
-            right; NaN where none was sought.
-        n_confirmed: regions that both must have seen, and have.
-        n_contradicted: regions that one of them lacks.
-        probability: that it is right; NaN where no evidence was sought.
+        status: accepted, or the kind of refusal; the status of the alignment if it failed before.
+        log10_false_alarms: log10 of the NFA, the expected number of chance alignments of these maps
+            with at least this support; NaN without an alignment.
+        reason: reason of a refusal, or a remark on an accepted alignment; else empty.
+        log10_evidence: log10 likelihood ratio of the regions that both robots must have seen; NaN
+            without evidence.
+        n_confirmed: number of these regions that are in both maps.
+        n_contradicted: number of these regions that are missing from one map.
+        probability: probability that the alignment is right; NaN without evidence.
     """
 
     status: Status
@@ -370,11 +360,11 @@ class Verdict:
 
     @property
     def accepted(self) -> bool:
-        """By the estimator and by all tests."""
+        """True if the estimator and all tests accept the alignment."""
         return self.status is Status.ACCEPTED
 
     def applied_to(self, alignment: Alignment) -> Alignment:
-        """The alignment with the status of the verdict; a failed one stays what it is."""
+        """Return the alignment with the status of the verdict; a failed one is unchanged."""
         if self.accepted or not alignment.ok:
             return alignment
         return replace(alignment, status=self.status, reason=self.reason)
@@ -384,38 +374,37 @@ class Verdict:
 class Acceptance:
     """A-contrario test of an alignment, the same for every estimator (Moisan and Stival 2004).
 
-    Against it stands chance: all correspondences false, each landmark of map a paired with a random
-    one of the same height among map b's. Under a motion T such a pair agrees within a gate with a
-    probability p(T), the share that do so among all re-pairings of the very landmarks at hand; maps
-    made of walls have a larger p(T) where T lays wall on wall. A motion that two of n
-    correspondences determine then finds k - 2 supporters or more among the others with probability
-    at most the binomial's tail B(k - 2; n - 2, p) (pairs of unequal p only make it smaller:
-    Hoeffding 1956), and the expected number of such motions among all n (n - 1) / 2 is at most
+    Null hypothesis: all correspondences are false, and each landmark of map a is paired with a
+    random landmark of map b of the same height. Under a motion T such a pair agrees within a gate
+    with a probability p(T), estimated as the share of all re-pairings of the given landmarks that
+    agree. p(T) is larger where T maps walls onto walls. A motion of two of n correspondences then
+    finds k - 2 or more supporters among the others with probability at most the binomial tail
+    B(k - 2; n - 2, p) (unequal p make it smaller: Hoeffding 1956). The expected number of such
+    motions among all n (n - 1) / 2 is at most
 
         NFA = tests * n (n - 1) / 2 * B(k - 2; n - 2, p(T)),
 
-    where `tests` counts the gates and selections tried. An alignment is judged by the motion of two
-    of its own supporters that lies nearest to it; only those count that both bring together. So
-    whatever estimator was used, and however often: two maps without common ground have an
+    where `tests` is the number of gates and selections. An alignment is tested by the motion of two
+    of its supporters that is nearest to it, and only pairs that agree under both motions count. For
+    any estimator and any number of repetitions, two maps without common ground therefore have an
     acceptable alignment with probability at most `false_alarms`.
 
-    Two things would break this and are met. Neighbours are not independent: corners of one patch
-    share most of their descriptors' windows, and one point may be in a map twice. So of
-    correspondences that are neighbours in both maps only the best-matching one is used. And n false
-    ones can hide few true ones: the best-matching half, quarter, ... are tested as well.
+    Neighbouring landmarks are not independent: corners of one patch share most of their descriptor
+    windows, and one point may be in a map twice. Of correspondences that are neighbours in both
+    maps only the best match is used. Many false correspondences can hide few true ones: the best
+    half, quarter, and so on, are tested as well.
 
-    Known identities are another matter: see `named_landmarks.py`.
-
-    What it cannot see: texture that repeats is not chance. A poster that hangs on two walls gives
-    as many supporters as common ground does (`mapfusion/verification` sees to that).
+    Repeated texture passes this test, because it is not random; the other tests of
+    `mapfusion.verification` detect it. Labelled landmarks have a test of their own, see
+    `named_false_alarms`.
 
     Attributes:
-        false_alarms: accepted expected number of chance alignments for a pair of maps.
-        gates_m: distances in the plane up to which a pair supports a motion: from a landmark's own
-            noise to what drift displaces true pairs by.
-        patch_m: correspondences nearer than this to each other, in both maps, are one: without
-            common ground such neighbours are far more frequent than under re-pairing.
-        height: which landmarks can have one height (not for planar maps).
+        false_alarms: largest accepted expected number of chance alignments of a pair of maps.
+        gates_m: distances in the plane up to which a pair supports a motion, from the noise of a
+            landmark to the displacement by drift.
+        patch_m: correspondences closer than this in both maps count as one. Without common ground
+            such neighbours are much more frequent than under re-pairing.
+        height: test of compatible heights (not for planar maps).
     """
 
     false_alarms: Annotated[float, Range(1e-100, 1, "1")] = 1e-3
@@ -429,46 +418,38 @@ class Acceptance:
             raise ValueError(f"gates_m: expected 1 to {_MAX_GATES} distances")
 
     def judge(self, pairs: Pairs, alignment: Alignment) -> Verdict:
-        """Hold an alignment of these correspondences against chance."""
+        """Test an alignment of these correspondences against chance."""
         return self.on(pairs).judge(alignment)
 
     def on(self, pairs: Pairs) -> "ChanceTest":
-        """The test for these correspondences, made ready for any number of alignments."""
+        """Prepare the test of any number of alignments of these correspondences."""
         gates_m = np.array(sorted(self.gates_m))
         if pairs.by_name:
             in_plan = pairs.in_plan()
             return ChanceTest(self.false_alarms, gates_m, (in_plan.p_a, in_plan.p_b))
-        pairs = pairs[self._independent(pairs)]
-        planar = pairs.in_plan()
-        independent = independent_pairs(planar.p_a, planar.p_b, self._heights(pairs))
-        return ChanceTest(self.false_alarms, gates_m, independent)
-
-    def _independent(self, pairs: Pairs) -> np.ndarray:
-        """Rows (n,) of the pairs that count, best match first."""
+        # independent pairs of compatible height, best match first
         rows = pairs.of_one_height(self.height)
         rows = rows[np.argsort(pairs.distance[rows], kind="stable")]
-        return rows[thin(*pairs[rows].points(), self.patch_m)]
-
-    def _heights(self, pairs: Pairs) -> Float:
-        """Heights (n, 4) as `IndependentPairs` has them; of planar maps all 0."""
-        if pairs.planar:
-            return np.zeros((len(pairs), 4))
-        bound = self.height.bound
-        variance_a = pairs.covariance_a[:, 2, 2]
-        variance_b = pairs.covariance_b[:, 2, 2] + self.height.floor_m**2
-        return np.stack(
-            [pairs.p_a[:, 2], pairs.p_b[:, 2], bound * variance_a, bound * variance_b], axis=1
-        )
+        pairs = pairs[rows[independent_rows(*pairs[rows].points(), self.patch_m)]]
+        heights = np.zeros((len(pairs), 4))
+        if not pairs.planar:
+            bound = self.height.bound
+            heights[:, 0], heights[:, 1] = pairs.p_a[:, 2], pairs.p_b[:, 2]
+            heights[:, 2] = bound * pairs.covariance_a[:, 2, 2]
+            heights[:, 3] = bound * (pairs.covariance_b[:, 2, 2] + self.height.floor_m**2)
+        planar = pairs.in_plan()
+        independent = independent_pairs(planar.p_a, planar.p_b, heights)
+        return ChanceTest(self.false_alarms, gates_m, independent)
 
 
 @dataclass(frozen=True)
 class ChanceTest:
-    """`Acceptance` for the independent correspondences of two maps.
+    """`Acceptance` prepared for the correspondences of two maps.
 
     Attributes:
-        false_alarms: accepted expected number of chance alignments.
-        gates_m: (G,) ascending.
-        pairs: the correspondences, or the places (N, 2) of namesakes in both maps.
+        false_alarms: largest accepted expected number of chance alignments.
+        gates_m: ascending gates, shape (G,).
+        pairs: independent correspondences, or the positions (N, 2) of labelled landmarks.
     """
 
     false_alarms: float
@@ -476,7 +457,7 @@ class ChanceTest:
     pairs: IndependentPairs | tuple[Float, Float]
 
     def judge(self, alignment: Alignment) -> Verdict:
-        """Hold one alignment of the correspondences against chance."""
+        """Test one alignment of the correspondences against chance."""
         if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
             return Verdict(alignment.status, math.nan, alignment.reason)
         if isinstance(self.pairs, IndependentPairs):
@@ -486,15 +467,14 @@ class ChanceTest:
         log10, gate_m, n, k = found
         if log10 <= math.log10(self.false_alarms):
             return Verdict(Status.ACCEPTED, log10)
-        return Verdict(Status.REFUSED, log10, self._why(log10, gate_m, n, k))
-
-    def _why(self, log10: float, gate_m: float, n: int, k: int) -> str:
         if n < MIN_PAIRS:
-            return f"{n} independent correspondences are too few to tell from chance"
-        if k < MIN_PAIRS:
-            return f"fewer than {MIN_PAIRS} of {n} independent correspondences support it"
-        times = f"{10**log10:.2g}" if log10 < 4 else f"1e{log10:.0f}"
-        return (
-            f"{k} of {n} independent correspondences agree within {gate_m:g} m; chance alone gives "
-            f"as much {times} times for these maps, {self.false_alarms:g} are allowed"
-        )
+            reason = f"{n} independent correspondences are too few to tell from chance"
+        elif k < MIN_PAIRS:
+            reason = f"fewer than {MIN_PAIRS} of {n} independent correspondences support it"
+        else:
+            times = f"{10**log10:.2g}" if log10 < 4 else f"1e{log10:.0f}"
+            reason = (
+                f"{k} of {n} independent correspondences agree within {gate_m:g} m; chance alone "
+                f"gives as much {times} times for these maps, {self.false_alarms:g} are allowed"
+            )
+        return Verdict(Status.REFUSED, log10, reason)

@@ -1,17 +1,18 @@
 """Likelihood ratio of shared regions, and the probability that an alignment is right.
 
-Of the n landmarks of a region that are looked for, k are found. If the motion is right, k is
-beta-binomial: each region has a rate of its own, since light, slant and texture differ; it is high
-where landmarks must be seen and middling where they may be. If it is wrong, a region is either the
-twin of what is there (a poster, a room that repeats), and then no different, or the twin covers a
-part of it, any share as likely as any other, or it is what chance leaves. What another motion lays
-on its like is a twin much more often than the rest, and counts apart.
+Of n landmarks of a region that are searched for, k are matched. Under a right motion k is
+beta-binomial: the rate differs between regions with light, slant and texture, and is higher for
+landmarks that must be seen than for those that may be seen. Under a wrong motion a region is one of
+three kinds: a whole copy of the structure it is compared with (the same rates as under a right
+motion), a copy of a part of it (a uniformly distributed share), or unrelated (the rates of chance).
+Structure that another motion explains as well is a copy much more often, and has its own share.
 
-No motion is judged that nothing led to. A wrong one was found by a twin: that this region agrees is
-no evidence for it, and no sample of how often wrong motions lay regions on their like.
+A motion is only tested because some region led to it. Under a wrong motion this region is a copy;
+it is therefore no evidence, and not a sample of the share of copies.
 
-Right means within 0.5 m and 0.1 rad. A logistic model whose coefficients are fitted over worlds, of
-which some fool every test of support (`fitted.py`); what is more than chance has one.
+The probability that an alignment is right (error below 0.5 m and 0.1 rad) is a logistic model of
+the results of all tests. Its coefficients are fitted to simulated worlds, some with repeated
+structure (`fitted.py`).
 """
 
 import math
@@ -26,48 +27,47 @@ from mapfusion.verification.fitted import INTERCEPT, WEIGHTS
 
 
 class BetaRate(NamedTuple):
-    """A rate that varies from region to region: the beta distribution's two parameters."""
+    """Beta distribution of a rate that differs between regions."""
 
     seen: float
     missed: float
 
     @property
     def mean(self) -> float:
-        """The mean rate."""
+        """Mean of the distribution."""
         return self.seen / (self.seen + self.missed)
 
     def in_part(self) -> "BetaRate":
-        """This rate times a share that is any between 0 and 1: the beta of that mean and spread."""
+        """Return the beta distribution with the mean and variance of this rate times U(0, 1)."""
         n = self.seen + self.missed
         mean, square = self.mean / 2, self.mean * (self.seen + 1) / (n + 1) / 3
         total = (mean - square) / (square - mean**2)
         return BetaRate(mean * total, (1 - mean) * total)
 
 
-Rates = tuple[BetaRate, BetaRate]  # of what must be seen and of what may be
+Rates = tuple[BetaRate, BetaRate]  # of landmarks that must be seen, and that may be seen
 RIGHT: Rates = (BetaRate(*fitted_rates.RIGHT[0]), BetaRate(*fitted_rates.RIGHT[1]))
 WRONG: Rates = (BetaRate(*fitted_rates.WRONG[0]), BetaRate(*fitted_rates.WRONG[1]))
-# Of a region of which a twin covers a part: the edge of a poster, a wall that hangs elsewhere.
+# Rates of a region that is a copy in part, as at the edge of a repeated texture.
 PART: Rates = (RIGHT[0].in_part(), RIGHT[1].in_part())
-# Regions of a right alignment that are as a wrong one's: a picture that was moved, light that
-# changed, a stretch in which one of the maps drifted. It bounds what one region can say against it.
-# Of simulated worlds, in which nothing moves, the fit says a tenth of this: it is of the world, no
-# map tells it. Less than one in ten (`most_against`): one region that is gone contradicts.
+# Probability that a region under a right motion looks as under a wrong one: a moved object, changed
+# light, drift of one map. It limits the evidence of one region against a motion. It depends on the
+# world and cannot be estimated from the maps. It is below 1 / `most_against`, so that one missing
+# region is enough for a contradiction.
 CHANGED = 0.05
-# Parts of a region: where no other motion lays it on its like, and where another does.
+# Parts of a region: structure that no other motion explains, and structure that another explains.
 OWN, COPIED = 0, 1
-# Decades by which a region is likelier as found if the motion is right than by chance, for counts
-# and words: confirmed from so many on, contradicted from as many against it. Ten to one is called
-# strong evidence (Jeffreys 1961).
+# log10 likelihood ratio from which on a region counts as confirmed, or (negative) as contradicted.
+# Ten to one is called strong evidence (Jeffreys 1961).
 DECISIVE = 1.0
 
 
 class TwinShares(NamedTuple):
-    """Of what a wrong motion must find, the share that it lays on its like.
+    """Shares of regions that are copies under a wrong motion.
 
     Attributes:
-        own: where no other motion lays it on its like.
-        copied: where another does.
+        own: share in structure that no other motion explains.
+        copied: share in structure that another motion explains.
     """
 
     own: float
@@ -75,9 +75,10 @@ class TwinShares(NamedTuple):
 
 
 def log_likelihood(k: np.ndarray, n: np.ndarray, rates: Rates) -> Float:
-    """Natural logarithm (...) of the beta-binomial probability of k of n (..., 2).
+    """Return the log-likelihood of k of n under beta-binomial rates, shape (...).
 
-    But for the coefficients. Last axis: landmarks that must be seen, and those that may be.
+    The binomial coefficients, which cancel in ratios, are left out. k and n have the shape
+    (..., 2): landmarks that must be seen, and that may be seen.
     """
     by_class = [
         betaln(k[..., c] + rate.seen, n[..., c] - k[..., c] + rate.missed) - betaln(*rate)
@@ -87,21 +88,20 @@ def log_likelihood(k: np.ndarray, n: np.ndarray, rates: Rates) -> Float:
 
 
 def log10_against_chance(k: np.ndarray, n: np.ndarray) -> Float:
-    """log10 (...) of how much likelier k of n (..., 2) are under a right motion than by chance."""
+    """Return the log10 likelihood ratio (...) of k of n (..., 2), right motion over chance."""
     return (log_likelihood(k, n, RIGHT) - log_likelihood(k, n, WRONG)) / np.log(10.0)
 
 
 def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares) -> Float:
-    """log10 (R,) of how much likelier each region is under a right motion than under a wrong one.
+    """Return the log10 likelihood ratio of each region, right over wrong motion, shape (R,).
 
-    Under a wrong one all of a region is its like, or what another motion, too, lays on its like, or
-    nothing of it; of what is, `fitted_twins.WHOLE` is so throughout, the rest in part.
+    Under a wrong motion the whole region is a copy, or only its COPIED part is, or no part of it.
+    A copy is complete with probability `fitted_twins.WHOLE`, otherwise partial.
 
     Args:
-        k: (R, 2, 2) landmarks that were found: OWN and COPIED, of those that must be seen
-            and that may be.
-        n: (R, 2, 2) landmarks that are looked for.
-        shares: each above 0 and below 1.
+        k: matched landmarks, shape (R, 2, 2): OWN and COPIED, that must be seen and may be seen.
+        n: landmarks that are searched for, shape (R, 2, 2).
+        shares: shares of copies, each above 0 and below 1.
     """
     right, part, chance = (log_likelihood(k, n, rates) for rates in (RIGHT, PART, WRONG))
     whole = right.sum(axis=1)
@@ -115,15 +115,15 @@ def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares) -> Float:
 
 
 def _twin(whole: Float, part: Float) -> Float:
-    """Natural logarithm of the likelihood of twins, from those of whole ones and of parts."""
+    """Return the log-likelihood of a copy, from those of a complete and of a partial copy."""
     return np.logaddexp(np.log(fitted_twins.WHOLE) + whole, np.log1p(-fitted_twins.WHOLE) + part)
 
 
-def log10_beside_one(log10_ratios: Float) -> float:
-    """log10 of how much likelier regions (R,) are if right than if wrong and found by one of them.
+def log10_without_discovery(log10_ratios: Float) -> float:
+    """Return the log10 likelihood ratio of regions (R,) without the one that led to the motion.
 
-    The one, whichever of them, is then as under a right motion: of ratios r_i it is
-    prod_i r_i / mean_j r_j. 0 of none.
+    Under a wrong motion this region, whichever it is, looks as under a right one, so that the ratio
+    is prod_i r_i / mean_j r_j for the regions' ratios r_i. It is 0 without regions.
     """
     if not len(log10_ratios):
         return 0.0
@@ -131,25 +131,25 @@ def log10_beside_one(log10_ratios: Float) -> float:
     return float(np.sum(log10_ratios) - one)
 
 
-# Decades: beyond them it is as sure as anything the model was fitted to.
-_MOST_EVIDENCE, _LEAST_CHANCE = 3.0, 10.0
-_CONTRADICTION = 3.0  # regions that confirm make good for one that contradicts
-_FEW = 2.0  # regions: a share of so few is drawn to nothing
-_MOST_EXTENT_M = 12.0  # of support: beyond a hall it is as good as anywhere
+# Limits of the features (log10 likelihood ratio, -log10 NFA, extent of the support): beyond them
+# the model has no data.
+_MOST_EVIDENCE, _LEAST_CHANCE, _MOST_EXTENT_M = 3.0, 10.0, 12.0
+_CONTRADICTION = 3.0  # weight of a contradicting region relative to a confirming one
+_FEW = 2.0  # regions; pulls the share of few regions towards 0
 
 
-class Signs(NamedTuple):
-    """What speaks for and against one alignment.
+class EvidenceFeatures(NamedTuple):
+    """Results of all tests of one alignment.
 
     Attributes:
-        log10_false_alarms: of the test against chance; infinite where it has no answer.
-        log10_evidence: of the regions.
-        n_confirmed: regions that are seen again.
-        n_contradicted: regions that are not.
-        n_support: correspondences that support it.
-        extent_m: the longer side of where its support lies.
-        repeats: whether either map holds something twice.
-        one_place: whether the maps show little else than the place that they share.
+        log10_false_alarms: log10 NFA of the test against chance; infinite if it is not defined.
+        log10_evidence: log10 likelihood ratio of the regions.
+        n_confirmed: number of confirmed regions.
+        n_contradicted: number of contradicted regions.
+        n_support: number of supporting correspondences.
+        extent_m: longer side of the bounding box of the supporters.
+        repeats: True if either map has repeated structure.
+        one_place: True if the maps show little beyond the place that they share.
     """
 
     log10_false_alarms: float
@@ -161,8 +161,8 @@ class Signs(NamedTuple):
     repeats: bool
     one_place: bool
 
-    def features(self) -> Float:
-        """What the model weighs (7,)."""
+    def vector(self) -> Float:
+        """Return the features of the logistic model, shape (7,)."""
         against = _CONTRADICTION * self.n_contradicted
         net = (self.n_confirmed - against) / (self.n_confirmed + against + _FEW)
         return np.array(
@@ -170,7 +170,7 @@ class Signs(NamedTuple):
                 np.clip(-self.log10_false_alarms, 0.0, _LEAST_CHANCE),
                 np.clip(self.log10_evidence, -_MOST_EVIDENCE, _MOST_EVIDENCE),
                 net,
-                # at one extent more of them are denser, as a copy of one picture is
+                # more supporters at equal extent are denser, as in the copy of one texture
                 math.log10(self.n_support + 1),
                 min(self.extent_m, _MOST_EXTENT_M),
                 float(self.repeats),
@@ -179,6 +179,6 @@ class Signs(NamedTuple):
         )
 
 
-def probability(signs: Signs) -> float:
-    """That the alignment is right."""
-    return float(1 / (1 + np.exp(-(INTERCEPT + signs.features() @ np.array(WEIGHTS)))))
+def probability_correct(features: EvidenceFeatures) -> float:
+    """Return the probability that the alignment is right."""
+    return float(1 / (1 + np.exp(-(INTERCEPT + features.vector() @ np.array(WEIGHTS)))))

@@ -1,40 +1,91 @@
-"""Regions that two maps must share under a motion, and how much of each is in both."""
+"""Regions that both robots must have seen under a motion, and the landmarks matched in each."""
 
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.nearest_neighbours import Grid, runs_about
+from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import inverse, transform_points
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.parameters import Range, require_in_range
 from mapfusion.verification.likelihood import (
     DECISIVE,
     TwinShares,
     log10_against_chance,
-    log10_beside_one,
     log10_ratio,
+    log10_without_discovery,
 )
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.rivals import BETWEEN, Copies, about_each, laid_on_like
-from mapfusion.verification.visibility import MUST, UNSEEN, Seen, Watch, how_seen
+from mapfusion.verification.rivals import (
+    BETWEEN,
+    RepeatedLandmarks,
+    count_neighbours,
+    mark_repeated,
+)
+from mapfusion.verification.visibility import (
+    MUST,
+    UNSEEN,
+    ObservedLandmarks,
+    ViewingHistory,
+    classify_visibility,
+)
 
-# Of a descriptor's dimensions, those after which it is asked whether the distance is too large yet.
-_AT_A_TIME = 8
 
-
-class Looks(NamedTuple):
-    """N landmarks by place and look, for the kernel.
+@dataclass(frozen=True)
+class EvidenceParameters:
+    """Gates for landmarks seen again, and thresholds of the verdict.
 
     Attributes:
-        near: the grid over their places in the plane.
-        z_m: (N,) heights.
-        z_m2: (N,) their variances.
-        descriptor: (N, D) float32.
+        gate_m: largest distance between a landmark and its match in the other map. It covers the
+            landmarks' covariances, the alignment's uncertainty and the drift of both maps.
+        max_descriptor_distance: largest descriptor distance of a match; that of the observations of
+            one landmark in the filter.
+        region_m: smallest side of a region that counts as one piece of evidence, since neighbouring
+            corners belong to one texture. It grows to the largest structure that the maps repeat.
+        place_m: longest side of a place that may occur twice as a whole, such as a room. If most of
+            the smaller map lies in such a place and agrees, its surroundings were not compared.
+        least_ratio: smallest likelihood ratio of the regions, right motion over wrong motion, if
+            maps repeat structure or another motion fits; multiplied by the number of motions that
+            pass the test against chance. At most one pair of maps in this number has a wrong motion
+            that reaches it (Markov's and Boole's inequalities).
+        most_against: inverse of the likelihood ratio below which an alignment is contradicted; at
+            most one right motion in this number falls below it.
+        least_probability: smallest probability that the alignment is right.
+        max_sigma_m: largest standard deviation of the other map's landmarks under the alignment,
+            RMS. Two standard deviations (95 %) are 0.5 m, the limit of a useful merged map.
+        max_sigma_rad: largest standard deviation of the rotation; two standard deviations move a
+            landmark at 5 m by 0.5 m.
+    """
+
+    gate_m: Annotated[float, Range(0.01, 10, "m")] = 0.3
+    max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.5
+    region_m: Annotated[float, Range(0.1, 100, "m")] = 2.0
+    place_m: Annotated[float, Range(0, 1000, "m")] = 6.0
+    least_ratio: Annotated[float, Range(1, 1e12, "1")] = 30.0
+    most_against: Annotated[float, Range(1, 1e12, "1")] = 10.0
+    least_probability: Annotated[float, Range(0, 1, "1")] = 0.5
+    max_sigma_m: Annotated[float, Range(1e-3, 1e6, "m")] = 0.25
+    max_sigma_rad: Annotated[float, Range(1e-4, 10, "rad")] = 0.05
+
+    def __post_init__(self) -> None:
+        require_in_range(self)
+
+
+_DESCRIPTOR_STEP = 8  # dimensions summed between two tests of the distance against its limit
+
+
+class DescribedLandmarks(NamedTuple):
+    """N landmarks with positions and descriptors, as arrays for kernels.
+
+    Attributes:
+        near: grid over the positions in the plane.
+        z_m: heights, shape (N,).
+        z_m2: variances of the heights, shape (N,).
+        descriptor: descriptors, shape (N, D), float32.
     """
 
     near: Grid
@@ -43,15 +94,14 @@ class Looks(NamedTuple):
     descriptor: np.ndarray
 
 
-class Gates(NamedTuple):
-    """How far off what is the same may be.
+class MatchGates(NamedTuple):
+    """Largest differences between two landmarks that are the same point.
 
     Attributes:
-        distance_m: in the plane.
-        height_bound: of the squared difference of heights, over its variance; infinite where
-            heights tell nothing.
-        height_floor_m2: of that variance, what landmarks' own leave out.
-        unlike: of descriptors.
+        distance_m: distance in the plane.
+        height_bound: squared difference of heights over its variance; infinite for planar maps.
+        height_floor_m2: variance of a height difference beyond the landmarks' own variances.
+        unlike: descriptor distance.
     """
 
     distance_m: float
@@ -61,21 +111,34 @@ class Gates(NamedTuple):
 
 
 @kernel
-def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> np.ndarray:
-    """Bool (n,): whether `other` has some `rows` (n,) of `own`, whose places are p (N, 3) there.
+def mark_matched(
+    p: Float,
+    rows: np.ndarray,
+    own: DescribedLandmarks,
+    other: DescribedLandmarks,
+    gates: MatchGates,
+) -> np.ndarray:
+    """Mark the landmarks of `own` that have a match in `other`; return bool, shape (n,).
 
-    What has no descriptor (NaN) is not found.
+    Landmarks without a descriptor (NaN) have no match.
+
+    Args:
+        p: positions of all own landmarks in the frame of the other map, shape (N, 3).
+        rows: own landmarks to search for, shape (n,).
+        own: own landmarks.
+        other: landmarks of the other map.
+        gates: largest differences of a match.
     """
-    # arrays by themselves: taken from a tuple, each access would count its references
-    _, z_own, z2_own, look_own = own
-    near, z_other, z2_other, look_other = other
+    # unpacked once: each access through the tuple would count references
+    _, z_own, z2_own, descriptor_own = own
+    near, z_other, z2_other, descriptor_other = other
     at, row_of, distance_m = near.p, near.row, gates.distance_m
     found = np.zeros(len(rows), np.bool_)
     runs = np.empty((near.shape[1], 2), np.int64)
     most, floor_m2, unlike2 = gates.height_bound, gates.height_floor_m2, gates.unlike**2
     for m in range(len(rows)):
         i = rows[m]
-        for run in range(runs_about(p[i, 0], p[i, 1], distance_m, near, runs)):
+        for run in range(ranges_within(p[i, 0], p[i, 1], distance_m, near, runs)):
             for k in range(runs[run, 0], runs[run, 1]):
                 dx, dy = at[k, 0] - p[i, 0], at[k, 1] - p[i, 1]
                 if dx * dx + dy * dy > distance_m * distance_m:
@@ -84,7 +147,13 @@ def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> n
                 dz = z_own[i] - z_other[j]
                 if most < math.inf and dz * dz > most * (z2_own[i] + z2_other[j] + floor_m2):
                     continue
-                if _alike(look_own, i, look_other, j, unlike2):
+                square = 0.0  # distance of the descriptors
+                for first in range(0, descriptor_own.shape[1], _DESCRIPTOR_STEP):
+                    for d in range(first, min(first + _DESCRIPTOR_STEP, descriptor_own.shape[1])):
+                        square += (descriptor_own[i, d] - descriptor_other[j, d]) ** 2
+                    if square > unlike2:
+                        break
+                if square <= unlike2:
                     found[m] = True
                     break
             if found[m]:
@@ -92,29 +161,20 @@ def has(p: Float, rows: np.ndarray, own: Looks, other: Looks, gates: Gates) -> n
     return found
 
 
-@kernel
-def _alike(own: np.ndarray, i: int, other: np.ndarray, j: int, most: float) -> bool:
-    """Whether descriptors i and j of (N, D) are no more than so much apart, squared."""
-    square = 0.0
-    for first in range(0, own.shape[1], _AT_A_TIME):
-        for d in range(first, min(first + _AT_A_TIME, own.shape[1])):
-            square += (own[i, d] - other[j, d]) ** 2
-        if square > most:
-            return False
-    return square <= most
-
-
-LEAST_EXPECTED = 5  # landmarks of a region; fewer say little, and mostly lie on its edge
+LEAST_EXPECTED = 5  # landmarks of a region; regions with fewer are not evaluated
 
 
 @dataclass(frozen=True)
 class Regions:
-    """What became of what must be seen, region by region.
+    """Counts of expected and matched landmarks in R regions.
+
+    The second axis separates landmarks outside (OWN) and inside (COPIED) structure that another
+    motion also explains; the third axis separates landmarks that the other robot must have seen
+    and may have seen.
 
     Attributes:
-        found: (R, 2, 2) landmarks that the other map has: in places that may be copies or not
-            (OWN, COPIED), of those that it must have and that it may have.
-        expected: (R, 2, 2) landmarks that are looked for, those of both maps.
+        found: landmarks of either map that the other map contains, shape (R, 2, 2).
+        expected: landmarks of either map that are searched for, shape (R, 2, 2).
     """
 
     found: np.ndarray
@@ -128,17 +188,17 @@ class Regions:
 
     @cached_property
     def confirmed(self) -> np.ndarray:
-        """Bool (R,): what is found there speaks for the motion, and nothing of it against."""
+        """Regions that support the motion and have no part that contradicts it, bool (R,)."""
         return (self._all >= DECISIVE) & (self._parts > -DECISIVE).all(axis=1)
 
     @property
     def n_confirmed(self) -> int:
-        """Regions of which most is there."""
+        """Number of confirmed regions."""
         return int(np.sum(self.confirmed))
 
     @property
     def n_contradicted(self) -> int:
-        """Regions of which hardly anything is there, or nothing but what may be a copy."""
+        """Number of regions that contradict the motion as a whole or in one part."""
         against = (self._all <= -DECISIVE) | (self._parts <= -DECISIVE).any(axis=1)
         return int(np.sum(against))
 
@@ -151,66 +211,69 @@ class Regions:
         return self._parts.sum(axis=1)
 
     def beside_best(self, part: int) -> np.ndarray:
-        """Bool (R,): regions with enough of a part (OWN, COPIED), but for that which agrees best.
+        """Return the regions with enough landmarks in a part (OWN or COPIED), bool (R,).
 
-        By that one a motion was found.
+        The region with the best agreement is left out, because the motion was found from it.
         """
         enough = self.expected[:, part].sum(axis=1) >= LEAST_EXPECTED
         if len(self):
             enough[np.argmax(self._all)] = False
         return enough
 
-    def seen_again(self, part: int) -> tuple[int, int]:
-        """Of a part (OWN, COPIED) of regions `beside_best`, the confirmed, and all."""
+    def count_confirmed(self, part: int) -> tuple[int, int]:
+        """Return the number of confirmed and of all regions `beside_best` in a part."""
         enough = self.beside_best(part)
         return int(np.sum(self._parts[enough, part] >= DECISIVE)), int(np.sum(enough))
 
     def log10_ratio(self, shares: TwinShares) -> float:
-        """log10 of how much likelier all of them are if right than if wrong; 0 of none."""
+        """Return the log10 likelihood ratio of all regions, right motion over wrong motion."""
         return float(np.sum(log10_ratio(self.found, self.expected, shares)))
 
     def log10_evidence(self, shares: TwinShares) -> float:
-        """The same, if wrong then found by one of them, which is no evidence; 0 of none."""
-        if shares not in self._evidence:  # a verdict rests on it in several places
+        """Return the log10 likelihood ratio without the region that led to the motion.
+
+        It is 0 without regions.
+        """
+        if shares not in self._evidence:  # used several times by a verdict
             ratios = log10_ratio(self.found, self.expected, shares)
-            self._evidence[shares] = log10_beside_one(ratios)
+            self._evidence[shares] = log10_without_discovery(ratios)
         return self._evidence[shares]
 
 
-class Squares(NamedTuple):
-    """The squares of the plane that are one region each.
+class RegionGrid(NamedTuple):
+    """Square regions of the plane.
 
     Attributes:
-        side_m: of a square.
-        middle: (2,) of one of them, in frame a: where what supports a motion has its middle, so
-            that one picture is one region and not the two or four that a line through it makes.
+        side_m: side of a square.
+        middle: centre of one square in frame a, shape (2,). It is the centre of the supporters of a
+            motion, so that no edge divides them.
     """
 
     side_m: float
     middle: Float
 
     @classmethod
-    def about(cls, p_a: Float, side_m: float) -> "Squares":
-        """About the middle of supporters (n, 2 or 3); about the origin without any."""
+    def about(cls, p_a: Float, side_m: float) -> "RegionGrid":
+        """Return the grid centred on supporters (n, 2 or 3), or on the origin without any."""
         if not len(p_a):
             return cls(side_m, np.zeros(2))
         return cls(side_m, (p_a[:, :2].min(axis=0) + p_a[:, :2].max(axis=0)) / 2)
 
     def of(self, p: Float) -> np.ndarray:
-        """Number (n,) of the square in which each point (n, 2) lies, from 0 on."""
+        """Return the number of the square of each point (n, 2), from 0, shape (n,)."""
         column, row = np.floor((p - self.middle).T / self.side_m + 0.5).astype(np.int64)
         width = int(np.ptp(row)) + 1 if len(row) else 1
         return np.unique(column * width + row, return_inverse=True)[1]
 
 
-class _Asked(NamedTuple):
-    """Landmarks that another robot had in view (n,).
+class _Expected(NamedTuple):
+    """Landmarks of one map that the robot of the other map had in view, arrays (n,).
 
     Attributes:
-        rows: of the map.
-        how: MAY or MUST.
-        found: whether the other map has them.
-        copied: whether another motion lays their place on its like.
+        rows: rows of the map.
+        how: visibility, MAY or MUST.
+        found: True for landmarks with a match in the other map.
+        copied: True for landmarks in structure that another motion also explains.
     """
 
     rows: np.ndarray
@@ -219,127 +282,133 @@ class _Asked(NamedTuple):
     copied: np.ndarray
 
 
-class Witness:
-    """A map with viewing evidence, made ready to be asked what it must have seen."""
+class ViewedMap:
+    """Map with descriptors and viewing evidence, prepared for queries of visibility and matches."""
 
     def __init__(self, landmarks: LandmarkMap) -> None:
-        """Of a map that has viewing evidence and descriptors."""
+        """Prepare a map that has viewing evidence and descriptors."""
         viewing, descriptor = landmarks.viewing, landmarks.descriptor
         assert viewing is not None
         assert descriptor is not None
         self.landmarks, self._viewing = landmarks, viewing
-        self.watch = Watch.of(viewing)
+        self.history = ViewingHistory.of(viewing)
         position = np.ascontiguousarray(landmarks.position_m)
         z_m2 = landmarks.covariance_m2[:, 2, 2].copy()
         near = Grid.of(position[:, :2])
-        self.looks = Looks(near, position[:, 2].copy(), z_m2, np.ascontiguousarray(descriptor))
-        # what was found of this map alone, by what was asked: several pairs have the same map
+        self.described = DescribedLandmarks(
+            near, position[:, 2].copy(), z_m2, np.ascontiguousarray(descriptor)
+        )
+        # results that depend on this map alone, by query: several pairs share a map
         self.kept: dict[tuple, Any] = {}
 
     @cached_property
-    def crowd(self) -> np.ndarray:
-        """(N,) landmarks about each."""
-        return about_each(np.ones(len(self.landmarks), np.bool_), self.looks.near)
+    def n_near(self) -> np.ndarray:
+        """Number of landmarks near each landmark, shape (N,)."""
+        return count_neighbours(np.ones(len(self.landmarks), np.bool_), self.described.near)
 
-    def laid_by(self, T: Float) -> Float:
-        """Its landmarks (N, 3) where a motion of the plane lays them."""
+    def transformed(self, T: Float) -> Float:
+        """Return the positions under a motion of the plane, shape (N, 3)."""
         p = self.landmarks.position_m.copy()
         p[:, :2] = transform_points(T, p[:, :2])
         return p
 
-    def seen_from(self, T: Float) -> Seen:
-        """Its landmarks as another robot would find them, T from its frame to that one's."""
-        viewing, p = self._viewing, self.laid_by(T)
+    def observed_from(self, T: Float) -> ObservedLandmarks:
+        """Return the landmarks with their viewpoints in another frame, T from this frame to it."""
+        viewing, p = self._viewing, self.transformed(T)
         angle = viewing.direction_rad + T[2]
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         distance = np.where(viewing.n_views > 0, viewing.distance_m, 0.0)
-        return Seen(p, direction, distance)
+        return ObservedLandmarks(p, direction, distance)
 
 
-class Witnesses:
-    """Two maps that may be asked about any motion between them."""
+class ViewedMapPair:
+    """Two maps prepared for queries about any motion between them."""
 
-    def __init__(self, a: Witness, b: Witness, parameters: EvidenceParameters) -> None:
+    def __init__(self, a: ViewedMap, b: ViewedMap, parameters: EvidenceParameters) -> None:
         self.a, self.b, self._parameters = a, b, parameters
         height = HeightGate()
         planar = a.landmarks.planar or b.landmarks.planar
         bound = np.inf if planar else height.bound
         unlike = parameters.max_descriptor_distance
-        self._gates = Gates(parameters.gate_m, bound, height.floor_m**2, unlike)
-        # which of a's or b's landmarks (N,) the other has under a motion: copies ask for all, and
-        # regions, after them, for some of the same; and how the other saw them
+        self._gates = MatchGates(parameters.gate_m, bound, height.floor_m**2, unlike)
+        # matches and visibility of all landmarks of a map (first key: True for map a) by motion
         self._found: dict[tuple[bool, bytes], np.ndarray] = {}
         self._how: dict[tuple[bool, bytes], np.ndarray] = {}
 
     @classmethod
-    def beside_itself(cls, own: Witness, parameters: EvidenceParameters) -> "Witnesses":
-        """A map that may be asked about motions onto itself, with what it was asked before."""
+    def beside_itself(cls, own: ViewedMap, parameters: EvidenceParameters) -> "ViewedMapPair":
+        """Return the pair of a map with itself, kept with the map for later queries."""
         key = cls, parameters
         if key not in own.kept:
             own.kept[key] = cls(own, own, parameters)
         return own.kept[key]
 
     @cached_property
-    def _of(self) -> dict[str, "Witnesses"]:
-        """These, and each map beside itself, by what motions are of."""
+    def _of(self) -> dict[str, "ViewedMapPair"]:
+        """Pairs by the domain of a motion: both maps, or either map with itself."""
         a, b = (self.beside_itself(own, self._parameters) for own in (self.a, self.b))
         return {BETWEEN: self, "a": a, "b": b}
 
-    def regions(self, of: str, T: Float, squares: Squares, copies: Copies) -> Regions:
-        """What must have been seen under a motion, and is there, in squares of frame a.
+    def regions(self, of: str, T: Float, squares: RegionGrid, copies: RepeatedLandmarks) -> Regions:
+        """Count expected and matched landmarks under a motion, in square regions of frame a.
 
-        Of two maps both ways are counted into one square: they are of one part of the world. What
-        lies in `copies` is counted apart.
+        Landmarks of both maps are counted in the same square.
+
+        Args:
+            of: domain of the motion: BETWEEN, "a" or "b".
+            T: motion, shape (3,).
+            squares: the regions.
+            copies: landmarks in structure that another motion also explains.
         """
         if of != BETWEEN:
             own = copies.in_a if of == "a" else copies.in_b
-            return self._of[of].regions(BETWEEN, T, squares, Copies(own, own))
+            return self._of[of].regions(BETWEEN, T, squares, RepeatedLandmarks(own, own))
         T_a_b = T
-        asked_b, b_in_a = self._asked(self.b, self.a, T_a_b, copies.in_b)
-        asked_a, _ = self._asked(self.a, self.b, inverse(T_a_b), copies.in_a)
-        asked = _Asked(*map(np.concatenate, zip(asked_b, asked_a, strict=True)))
-        places = np.concatenate([b_in_a[asked_b.rows], self.a.landmarks.position_m[asked_a.rows]])
-        place = squares.of(places[:, :2])
-        n = int(place.max(initial=-1)) + 1
+        of_b, b_in_a = self._expected(self.b, self.a, T_a_b, copies.in_b)
+        of_a, _ = self._expected(self.a, self.b, inverse(T_a_b), copies.in_a)
+        both = _Expected(*map(np.concatenate, zip(of_b, of_a, strict=True)))
+        position_m = np.concatenate([b_in_a[of_b.rows], self.a.landmarks.position_m[of_a.rows]])
+        region = squares.of(position_m[:, :2])
+        n = int(region.max(initial=-1)) + 1
         found, expected = np.zeros((n, 2, 2), np.int64), np.zeros((n, 2, 2), np.int64)
-        at = place, asked.copied.astype(np.int64), np.where(asked.how == MUST, 0, 1)
+        at = region, both.copied.astype(np.int64), np.where(both.how == MUST, 0, 1)
         np.add.at(expected, at, 1)
-        np.add.at(found, at, asked.found)
-        counts = expected.sum(axis=(1, 2)) >= LEAST_EXPECTED
-        return Regions(found[counts], expected[counts])
+        np.add.at(found, at, both.found)
+        large = expected.sum(axis=(1, 2)) >= LEAST_EXPECTED
+        return Regions(found[large], expected[large])
 
-    def copies(self, of: str, T: Float) -> Copies:
-        """Landmarks of both maps that a motion lays on their like."""
-        two = self._of[of]
-        in_a, in_b = two._laid(two.a, two.b, inverse(T)), two._laid(two.b, two.a, T)
+    def copies(self, of: str, T: Float) -> RepeatedLandmarks:
+        """Return the landmarks of both maps that a motion maps onto matching structure."""
+        pair = self._of[of]
+        in_a, in_b = pair._repeated(pair.a, pair.b, inverse(T)), pair._repeated(pair.b, pair.a, T)
         if of == BETWEEN:
-            return Copies(in_a, in_b)
-        none = Copies.none(len(self.a.landmarks), len(self.b.landmarks))
+            return RepeatedLandmarks(in_a, in_b)
+        none = RepeatedLandmarks.none(len(self.a.landmarks), len(self.b.landmarks))
         return none._replace(**{f"in_{of}": in_a | in_b})
 
-    def _laid(self, own: Witness, other: Witness, T: Float) -> np.ndarray:
+    def _repeated(self, own: ViewedMap, other: ViewedMap, T: Float) -> np.ndarray:
         key = own is self.a, T.tobytes()
         if key not in self._found:
-            p = own.laid_by(T)
-            found = has(p, np.arange(len(p)), own.looks, other.looks, self._gates)
+            p = own.transformed(T)
+            found = mark_matched(p, np.arange(len(p)), own.described, other.described, self._gates)
             self._found[key] = found
-        return laid_on_like(self._found[key], own.crowd, own.looks.near)
+        return mark_repeated(self._found[key], own.n_near, own.described.near)
 
-    def _asked(
-        self, own: Witness, other: Witness, T: Float, copied: np.ndarray
-    ) -> tuple[_Asked, Float]:
-        """What `other` has of `own`, and all of own's landmarks in its frame.
+    def _expected(
+        self, own: ViewedMap, other: ViewedMap, T: Float, copied: np.ndarray
+    ) -> tuple[_Expected, Float]:
+        """Return the landmarks of `own` that `other` is expected to contain.
 
-        T (3,) maps own's frame into that of the other.
+        Also return all own positions in the frame of `other`; T (3,) maps into this frame.
         """
         key = own is self.a, T.tobytes()
         if key in self._how:
-            p = own.laid_by(T)
+            p = own.transformed(T)
         else:
-            seen = own.seen_from(T)
-            self._how[key], p = how_seen(seen, other.watch), seen.p
+            seen = own.observed_from(T)
+            self._how[key], p = classify_visibility(seen, other.history), seen.p
         how, known = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
-        looks = own.looks, other.looks
-        found = has(p, rows, *looks, self._gates) if known is None else known[rows]
-        return _Asked(rows, how[rows], found, copied[rows]), p
+        looks = own.described, other.described
+        found = mark_matched(p, rows, *looks, self._gates) if known is None else known[rows]
+        return _Expected(rows, how[rows], found, copied[rows]), p

@@ -8,89 +8,89 @@ import numpy as np
 
 from mapfusion.align.alignment import MIN_PAIRS, Pairs
 from mapfusion.align.clique import Clique
-from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_both_ways
+from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_descriptors
 from mapfusion.align.method import Undetermined
-from mapfusion.align.nearest_neighbours import Grid, runs_about
+from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
 
-# A place is that of a landmark, as far about it as the smallest posters are wide (half a metre):
-# neighbouring corners of one picture.
+# Radius of a landmark's neighbourhood: the width of a small poster, whose corners are repeated
+# together.
 _PLACE_M = 0.5
-# It is laid on its like where so many landmarks of it are found, as a region needs to count, and so
-# large a share: from about there on it is ten times likelier that a copy was seen from elsewhere
-# than that chance found as many (`fitted_rates.py`, what may be seen: 7 of 20, 17 of 60).
+# A neighbourhood is repeated structure if at least this number and share of its landmarks have a
+# match elsewhere. At this share a copy is about ten times likelier than chance (rates of
+# `fitted_rates.py` for landmarks that may be seen: 7 of 20, 17 of 60).
 _LEAST, _LEAST_SHARE = 5, 0.3
 
 
-BETWEEN = "a b"  # of a motion between two maps; of one map onto itself: a, b
+BETWEEN = "a b"  # domain of a motion between two maps; "a" or "b": of a map onto itself
 
 
-class Copies(NamedTuple):
-    """Which landmarks of two maps lie in places that may be copies: bool (N_a,) and (N_b,)."""
+class RepeatedLandmarks(NamedTuple):
+    """Landmarks of two maps in structure that occurs more than once, bool (N_a,) and (N_b,)."""
 
     in_a: np.ndarray
     in_b: np.ndarray
 
     @classmethod
-    def none(cls, n_a: int, n_b: int) -> "Copies":
-        """Of maps in which nothing is held twice."""
+    def none(cls, n_a: int, n_b: int) -> "RepeatedLandmarks":
+        """Return the value of maps without repeated structure."""
         return cls(np.zeros(n_a, np.bool_), np.zeros(n_b, np.bool_))
 
-    def joined(self, others: Iterable["Copies"]) -> "Copies":
-        """Those of any of several motions."""
+    def joined(self, others: Iterable["RepeatedLandmarks"]) -> "RepeatedLandmarks":
+        """Return the union over several motions."""
         in_a, in_b = self.in_a.copy(), self.in_b.copy()
         for other in others:
             in_a |= other.in_a
             in_b |= other.in_b
-        return Copies(in_a, in_b)
+        return RepeatedLandmarks(in_a, in_b)
 
 
-def of_others(copies: Sequence[Copies], own: int) -> Copies:
-    """What motions but one of them lay on its like."""
-    first = Copies.none(len(copies[own].in_a), len(copies[own].in_b))
+def repeated_under_others(copies: Sequence[RepeatedLandmarks], own: int) -> RepeatedLandmarks:
+    """Return the repeated landmarks under all motions except the motion `own`."""
+    first = RepeatedLandmarks.none(len(copies[own].in_a), len(copies[own].in_b))
     return first.joined(each for k, each in enumerate(copies) if k != own)
 
 
 @kernel
-def about_each(counted: np.ndarray, near: Grid) -> np.ndarray:
-    """How many of the landmarks about each (N,) are `counted` (N,), itself among them."""
+def count_neighbours(counted: np.ndarray, near: Grid) -> np.ndarray:
+    """Count the `counted` (N,) landmarks near each counted one, including itself; shape (N,)."""
     p, row_of = near.p, near.row
     n = np.zeros(len(counted), np.int64)
     runs = np.empty((near.shape[1], 2), np.int64)
     for k in range(len(p)):
         if not counted[row_of[k]]:
             continue
-        for run in range(runs_about(p[k, 0], p[k, 1], _PLACE_M, near, runs)):
+        for run in range(ranges_within(p[k, 0], p[k, 1], _PLACE_M, near, runs)):
             for m in range(runs[run, 0], runs[run, 1]):
                 dx, dy = p[m, 0] - p[k, 0], p[m, 1] - p[k, 1]
                 n[row_of[m]] += dx * dx + dy * dy <= _PLACE_M * _PLACE_M
     return n
 
 
-def laid_on_like(found: np.ndarray, crowd: np.ndarray, near: Grid) -> np.ndarray:
-    """Which landmarks (N,) lie where enough of those about them are `found` (N,) elsewhere.
+def mark_repeated(found: np.ndarray, n_near: np.ndarray, near: Grid) -> np.ndarray:
+    """Mark landmarks (N,) in neighbourhoods of which enough landmarks are `found` (N,) elsewhere.
 
-    Of `crowd` (N,) is how many there are about each.
+    `n_near` (N,) is the number of landmarks near each.
     """
-    hits = about_each(found, near)
-    return (hits >= _LEAST) & (hits >= _LEAST_SHARE * crowd)
+    hits = count_neighbours(found, near)
+    return (hits >= _LEAST) & (hits >= _LEAST_SHARE * n_near)
 
 
-# What lies nearer is of one place: neighbouring corners share most of their descriptors' windows,
-# and one point may be in a map twice.
+# Smallest distance of two similar landmarks: neighbouring corners share most of their descriptor
+# windows, and one point may be in a map twice.
 _ELSEWHERE_M = 1.0
-_UNLIKE = 0.6  # of descriptors, at the most: as landmarks of two maps are paired
+_UNLIKE = 0.6  # largest descriptor distance, as for the correspondences of two maps
 
 
-def twins(landmarks: LandmarkMap) -> Correspondences:
-    """Landmarks that are each other's most alike among those elsewhere, each pair both ways.
+def similar_landmarks(landmarks: LandmarkMap) -> Correspondences:
+    """Return pairs of landmarks of one map that are mutually nearest in descriptor, both ways.
 
-    A motion under which such pairs agree lays one part of the map on its like. Maps without
-    descriptors have none.
+    Landmarks closer than 1 m are not paired. A motion that many pairs support maps one part of the
+    map onto a similar part. A map without descriptors has no pairs.
     """
     n = len(landmarks)
     if landmarks.descriptor is None or n < 2:
@@ -98,7 +98,7 @@ def twins(landmarks: LandmarkMap) -> Correspondences:
     height = HeightGate()
     bound = math.inf if landmarks.planar else height.bound
     gates = bound, height.floor_m**2, _ELSEWHERE_M
-    nearest, distance2, _ = nearest_both_ways(landmarks, landmarks, *gates)
+    nearest, distance2, _ = nearest_descriptors(landmarks, landmarks, *gates)
     rows = np.arange(n)
     unlike = np.sqrt(np.maximum(distance2, 0.0))
     kept = (nearest >= 0) & (nearest[nearest] == rows) & (unlike <= _UNLIKE)
@@ -106,10 +106,10 @@ def twins(landmarks: LandmarkMap) -> Correspondences:
 
 
 @kernel
-def largest_patch_m(p: Float, reach_m: float, least: int) -> float:
-    """The longest side of the largest patch of points (n, 2), 0 of none.
+def longest_patch_side_m(p: Float, reach_m: float, least: int) -> float:
+    """Return the longest side of the bounding boxes of patches of points (n, 2), 0 without any.
 
-    Points that are less than `reach_m` apart are of one patch, which has `least` points or more.
+    A patch is a connected component of points closer than `reach_m`, with at least `least` points.
     """
     n = len(p)
     patch, queue, longest = np.full(n, -1), np.empty(n, np.int64), 0.0
@@ -135,18 +135,19 @@ def largest_patch_m(p: Float, reach_m: float, least: int) -> float:
     return longest
 
 
-# Motions that move the landmarks less far apart, RMS, are one: twice what a right one may be off.
+# Motions with a smaller RMS distance of the moved landmarks count as equal: twice the largest error
+# of a correct alignment.
 DISTINCT_M = 1.0
-_LEAST_PAIRS = 6  # among fewer no motion is more than chance
+_LEAST_PAIRS = 6  # no motion among fewer pairs passes the test against chance
 
 
-class Supported(NamedTuple):
-    """A motion, and what of the correspondences supports it.
+class SupportedMotion(NamedTuple):
+    """Motion and the correspondences that support it.
 
     Attributes:
-        T_a_b: (3,).
-        log10_false_alarms: as the test against chance has it; infinite where it has no answer.
-        inlier: (N,) bool, the pairs within the widest gate of the test.
+        T_a_b: motion, shape (3,).
+        log10_false_alarms: log10 of the number of false alarms; infinite if it is not defined.
+        inlier: pairs within the widest gate of the test against chance, bool (N,).
     """
 
     T_a_b: Float
@@ -154,47 +155,47 @@ class Supported(NamedTuple):
     inlier: np.ndarray
 
 
-def apart_m(T_a_b: Float, other: Float, p_b: Float) -> float:
-    """How far apart two motions (3,) move points (n, 2), RMS."""
+def rms_distance_m(T_a_b: Float, other: Float, p_b: Float) -> float:
+    """Return the RMS distance between points (n, 2) under two motions (3,)."""
     apart = transform_points(T_a_b, p_b) - transform_points(other, p_b)
     return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 
 def distinct_motions(
     pairs: Pairs, most: int, acceptance: Acceptance, refinement: Refinement
-) -> list[Supported]:
-    """Up to `most` motions, that of the largest clique first, then that of what it leaves, ...
+) -> list[SupportedMotion]:
+    """Find up to `most` distinct motions by cliques, each among the pairs that earlier ones leave.
 
-    Each is refined on all pairs, and held against chance with them.
+    Each motion is refined on all pairs and tested against chance.
     """
-    found: list[Supported] = []
+    found: list[SupportedMotion] = []
     chance, method = acceptance.on(pairs), Clique()
     p_a, p_b = pairs.p_a[:, :2], pairs.p_b[:, :2]
     rows, widest_m = np.arange(len(pairs)), max(acceptance.gates_m)
-    tries = 2 * most  # what the refinement moves onto one found before is none
+    tries = 2 * most  # refinement may move a motion onto an earlier one
     while len(rows) >= _LEAST_PAIRS and len(found) < most and tries > 0:
         tries -= 1
-        fit = method.find(pairs[rows], np.random.default_rng(0))  # which draws nothing
+        fit = method.find(pairs[rows], np.random.default_rng(0))  # the method is deterministic
         if isinstance(fit, Undetermined) or np.count_nonzero(fit.inlier) < MIN_PAIRS:
             break
         refined = refinement.refine(pairs, fit.T_a_b)
         T = refined.T_a_b if np.isfinite(refined.T_a_b).all() else fit.T_a_b
-        if not any(apart_m(T, each.T_a_b, p_b) < DISTINCT_M for each in found):
+        if not any(rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M for each in found):
             log10 = chance.judge(refined).log10_false_alarms
-            found.append(Supported(T, log10, _within(T, p_a, p_b, widest_m)))
+            found.append(SupportedMotion(T, log10, _within(T, p_a, p_b, widest_m)))
         rows = rows[~(fit.inlier | _within(fit.T_a_b, p_a[rows], p_b[rows], widest_m))]
     return found
 
 
 def self_motions(
     landmarks: LandmarkMap, most: int, acceptance: Acceptance, refinement: Refinement
-) -> tuple[Pairs, list[Supported]]:
-    """The twins of a map, and motions that lay parts of it on their like."""
-    pairs = Pairs(landmarks, landmarks, twins(landmarks))
+) -> tuple[Pairs, list[SupportedMotion]]:
+    """Return the similar landmarks of a map and the motions that map parts onto similar parts."""
+    pairs = Pairs(landmarks, landmarks, similar_landmarks(landmarks))
     back = np.searchsorted(pairs.index_a, pairs.index_b)  # rows ascend, and each pair is both ways
     found = []
     for each in distinct_motions(pairs, most, acceptance, refinement):
-        # a motion that undoes itself brings both orders of a pair together: they are one
+        # under a motion that is its own inverse both orders of a pair agree: count one of them
         again = each.inlier & each.inlier[back] & (pairs.index_a > pairs.index_b)
         once = pairs[~again]
         log10 = each.log10_false_alarms

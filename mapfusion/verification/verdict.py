@@ -13,32 +13,43 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.likelihood import COPIED, OWN, Signs, TwinShares, probability
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import Regions, Squares, Witness, Witnesses
+from mapfusion.verification.likelihood import (
+    COPIED,
+    OWN,
+    EvidenceFeatures,
+    TwinShares,
+    probability_correct,
+)
+from mapfusion.verification.regions import (
+    EvidenceParameters,
+    RegionGrid,
+    Regions,
+    ViewedMap,
+    ViewedMapPair,
+)
 from mapfusion.verification.rivals import (
     BETWEEN,
     DISTINCT_M,
-    Copies,
-    Supported,
-    apart_m,
+    RepeatedLandmarks,
     distinct_motions,
-    largest_patch_m,
-    of_others,
+    longest_patch_side_m,
+    repeated_under_others,
+    rms_distance_m,
     self_motions,
 )
 
 
-def laid_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
-    """By how far the landmarks of map b lie off for the alignment's sake, RMS, in metres.
+def landmark_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
+    """Return the standard deviation in metres of map b's landmarks due to the alignment, RMS.
 
-    To first order: the mean over the landmarks of tr(J S J') with J = d(T p_b)/dT. What supports an
-    alignment lies in one part of the map; what the angle leaves open there grows with the distance.
+    To first order this is the root of the mean of tr(J S J') over the landmarks, J = d(T p_b)/dT.
+    The supporters of an alignment may lie in one part of the map; the effect of the angle grows
+    with the distance from them.
 
     Args:
-        T_a_b: (3,).
-        covariance: (3, 3) of it.
-        p_b: (N, 2) positions in metres.
+        T_a_b: motion, shape (3,).
+        covariance: covariance S of T_a_b, shape (3, 3).
+        p_b: positions in metres, shape (N, 2).
     """
     x, y = (transform_points(T_a_b, p_b) - T_a_b[:2]).T
     moved_by_angle = x**2 + y**2
@@ -47,30 +58,30 @@ def laid_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
     return float(np.sqrt(np.mean(squares + moved_by_angle * covariance[2, 2])))
 
 
-N_RIVALS, N_SELF_MOTIONS = 4, 3  # the best tell how much alike the others are
-_PATCH_REACH_M = 0.7  # between neighbouring corners of one picture
-_LEAST_OF_PATCH = 5
-# What is known of the shares of twins before any region is seen, as twins of so many regions: the
-# likeliest beta distributions of both under wrong motions in worlds that fool (posters and alias,
-# seeds 0 to 4), the region that led to a motion left out.
+N_RIVALS, N_SELF_MOTIONS = 4, 3  # motions searched between two maps, and of each map onto itself
+_PATCH_REACH_M = 0.7  # largest distance between neighbouring corners of one texture
+_LEAST_OF_PATCH = 5  # landmarks
+# Beta priors of the shares of regions that a wrong motion confirms, as (confirmed, all) regions:
+# maximum likelihood over wrong motions in simulated worlds with repeated structure, without the
+# region that led to each motion.
 _TWINS_BEFORE = 0.44, 3.85
 _COPIES_BEFORE = 1.14, 6.1
 
 
 @dataclass(frozen=True)
 class RivalMotion:
-    """A motion that correspondences support.
+    """Motion that correspondences support.
 
     Attributes:
-        of: BETWEEN, or the map ("a" or "b") that it lays onto itself.
-        T_a_b: (3,).
-        log10_false_alarms: of the test against chance.
-        n_support: correspondences within its widest gate.
-        n_confirmed: regions that are seen again.
-        n_contradicted: regions that are not.
-        n_regions: that must be seen.
-        log10_evidence: of the regions, of a motion between the maps; NaN of one onto itself.
-        copies: what it lays on its like.
+        of: domain: BETWEEN, or the map ("a" or "b") that the motion maps onto itself.
+        T_a_b: motion, shape (3,).
+        log10_false_alarms: log10 of the number of false alarms in the test against chance.
+        n_support: number of correspondences within the widest gate of this test.
+        n_confirmed: number of regions that support the motion.
+        n_contradicted: number of regions that contradict it.
+        n_regions: number of regions that both robots must have seen.
+        log10_evidence: log10 likelihood ratio of the regions; NaN for a motion of one map.
+        copies: landmarks that the motion maps onto matching structure.
     """
 
     of: str
@@ -81,17 +92,17 @@ class RivalMotion:
     n_contradicted: int
     n_regions: int
     log10_evidence: float
-    copies: Copies
+    copies: RepeatedLandmarks
 
 
 @dataclass(frozen=True)
 class PairEvidence:
-    """What two maps say about motions between them.
+    """Motions that two maps support, and the amount of repeated structure in them.
 
     Attributes:
-        motions: the best of each kind, best first.
-        shares: of what a wrong motion lays on its like.
-        region_m: side of a region: at least as large as what repeats.
+        motions: best motions between the maps and of each map onto itself, best first.
+        shares: shares of regions that a wrong motion confirms.
+        region_m: side of a region, at least that of the largest repeated structure.
     """
 
     motions: tuple[RivalMotion, ...]
@@ -100,26 +111,26 @@ class PairEvidence:
 
     @classmethod
     def of_nothing(cls, parameters: EvidenceParameters) -> "PairEvidence":
-        """Of two maps that no motion fits."""
+        """Return the evidence of two maps without any supported motion."""
         return cls((), _twin_shares([], []), parameters.region_m)
 
     @property
     def rivals(self) -> tuple[RivalMotion, ...]:
-        """Those between the two maps."""
+        """Motions between the two maps."""
         return tuple(each for each in self.motions if each.of == BETWEEN)
 
     def n_motions(self, log10_false_alarms: float) -> int:
-        """Motions between the maps by more than so many false alarms; at least one."""
+        """Return the number of motions between the maps below a bound of the NFA, at least 1."""
         return max(1, sum(each.log10_false_alarms <= log10_false_alarms for each in self.rivals))
 
     def repeats(self, log10_false_alarms: float) -> bool:
-        """Whether either map holds something twice, by more than so many false alarms."""
+        """Return True if a motion of either map onto itself is below a bound of the NFA."""
         onto_self = (each for each in self.motions if each.of != BETWEEN)
         return any(each.log10_false_alarms <= log10_false_alarms for each in onto_self)
 
 
 def why_not_sought(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
-    """Why two maps hold no evidence to be sought; empty where they do."""
+    """Return the data that two maps lack for a search of evidence; empty if they lack none."""
     for landmarks in (map_a, map_b):
         for what, held in (
             ("viewing evidence", landmarks.viewing),
@@ -132,54 +143,64 @@ def why_not_sought(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
 
 def find_evidence(
     pairs: Pairs,
-    witnesses: Witnesses,
+    viewed_maps: ViewedMapPair,
     acceptance: Acceptance,
     refinement: Refinement,
     parameters: EvidenceParameters,
 ) -> PairEvidence:
-    """All of it, of two maps with viewing evidence and descriptors."""
-    between = distinct_motions(pairs, N_RIVALS, acceptance, refinement)
-    region_m, onto_self = parameters.region_m, []
-    supporters = [pairs.p_a[each.inlier] for each in between]
-    for side, own in zip("ab", (witnesses.a, witnesses.b), strict=True):
-        alike, motions = _onto_itself(own, acceptance, refinement)
-        onto_self += [(side, motion) for motion in motions]
-        supporters += [alike.p_a[each.inlier] for each in motions]
-        region_m = max(region_m, _largest_twin_m(alike, motions, acceptance))
-    kinds = [*((BETWEEN, each) for each in between), *onto_self]
-    laid = [witnesses.copies(of, each.T_a_b) for of, each in kinds]
+    """Find the motions that two maps with viewing evidence and descriptors support.
+
+    Args:
+        pairs: correspondences of the maps.
+        viewed_maps: the maps, prepared for queries.
+        acceptance: test of each motion against chance.
+        refinement: least squares of each motion.
+        parameters: size of a region.
+    """
+    # motions between the maps, and of each map onto itself
+    motions = [(BETWEEN, m) for m in distinct_motions(pairs, N_RIVALS, acceptance, refinement)]
+    n_between, region_m = len(motions), parameters.region_m
+    supporters = [pairs.p_a[motion.inlier] for _, motion in motions]
+    for side, own in zip("ab", (viewed_maps.a, viewed_maps.b), strict=True):
+        key = self_motions, acceptance, refinement
+        if key not in own.kept:
+            own.kept[key] = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
+        similar, onto_itself = own.kept[key]
+        for motion in onto_itself:
+            motions.append((side, motion))
+            supporters.append(similar.p_a[motion.inlier])
+            # a region is at least as large as the largest repeated structure
+            if motion.log10_false_alarms <= math.log10(acceptance.false_alarms):
+                p = np.ascontiguousarray(similar.p_a[motion.inlier, :2])
+                side_m = longest_patch_side_m(p, _PATCH_REACH_M, _LEAST_OF_PATCH)
+                region_m = max(region_m, side_m)
+    # regions under each motion, with the structure that other motions explain counted apart
+    copies = [viewed_maps.copies(of, motion.T_a_b) for of, motion in motions]
     regions = [
-        witnesses.regions(
-            of, motion.T_a_b, Squares.about(supporters[k], region_m), of_others(laid, k)
+        viewed_maps.regions(
+            of,
+            motion.T_a_b,
+            RegionGrid.about(supporters[k], region_m),
+            repeated_under_others(copies, k),
         )
-        for k, (of, motion) in enumerate(kinds)
+        for k, (of, motion) in enumerate(motions)
     ]
-    shares = _twin_shares(regions[: len(between)], regions[len(between) :])
-    found = [
-        _rival(of, each, r, r.log10_evidence(shares) if of == BETWEEN else math.nan, copies)
-        for (of, each), r, copies in zip(kinds, regions, laid, strict=True)
-    ]
-    return PairEvidence(tuple(found), shares, region_m)
-
-
-def _onto_itself(
-    own: Witness, acceptance: Acceptance, refinement: Refinement
-) -> tuple[Pairs, list[Supported]]:
-    """The twins of a map and its motions onto itself, found once."""
-    key = self_motions, acceptance, refinement
-    if key not in own.kept:
-        own.kept[key] = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
-    return own.kept[key]
-
-
-def _largest_twin_m(alike: Pairs, motions: list[Supported], acceptance: Acceptance) -> float:
-    """The largest thing that a map holds twice."""
-    longest = 0.0
-    for motion in motions:
-        if motion.log10_false_alarms <= math.log10(acceptance.false_alarms):
-            p = np.ascontiguousarray(alike.p_a[motion.inlier, :2])
-            longest = max(longest, largest_patch_m(p, _PATCH_REACH_M, _LEAST_OF_PATCH))
-    return longest
+    shares = _twin_shares(regions[:n_between], regions[n_between:])
+    found = tuple(
+        RivalMotion(
+            of,
+            motion.T_a_b,
+            motion.log10_false_alarms,
+            int(np.count_nonzero(motion.inlier)),
+            own.n_confirmed,
+            own.n_contradicted,
+            len(own),
+            own.log10_evidence(shares) if of == BETWEEN else math.nan,
+            repeated,
+        )
+        for (of, motion), own, repeated in zip(motions, regions, copies, strict=True)
+    )
+    return PairEvidence(found, shares, region_m)
 
 
 def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
@@ -190,34 +211,26 @@ def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
     the map holds a structure twice, and says nothing of other regions.
     """
     wrong = sorted(rivals, key=lambda r: r.n_contradicted - r.n_confirmed)[1:]
-    own = [_TWINS_BEFORE, *(regions.seen_again(OWN) for regions in wrong)]
-    copied = [_COPIES_BEFORE, *(regions.seen_again(COPIED) for regions in [*wrong, *selves])]
+    own = [_TWINS_BEFORE, *(regions.count_confirmed(OWN) for regions in wrong)]
+    copied = [_COPIES_BEFORE, *(regions.count_confirmed(COPIED) for regions in [*wrong, *selves])]
     shares = (np.sum(counts, axis=0) for counts in (own, copied))
     return TwinShares(*(float(confirmed / n) for confirmed, n in shares))
 
 
-def _rival(
-    of: str, motion: Supported, regions: Regions, log10_evidence: float, copies: Copies
-) -> RivalMotion:
-    counts = (regions.n_confirmed, regions.n_contradicted, len(regions))
-    n_support = int(np.count_nonzero(motion.inlier))
-    sure = motion.log10_false_alarms
-    return RivalMotion(of, motion.T_a_b, sure, n_support, *counts, log10_evidence, copies)
-
-
 @dataclass(frozen=True)
 class Judge:
-    """All that is asked before an alignment may be used, the same for every estimator.
+    """Verification of an alignment before use, the same for every estimator.
 
-    First chance (`Acceptance`). Then what both robots looked at: regions of one map that the other
-    must have seen and has not contradict an alignment, those that it has confirm it. Maps that hold
-    things twice, or that fit in several ways, need evidence; others need only not be contradicted.
-    Then how sure it is. Of maps with labels identities say all of that.
+    The first test is against chance (`Acceptance`). The second test compares the regions that both
+    robots must have seen: a region in both maps confirms an alignment, a region missing from one
+    map contradicts it. Maps with repeated structure or with several supported motions need
+    confirmation; other maps only need the absence of contradiction. The third test bounds the
+    covariance. The second test is omitted for maps with labels.
 
     Attributes:
-        acceptance: the test against chance.
-        evidence: how much evidence is needed, and how sure an alignment has to be.
-        refinement: what rivals are refined by, as alignments are.
+        acceptance: test against chance.
+        evidence: thresholds of the evidence and of the covariance.
+        refinement: least squares of rival motions.
     """
 
     acceptance: Acceptance = field(default_factory=Acceptance)
@@ -228,51 +241,50 @@ class Judge:
         self,
         pairs: Pairs,
         known: PairEvidence | None = None,
-        witnesses: tuple[Witness, Witness] | None = None,
+        viewed_maps: tuple[ViewedMap, ViewedMap] | None = None,
     ) -> "PairJudge":
-        """Made ready for any number of alignments of two maps.
+        """Prepare the verification of any number of alignments of two maps.
 
         Args:
-            pairs: their correspondences.
-            known: what was found for them before; sought where it is needed if None.
-            witnesses: both maps made ready, and perhaps asked about other pairs before; they are
-                made ready where it is needed if None.
+            pairs: correspondences of the maps.
+            known: evidence found earlier; by default it is found at first use.
+            viewed_maps: both maps prepared for queries; by default they are prepared at first use.
         """
-        return PairJudge(self, pairs, known, witnesses)
+        return PairJudge(self, pairs, known, viewed_maps)
 
 
 class PairJudge:
-    """A `Judge` on two maps."""
+    """`Judge` prepared for two maps."""
 
     def __init__(
         self,
         judge: Judge,
         pairs: Pairs,
         known: PairEvidence | None,
-        witnesses: tuple[Witness, Witness] | None,
+        viewed_maps: tuple[ViewedMap, ViewedMap] | None,
     ) -> None:
-        self._judge, self._pairs, self._known, self._ready = judge, pairs, known, witnesses
+        self._judge, self._pairs, self._known, self._ready = judge, pairs, known, viewed_maps
         self._chance = judge.acceptance.on(pairs)
         self._bound = math.log10(judge.acceptance.false_alarms)
 
     @cached_property
-    def _witnesses(self) -> Witnesses:
-        a, b = self._ready or (Witness(self._pairs.map_a), Witness(self._pairs.map_b))
-        return Witnesses(a, b, self._judge.evidence)
+    def _viewed_maps(self) -> ViewedMapPair:
+        a, b = self._ready or (ViewedMap(self._pairs.map_a), ViewedMap(self._pairs.map_b))
+        return ViewedMapPair(a, b, self._judge.evidence)
 
     @cached_property
     def evidence(self) -> PairEvidence | None:
-        """What the maps say about motions between them; None where it cannot be sought."""
+        """Evidence of the maps, found at first use; None if they carry none."""
         if self._pairs.by_name or why_not_sought(self._pairs.map_a, self._pairs.map_b):
             return None
         if self._known is not None:
             return self._known
         judge = self._judge
         settings = (judge.acceptance, judge.refinement, judge.evidence)
-        return find_evidence(self._pairs, self._witnesses, *settings)
+        return find_evidence(self._pairs, self._viewed_maps, *settings)
 
     def judge(self, alignment: Alignment) -> Verdict:
-        """The verdict on one alignment of the correspondences."""
+        """Return the verdict on one alignment of the correspondences."""
         by_chance = self._chance.judge(alignment)
         if not by_chance.accepted:
             return by_chance
@@ -280,13 +292,22 @@ class PairJudge:
         evidence = self.evidence
         if evidence is not None:
             regions = self.regions(alignment, evidence)
-            found = regions.log10_evidence(evidence.shares)
-            told = {"log10_evidence": found, "n_confirmed": regions.n_confirmed}
-            signs = self._signs(alignment, regions, evidence, by_chance.log10_false_alarms)
-            p = probability(signs)
+            log10_evidence = regions.log10_evidence(evidence.shares)
+            told = {"log10_evidence": log10_evidence, "n_confirmed": regions.n_confirmed}
+            features = self._features(alignment, regions, evidence, by_chance.log10_false_alarms)
+            p = probability_correct(features)
             told |= {"n_contradicted": regions.n_contradicted, "probability": p}
-            status, reason = self._weighed(alignment, regions, evidence)
-            if status is Status.ACCEPTED and p < self._judge.evidence.least_probability:
+            # a contradiction counts even together with the region that led to the alignment
+            settings = self._judge.evidence
+            counts = f"{regions.n_confirmed} of {len(regions)} regions that both must have seen"
+            counts = f"{counts} are in both maps"
+            if regions.log10_ratio(evidence.shares) < -math.log10(settings.most_against):
+                status = Status.REFUSED
+                missing = regions.n_contradicted
+                reason = f"contradicted: {counts}, {missing} are missing from one"
+            elif doubt := self._doubt(alignment, regions, evidence):
+                status, reason = Status.AMBIGUOUS, doubt.format(told=counts)
+            elif p < settings.least_probability:
                 status = Status.AMBIGUOUS
                 reason = f"right with probability {p:.2g} alone, by all that speaks for and against"
         elif not self._pairs.by_name:
@@ -297,76 +318,72 @@ class PairJudge:
         return Verdict(status, by_chance.log10_false_alarms, reason, **told)
 
     def rivals_of(self, alignment: Alignment) -> list[Alignment]:
-        """The other motions that the maps support, refined and ambiguous; none without evidence."""
+        """Return the other motions that the maps support, refined, with the status ambiguous.
+
+        The list is empty without evidence.
+        """
         if self.evidence is None:
             return []
         others = self._others(alignment.T_a_b, self.evidence)
         refined = (self._judge.refinement.refine(self._pairs, each.T_a_b) for each in others)
         return [replace(each, status=Status.AMBIGUOUS) for each in refined if each.ok]
 
-    def signs(self, alignment: Alignment) -> Signs | None:
-        """What speaks for and against an alignment; None where no evidence can be sought."""
+    def features(self, alignment: Alignment) -> EvidenceFeatures | None:
+        """Return the features of an alignment; None if the maps carry no evidence."""
         if self.evidence is None:
             return None
         by_chance = self._chance.judge(alignment).log10_false_alarms
         regions = self.regions(alignment, self.evidence)
-        return self._signs(alignment, regions, self.evidence, by_chance)
+        return self._features(alignment, regions, self.evidence, by_chance)
 
     def regions(self, alignment: Alignment, evidence: PairEvidence) -> Regions:
-        """What becomes of what both robots must have seen under an alignment."""
+        """Return the regions that both robots must have seen under an alignment."""
         T_a_b, p_b = alignment.T_a_b, self._pairs.map_b.position_m[:, :2]
-        squares = Squares.about(self._pairs.p_a[alignment.inlier], evidence.region_m)
+        squares = RegionGrid.about(self._pairs.p_a[alignment.inlier], evidence.region_m)
         others = (
             each.copies
             for each in evidence.motions
-            if each.of != BETWEEN or apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
+            if each.of != BETWEEN or rms_distance_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
         )
-        none = Copies.none(len(self._pairs.map_a), len(self._pairs.map_b))
-        return self._witnesses.regions(BETWEEN, T_a_b, squares, none.joined(others))
+        none = RepeatedLandmarks.none(len(self._pairs.map_a), len(self._pairs.map_b))
+        return self._viewed_maps.regions(BETWEEN, T_a_b, squares, none.joined(others))
 
-    def _signs(
+    def _features(
         self,
         alignment: Alignment,
         regions: Regions,
         evidence: PairEvidence,
         log10_false_alarms: float,
-    ) -> Signs:
+    ) -> EvidenceFeatures:
         told = log10_false_alarms, regions.log10_evidence(evidence.shares)
         counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
         extent_m = self._extent_m(alignment)
         one_place = self._is_one_place(alignment, extent_m)
         repeats = evidence.repeats(self._bound)
-        return Signs(*told, *counts, extent_m, repeats, one_place)
-
-    def _weighed(
-        self, alignment: Alignment, regions: Regions, evidence: PairEvidence
-    ) -> tuple[Status, str]:
-        """What the evidence makes of an alignment that is more than chance.
-
-        It speaks against one where it does so though the region by which it was found counts.
-        """
-        against, n = regions.n_contradicted, len(regions)
-        told = f"{regions.n_confirmed} of {n} regions that both must have seen are in both maps"
-        least = -math.log10(self._judge.evidence.most_against)
-        if regions.log10_ratio(evidence.shares) < least:
-            return Status.REFUSED, f"contradicted: {told}, {against} are missing from one"
-        doubt = self._doubt(alignment, regions, evidence)
-        if not doubt:
-            return Status.ACCEPTED, ""
-        return Status.AMBIGUOUS, doubt.format(told=told)
+        return EvidenceFeatures(*told, *counts, extent_m, repeats, one_place)
 
     def _doubt(self, alignment: Alignment, regions: Regions, evidence: PairEvidence) -> str:
-        """Why another place may be the right one, with `{told}` of the regions; else empty."""
+        """Return why another motion may be the right one; empty if none may.
+
+        The text contains the placeholder `{told}` for the counts of regions.
+        """
         settings, extent_m = self._judge.evidence, self._extent_m(alignment)
         ratio = regions.log10_evidence(evidence.shares)
-        rivals = self._rivals(alignment.T_a_b, evidence)
+        # Other motions beyond chance. Their regions count as well, since two copies of a texture
+        # share the correspondences. Under a wrong motion the likelihood ratio of the regions
+        # exceeds 10^r with probability at most 10^-r (Markov), which lowers the NFA by r decades.
+        rivals = [
+            each
+            for each in self._others(alignment.T_a_b, evidence)
+            if each.log10_false_alarms - max(each.log10_evidence, 0.0) <= self._bound
+        ]
         rival = max(rivals, key=lambda each: each.log10_evidence, default=None)
         if rival is not None and rival.log10_evidence > ratio - math.log10(settings.most_against):
             return f"{{told}}; so do {_named(rival)}"
         if self._is_one_place(alignment, extent_m):
             what = f"the maps show little else than this place of {extent_m:.2g} m"
             return f"{what}; what lies around it tells whether it is another's like"
-        # the best of n wrong motions gets there n times as often
+        # the best of n wrong motions reaches the threshold n times as often (Boole)
         n_motions = evidence.n_motions(self._bound)
         if ratio >= math.log10(settings.least_ratio * n_motions):
             return ""
@@ -374,8 +391,8 @@ class PairJudge:
             return f"{{told}}, too few beside {_named(rival)}"
         if evidence.repeats(self._bound):
             return "{told}, too few for maps that hold things twice"
-        # Nothing repeats and no other motion fits: a region that contradicts is enough to doubt
-        # what is not likelier right by all but the one that led to it; else that one counts, too.
+        # No structure repeats and no other motion fits. One contradicting region is then a reason
+        # for doubt if the regions, without the one that led to the motion, do not favour it.
         if ratio < 0 and regions.n_contradicted:
             return "{told}; beside the one that led to it they speak against it"
         few = regions.log10_ratio(evidence.shares) < math.log10(settings.least_ratio)
@@ -384,43 +401,31 @@ class PairJudge:
             return f"{what} and could hang elsewhere too; no other region confirms it"
         return ""
 
-    def _rivals(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
-        """Of the other motions those that are more than chance.
-
-        What both robots saw of them counts, too, as of two copies of a picture each gets half the
-        correspondences: under a wrong motion regions beside the one that it was found by are 10^r
-        times likelier than not in at most one of so many cases (Markov), so that chance gives as
-        much that much more seldom.
-        """
+    def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
+        """Return the rivals that differ from a motion."""
+        p_b = self._pairs.map_b.position_m[:, :2]
         return [
-            each
-            for each in self._others(T_a_b, evidence)
-            if each.log10_false_alarms - max(each.log10_evidence, 0.0) <= self._bound
+            each for each in evidence.rivals if rms_distance_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M
         ]
 
-    def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
-        """The rivals that are another motion."""
-        p_b = self._pairs.map_b.position_m[:, :2]
-        return [each for each in evidence.rivals if apart_m(T_a_b, each.T_a_b, p_b) >= DISTINCT_M]
-
     def _extent_m(self, alignment: Alignment) -> float:
-        """The longer side of where the supporters lie."""
+        """Return the longer side of the bounding box of the supporters."""
         return float(np.ptp(self._pairs.p_b[alignment.inlier, :2], axis=0).max(initial=0.0))
 
     def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
-        """Whether most of a map is one place that agrees, and no larger than a room."""
+        """Return True if most of the smaller map agrees and lies within the size of a room."""
         smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
         most = np.count_nonzero(alignment.inlier) > smaller / 2
         return bool(most) and extent_m < self._judge.evidence.place_m
 
     def _why_unsure(self, alignment: Alignment) -> str:
-        """Why an alignment is not sure enough to be used; empty when it is."""
+        """Return why the covariance of an alignment is too large; empty if it is not."""
         settings, p_a = self._judge.evidence, self._pairs.p_a[alignment.inlier, :2]
-        # Landmarks known by name are few and far apart: where paths bend each is off by itself.
+        # Labelled landmarks are few and far apart, so that their drift is independent.
         drift_m = 0.0 if self._pairs.by_name else alignment.drift_sigma_m
         stated = whole_map_covariance(alignment.T_a_b, alignment.covariance, drift_m, p_a)
         p_b = self._pairs.map_b.position_m[:, :2]
-        sigma_m, sigma_rad = laid_sigma_m(alignment.T_a_b, stated, p_b), math.sqrt(stated[2, 2])
+        sigma_m, sigma_rad = landmark_sigma_m(alignment.T_a_b, stated, p_b), math.sqrt(stated[2, 2])
         if sigma_m <= settings.max_sigma_m and sigma_rad <= settings.max_sigma_rad:
             return ""
         found = f"sigma {sigma_m:.2g} m, {sigma_rad:.2g} rad"
@@ -428,7 +433,7 @@ class PairJudge:
 
 
 def _named(rival: RivalMotion) -> str:
-    """A rival as a person can try it."""
+    """Return a rival motion in words, with its transform."""
     x_m, y_m, theta_rad = rival.T_a_b
     T = f"T_a_b = ({x_m:.2f} m, {y_m:.2f} m, {theta_rad:.2f} rad)"
     return f"{rival.n_confirmed} of {rival.n_regions} under {T} with {rival.n_support} pairs"

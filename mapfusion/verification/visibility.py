@@ -1,4 +1,8 @@
-"""Visibility: landmarks of one map that the robot of the other must have seen."""
+"""Visibility: landmarks of one map that the robot of the other map must have seen.
+
+Poses are tested in blocks of consecutive frames. A bound for the whole block excludes most blocks;
+the poses of the others are tested one by one.
+"""
 
 import math
 from typing import NamedTuple
@@ -9,25 +13,26 @@ from mapfusion.geometry.numerics import WORD, Float, kernel, packed, popcount, t
 from mapfusion.geometry.se2 import wrap
 from mapfusion.viewing import FieldOfView, Viewing
 
-# Frames in a row that are looked at together: in so many a robot neither drives nor turns far.
-STRETCH = 8
-ROUNDING = 1e-9  # of a distance, an angle or a slope: more than it is off by rounding
-# Beyond what was seen in that direction by no more than this a landmark is not hidden: the same
-# wall, a little slanted within a part of the field of view.
+# Consecutive frames per block. A robot moves and turns little in this time.
+FRAMES_PER_BLOCK = 8
+ROUNDING = 1e-9  # relative bound on the rounding error of a distance, an angle or a slope
+# A landmark at most this far behind the farthest landmark of its sector is not occluded: within a
+# sector, a slanted wall covers a range of distances.
 BEHIND_M = 0.3
-CELLS = 512  # of slopes; so many that few hold an edge of a part
-_STEEPEST_RAD = math.pi / 2 - 1e-3  # aside: from there on a slope says little of an angle
+CELLS = 512  # slope cells; few of them contain the edge of a sector
+_STEEPEST_RAD = math.pi / 2 - 1e-3  # bearing beyond which a slope resolves angles poorly
 
 
-class Stretches(NamedTuple):
-    """C stretches of STRETCH frames in a row, the last one shorter.
+class PoseBlocks(NamedTuple):
+    """C blocks of FRAMES_PER_BLOCK consecutive frames; the last block may be shorter.
 
     Attributes:
-        x_m, y_m: (C,) middle of the places.
-        radius_m: (C,) about it within which all of them lie.
-        cos, sin: (C,) of the mean heading.
-        least_cos: (C,) of the angle between this and whatever lies in view from any of them.
-        reach_m: (C,) range of the farthest that any of them had in view.
+        x_m, y_m: centre of the positions, shape (C,).
+        radius_m: radius about the centre that contains all positions, shape (C,).
+        cos, sin: mean heading, shape (C,).
+        least_cos: cosine of the largest angle between the mean heading and a visible point,
+            shape (C,).
+        reach_m: range of the farthest landmark in view of any pose, shape (C,).
     """
 
     x_m: Float
@@ -40,12 +45,13 @@ class Stretches(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """The poses of C stretches, the last one filled up with poses that saw nothing.
+    """Poses of C blocks; the last block is padded with poses that saw nothing.
 
     Attributes:
-        x_m, y_m, cos, sin: (C, STRETCH) places and headings.
-        reach_m: (C, STRETCH (B + 2)) range up to which something was in view in each of B parts of
-            the field of view; then for what lies in none of them, and for what may lie in any.
+        x_m, y_m, cos, sin: positions and headings, shape (C, FRAMES_PER_BLOCK).
+        reach_m: range of the farthest landmark seen in each of the B sectors, followed by one
+            value for points outside the field of view and one for points whose sector is
+            undecided, shape (C, FRAMES_PER_BLOCK (B + 2)).
     """
 
     x_m: Float
@@ -55,13 +61,14 @@ class Poses(NamedTuple):
     reach_m: Float
 
 
-class Parts(NamedTuple):
-    """In which of B parts of the field of view something lies, by its slope: left over ahead.
+class BearingSectors(NamedTuple):
+    """Lookup table from a slope (left over ahead) to one of the B sectors of the field of view.
 
     Attributes:
-        part: (CELLS,) of a cell of slopes; B where it is in none, B + 1 where an edge is near.
-        first: slope at which the first cell begins.
-        per_slope: cells for a slope of 1.
+        part: sector of each slope cell, shape (CELLS,); B outside the field of view, B + 1 where
+            the edge of a sector lies in the cell.
+        first: slope at the start of the first cell.
+        per_slope: number of cells per unit of slope.
     """
 
     part: np.ndarray
@@ -69,14 +76,14 @@ class Parts(NamedTuple):
     per_slope: float
 
     @classmethod
-    def of(cls, field: FieldOfView, parts: int) -> "Parts":
-        """Of a field of view in so many parts of equal angles."""
+    def of(cls, field: FieldOfView, parts: int) -> "BearingSectors":
+        """Return the table of a field of view with a number of sectors of equal angle."""
         low, high = field.bearing_rad
         if not low < high:
             return cls(np.full(CELLS, parts), 0.0, 1.0)
         if max(abs(low), abs(high)) > _STEEPEST_RAD:
             return cls(np.full(CELLS, parts + 1), 0.0, 1.0)
-        width = (math.tan(high) - math.tan(low)) / (CELLS - 4)  # the outer two lie in no part
+        width = (math.tan(high) - math.tan(low)) / (CELLS - 4)  # two cells on each side lie outside
         first = math.tan(low) - 2 * width
         begins = first + width * np.arange(CELLS)
         ends = begins[None] + np.array([[-ROUNDING], [width + ROUNDING]])
@@ -86,90 +93,101 @@ class Parts(NamedTuple):
         return cls(part.astype(np.int64), first, 1 / width)
 
 
-class Watch(NamedTuple):
-    """All poses of a path of T frames, and what was in view from them.
+class ViewingHistory(NamedTuple):
+    """Poses of a path of T frames and the ranges seen from each of them.
 
     Attributes:
-        stretches: several poses together.
-        poses: by themselves.
-        parts: of the field of view.
-        reach_m: (T, B) range of the farthest landmark seen in each part.
-        bearing_rad, range_m: (2,) of the field of view.
-        height_m: (H, 2).
+        blocks: bounds of each block of poses.
+        poses: single poses.
+        parts: sectors of the field of view.
+        reach_m: range of the farthest landmark seen in each sector, shape (T, B).
+        bearing_rad, range_m: limits of the field of view, shape (2,).
+        height_m: limits of the visible heights at each of H steps of range, shape (H, 2).
     """
 
-    stretches: Stretches
+    blocks: PoseBlocks
     poses: Poses
-    parts: Parts
+    parts: BearingSectors
     reach_m: np.ndarray
     bearing_rad: Float
     range_m: Float
     height_m: Float
 
     @classmethod
-    def of(cls, viewing: Viewing) -> "Watch":
-        """Of viewing evidence."""
+    def of(cls, viewing: Viewing) -> "ViewingHistory":
+        """Return the history of a map's viewing evidence."""
         field, reach = viewing.field, viewing.reach_m
         n_frames, n_parts = reach.shape
-        n = -(-n_frames // STRETCH)
-        farthest = np.full((n * STRETCH, n_parts + 2), -np.inf)
+        n = -(-n_frames // FRAMES_PER_BLOCK)
+        farthest = np.full((n * FRAMES_PER_BLOCK, n_parts + 2), -np.inf)
         farthest[:n_frames, :n_parts] = reach.astype(np.float64) + BEHIND_M
         farthest[:n_frames, n_parts + 1] = np.inf
-        rows = np.minimum(np.arange(n * STRETCH), n_frames - 1).reshape(n, STRETCH)
+        rows = np.minimum(np.arange(n * FRAMES_PER_BLOCK), n_frames - 1).reshape(
+            n, FRAMES_PER_BLOCK
+        )
         x, y, theta = (np.ascontiguousarray(viewing.pose[rows, k]) for k in range(3))
         aside_rad = float(np.abs(field.bearing_rad).max())
         reach_m = farthest[:, :n_parts].reshape(n, -1).max(axis=1)
         poses = Poses(x, y, np.cos(theta), np.sin(theta), farthest.reshape(n, -1))
-        together = _together(poses, theta, reach_m, aside_rad)
+        # bounds of each block
+        mid_x, mid_y = ((v.min(axis=1) + v.max(axis=1)) / 2 for v in (x, y))
+        square = (x - mid_x[:, None]) ** 2 + (y - mid_y[:, None]) ** 2
+        mean = np.arctan2(poses.sin.sum(axis=1), poses.cos.sum(axis=1))
+        turned = np.abs(wrap(theta - mean[:, None])).max(axis=1)
+        least = np.cos(np.minimum(aside_rad + turned + ROUNDING, np.pi))
+        radius_m = np.sqrt(square.max(axis=1))
+        blocks = PoseBlocks(mid_x, mid_y, radius_m, np.cos(mean), np.sin(mean), least, reach_m)
         limits = field.bearing_rad, field.range_m, field.height_m
-        return cls(together, poses, Parts.of(field, n_parts), reach, *limits)
+        return cls(blocks, poses, BearingSectors.of(field, n_parts), reach, *limits)
 
 
-def _together(poses: Poses, theta: Float, reach_m: Float, aside_rad: float) -> Stretches:
-    """Poses of angles theta (C, STRETCH) that saw so far (C,), and so far aside."""
-    x, y = ((v.min(axis=1) + v.max(axis=1)) / 2 for v in (poses.x_m, poses.y_m))
-    square = (poses.x_m - x[:, None]) ** 2 + (poses.y_m - y[:, None]) ** 2
-    mean = np.arctan2(poses.sin.sum(axis=1), poses.cos.sum(axis=1))
-    turned = np.abs(wrap(theta - mean[:, None])).max(axis=1)
-    least = np.cos(np.minimum(aside_rad + turned + ROUNDING, np.pi))
-    return Stretches(x, y, np.sqrt(square.max(axis=1)), np.cos(mean), np.sin(mean), least, reach_m)
-
-
-# In which it lay in view: a track is observed from its third frame on, and after three observations
-# its landmark is in the map (the defaults of `TrackParameters.min_length` and `min_count`).
+# Frames with a landmark in view that put the landmark into the map: a track is observed from its
+# third frame on, and a landmark needs three observations (the defaults of
+# `TrackParameters.min_length` and `min_count`).
 LEAST_FRAMES = 5
-# How a landmark that another robot saw lay in view of this one: not at all; from another distance
-# or side, from where some are found again (U-SURF's window follows the depth, but the window of one
-# picture holds other things at another distance, and the slant changes it); from about where it was
-# seen, from where nearly all are.
+# Visibility of a landmark from a path. UNSEEN: not in view. MAY: in view from another distance or
+# side, where only some landmarks are matched again, because the descriptor window covers other
+# surfaces and the slant changes it. MUST: in view from a similar viewpoint, where nearly all are.
 UNSEEN, MAY, MUST = 0, 1, 2
 
 
-class Likeness(NamedTuple):
-    """From where a landmark looks as it did: within a ratio of its distance, and an angle."""
+class ViewpointTolerance(NamedTuple):
+    """Viewpoints with similar descriptors: largest ratio of distances and largest angle."""
 
     ratio: float
     slant_rad: float
 
 
-LIKE = {MUST: Likeness(1.4, math.radians(30.0)), MAY: Likeness(2.0, math.radians(45.0))}
-_MUST_RATIO2, _MAY_RATIO2 = LIKE[MUST].ratio ** 2, LIKE[MAY].ratio ** 2
-_MUST_COS2, _MAY_COS2 = math.cos(LIKE[MUST].slant_rad) ** 2, math.cos(LIKE[MAY].slant_rad) ** 2
-_MAY_RATIO, _MAY_COS = LIKE[MAY].ratio, math.cos(LIKE[MAY].slant_rad)
+VIEWPOINT_TOLERANCES = {
+    MUST: ViewpointTolerance(1.4, math.radians(30.0)),
+    MAY: ViewpointTolerance(2.0, math.radians(45.0)),
+}
+_MUST_RATIO2, _MAY_RATIO2 = (
+    VIEWPOINT_TOLERANCES[MUST].ratio ** 2,
+    VIEWPOINT_TOLERANCES[MAY].ratio ** 2,
+)
+_MUST_COS2, _MAY_COS2 = (
+    math.cos(VIEWPOINT_TOLERANCES[MUST].slant_rad) ** 2,
+    math.cos(VIEWPOINT_TOLERANCES[MAY].slant_rad) ** 2,
+)
+_MAY_RATIO, _MAY_COS = (
+    VIEWPOINT_TOLERANCES[MAY].ratio,
+    math.cos(VIEWPOINT_TOLERANCES[MAY].slant_rad),
+)
 _ONES = np.uint64(0x0101010101010101)  # the lowest bit of each byte
-# Bits of what `_look` says of a pose: it may have seen a landmark, from about where it was seen, or
-# so it is but for the part of the field of view, which is to be looked up by the angle.
+# Bits of the flags of a pose: the landmark is in view (MAY), it is in view from a similar viewpoint
+# (ALIKE), and the sector is undecided so that the angle must be computed (UNSURE).
 _MAY_BIT, _ALIKE_BIT, _UNSURE_BIT = 0, 1, 2
-_LEAST_AHEAD = 1e-300  # m; what is behind has no slope, and is told by its sign
+_LEAST_AHEAD = 1e-300  # m; avoids a division by zero; the sign of `ahead` excludes points behind
 
 
-class Seen(NamedTuple):
-    """N landmarks and how they were seen, in the frame of the robot that looks for them.
+class ObservedLandmarks(NamedTuple):
+    """N landmarks with their viewpoints, in the frame of the other robot.
 
     Attributes:
-        p: (N, 3) positions.
-        direction: (N, 2) unit vectors from the robot that saw them.
-        distance_m: (N,) from it; 0 for landmarks of which it is not known.
+        p: positions, shape (N, 3).
+        direction: unit vectors from the observing robot to the landmark, shape (N, 2).
+        distance_m: distance from the observing robot, shape (N,); 0 if unknown.
     """
 
     p: Float
@@ -178,24 +196,27 @@ class Seen(NamedTuple):
 
 
 @kernel
-def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
-    """UNSEEN, MAY or MUST (N,) of each landmark: LEAST_FRAMES frames or more had it in view so."""
+def classify_visibility(seen: ObservedLandmarks, watch: ViewingHistory) -> np.ndarray:
+    """Return UNSEEN, MAY or MUST for each landmark, shape (N,).
+
+    A class needs at least LEAST_FRAMES frames with the landmark in view.
+    """
     p, direction, distance_m = seen
-    # arrays by themselves: taken from a tuple, each access would count its references
-    stretches, poses, parts, reach_m, bearing_rad, range_m, height_m = watch
-    x, y, radius, cos, sin, least_cos, stretch_m = stretches
+    # unpacked once: each access through the tuple would count references
+    blocks, poses, parts, reach_m, bearing_rad, range_m, height_m = watch
+    x, y, radius, cos, sin, least_cos, block_reach_m = blocks
     how = np.zeros(len(p), np.int64)
     eights = np.zeros((len(x) + WORD - 1) // WORD * 8, np.uint64)
     possible = eights.view(np.uint8)[: len(x)]
     lanes = np.zeros(1, np.uint64)
-    said = lanes.view(np.uint8)
+    flags = lanes.view(np.uint8)
     for i in range(len(p)):
-        # a plain 0 is a type of its own, for which kernels would be compiled once more
+        # np.int64 keeps one type; a literal 0 would compile the kernels a second time
         r, ux, uy, levels = distance_m[i], direction[i, 0], direction[i, 1], np.int64(0)
         for step in range(len(height_m)):
             levels |= (height_m[step, 0] <= p[i, 2] <= height_m[step, 1]) << step
         own = p[i, 0], p[i, 1], ux, uy, max(r / _MAY_RATIO, range_m[0]), r * _MAY_RATIO
-        _mark_possible(own, x, y, radius, cos, sin, least_cos, stretch_m, possible)
+        _mark_possible_blocks(own, x, y, radius, cos, sin, least_cos, block_reach_m, possible)
         must = may = 0
         for w in range(len(eights) // 8):
             word = packed(eights, w)
@@ -203,12 +224,12 @@ def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
                 c = w * WORD + trailing_zeros(word)
                 word &= word - np.uint64(1)
                 sight = p[i, 0], p[i, 1], ux, uy, r * r
-                _look(sight, c, levels, poses, parts, range_m, len(height_m), said)
+                _flag_poses(sight, c, levels, poses, parts, range_m, len(height_m), flags)
                 unsure = (lanes[0] >> np.uint64(_UNSURE_BIT)) & _ONES
                 while unsure:
                     k = trailing_zeros(unsure) >> 3
                     unsure &= unsure - np.uint64(1)
-                    said[k] *= _is_in_view(sight, c, k, poses, bearing_rad, reach_m)
+                    flags[k] *= _is_in_view(sight, c, k, poses, bearing_rad, reach_m)
                 may += popcount((lanes[0] >> np.uint64(_MAY_BIT)) & _ONES)
                 must += popcount((lanes[0] >> np.uint64(_ALIKE_BIT)) & _ONES)
             if must >= LEAST_FRAMES:
@@ -221,7 +242,7 @@ def how_seen(seen: Seen, watch: Watch) -> np.ndarray:
 
 
 @kernel
-def _mark_possible(
+def _mark_possible_blocks(
     own: tuple[float, float, float, float, float, float],
     x: Float,
     y: Float,
@@ -232,12 +253,11 @@ def _mark_possible(
     reach_m: Float,
     possible: np.ndarray,
 ) -> None:
-    """Mark the stretches (C,) that may have a pose from which a landmark lies in view as it did.
+    """Mark the blocks (C,) that may contain a pose with the landmark in view.
 
-    Of the landmark are given its place, the direction in which it was seen, and how near and how
-    far a pose may be. A place that is off by no more than a radius changes each length below by no
-    more than twice that. Written so that the compiler takes several at once: no index but the
-    loop's own, no branch.
+    `own` is the landmark's position, its viewing direction, and the smallest and largest distance
+    of a pose. A displacement by at most the block's radius changes each length below by at most
+    twice that radius. The loop has no branch and no other index, so that it is vectorised.
     """
     at_x, at_y, ux, uy, nearest, farthest = own
     for k in range(len(possible)):
@@ -255,29 +275,29 @@ def _mark_possible(
 
 
 @kernel
-def _look(
+def _flag_poses(
     sight: tuple[float, float, float, float, float],
     c: int,
     levels: int,
     poses: Poses,
-    parts: Parts,
+    parts: BearingSectors,
     range_m: Float,
     n_steps: int,
-    said: np.ndarray,
+    flags: np.ndarray,
 ) -> None:
-    """Say (STRETCH,) whether and how a landmark lay in view of each pose of a stretch.
+    """Set the flags (FRAMES_PER_BLOCK,) of each pose of block c for one landmark.
 
-    Of the landmark are given its place, the direction in which it was seen and the square of its
-    distance then; and at which steps of range, as bits, its height is in view. Written, as the
-    above, so that the compiler takes several poses at once; indices without a sign for the same.
+    `sight` is the landmark's position, its viewing direction and the square of its viewing
+    distance. Bit h of `levels` is set if its height is in view at step h of the range. The loop is
+    vectorised: no branch, and unsigned indices.
     """
     x, y, cos, sin, reach_m = poses
     part_of, first, per_slope = parts
     at_x, at_y, ux, uy, r2 = sight
-    nearest, farthest, columns = range_m[0], range_m[1], reach_m.shape[1] // STRETCH
+    nearest, farthest, columns = range_m[0], range_m[1], reach_m.shape[1] // FRAMES_PER_BLOCK
     per_range = farthest if farthest > 0 else 1.0
     row = np.uint64(c)
-    for k in range(STRETCH):
+    for k in range(FRAMES_PER_BLOCK):
         dx, dy = at_x - x[c, k], at_y - y[c, k]
         square, along = dx * dx + dy * dy, dx * ux + dy * uy
         away = math.sqrt(square)
@@ -303,7 +323,7 @@ def _look(
             & (_MUST_RATIO2 * square <= _MUST_RATIO2 * _MUST_RATIO2 * r2)
             & (along * along >= _MUST_COS2 * square)
         )
-        said[k] = may * ((1 << _MAY_BIT) + (alike << _ALIKE_BIT) + (unsure << _UNSURE_BIT))
+        flags[k] = may * ((1 << _MAY_BIT) + (alike << _ALIKE_BIT) + (unsure << _UNSURE_BIT))
 
 
 @kernel
@@ -315,9 +335,9 @@ def _is_in_view(
     bearings: Float,
     reach_m: np.ndarray,
 ) -> bool:
-    """Whether a place is in view of a pose by its bearing, and not hidden, by the angle itself.
+    """Return True if a landmark is in view of pose k of block c and not occluded.
 
-    The field of view is by bearing (2,); reach_m is (T, B).
+    The bearing is computed exactly. `bearings` (2,) limits the field of view; `reach_m` is (T, B).
     """
     dx, dy = sight[0] - poses.x_m[c, k], sight[1] - poses.y_m[c, k]
     cos, sin = poses.cos[c, k], poses.sin[c, k]
@@ -326,4 +346,4 @@ def _is_in_view(
     if not low <= bearing <= high:
         return False
     part = min(int((bearing - low) / (high - low) * parts), parts - 1)
-    return math.sqrt(dx * dx + dy * dy) <= reach_m[c * STRETCH + k, part] + BEHIND_M
+    return math.sqrt(dx * dx + dy * dy) <= reach_m[c * FRAMES_PER_BLOCK + k, part] + BEHIND_M

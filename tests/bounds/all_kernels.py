@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.align.aligners import ALIGNERS, make_aligner
-from mapfusion.align.clique import everyone, larger_clique
+from mapfusion.align.clique import full_set, larger_clique
 from mapfusion.align.correspondences import match
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se3 import in_space
@@ -98,7 +98,7 @@ def alignments() -> None:
     test_finds_what_looking_at_all_finds("spread", "with others", 75)
     test_what_was_found_before_gives_the_same_verdict()
     test_a_picture_that_hangs_twice_leaves_two_places()
-    larger_clique(on_bits(random_graph(0, 130, 0.3)), everyone(130), 0, 1000)
+    larger_clique(on_bits(random_graph(0, 130, 0.3)), full_set(130), 0, 1000)
     test_calibration_counts_every_motion_of_two_pairs()
 
 

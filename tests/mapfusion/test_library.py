@@ -1,6 +1,7 @@
 """The names that `import mapfusion` offers, and the page that shows them."""
 
 import ast
+import importlib.util
 import re
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import mapfusion
+from mapfusion.errors import MOVED_MODULES
 from mapfusion.geometry.se2 import between, wrap
 
 ROOT = Path(__file__).parents[2]
@@ -65,3 +67,10 @@ def test_the_page_s_example_gives_the_map_of_both_robots(tmp_path: Path):
 def test_the_page_names_all_that_is_offered():
     table = PAGE.read_text().split("## ")[0]
     assert {name for name in mapfusion.__all__ if f"`{name}`" not in table} == set()
+
+
+@pytest.mark.parametrize(("former", "new"), MOVED_MODULES.items())
+def test_former_modules_are_gone_and_the_named_ones_exist(former: str, new: str):
+    assert importlib.util.find_spec(new) is not None
+    with pytest.raises(ImportError):
+        importlib.import_module(former)

@@ -28,7 +28,7 @@ from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Refinement
 from mapfusion.registration import Completion, PairRegistration
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.verification.parameters import EvidenceParameters
+from mapfusion.verification.regions import EvidenceParameters
 from mapfusion.verification.verdict import Judge
 
 LABEL, WRITES = match.LABEL, match.WRITES[:1]

@@ -21,8 +21,7 @@ from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.align.refinement import Refinement
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import Witness
+from mapfusion.verification.regions import EvidenceParameters, ViewedMap
 from mapfusion.verification.verdict import Judge, why_not_sought
 
 # Evaluated iterations a part: small enough that an interruption loses little and two cores end
@@ -51,11 +50,11 @@ def run(settings: MatchSettings, job: Job) -> None:
     for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
         pairs = match(map_a, map_b, settings.match)
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
-        witnesses = None
+        viewed_maps = None
         if not why_not_sought(map_a, map_b):
             a, b = folders_of_both(job)
-            witnesses = _witness(a, k), _witness(b, k)
-        if evidence := judge.on(Pairs(map_a, map_b, pairs), witnesses=witnesses).evidence:
+            viewed_maps = _viewed_map(a, k), _viewed_map(b, k)
+        if evidence := judge.on(Pairs(map_a, map_b, pairs), viewed_maps=viewed_maps).evidence:
             rivals += rival_rows(names, evidence)
         columns = names | {"index_a": pairs.index_a, "index_b": pairs.index_b}
         made.append(pd.DataFrame(columns | {"descriptor_distance": pairs.distance}))
@@ -64,9 +63,9 @@ def run(settings: MatchSettings, job: Job) -> None:
 
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
-def _witness(folders: RobotFolders, iteration: int) -> Witness:
+def _viewed_map(folders: RobotFolders, iteration: int) -> ViewedMap:
     """A robot's map, with what it was asked: it is in as many pairs as there are other robots."""
-    return Witness(known_at(stored_maps(folders), iteration))
+    return ViewedMap(known_at(stored_maps(folders), iteration))
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:

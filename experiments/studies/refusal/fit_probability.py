@@ -76,12 +76,12 @@ def _of_world(world: MappedWorld) -> list[tuple[Float, bool, str]]:
             registration = Registration(aligner, settings.refinement, judge=None)
             refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
             verdict = judged.judge(refined)
-            signs = judged.signs(refined) if np.isfinite(verdict.probability) else None
+            signs = judged.features(refined) if np.isfinite(verdict.probability) else None
             if signs is not None:
                 error = refined.T_a_b - case.T_true
                 right = np.hypot(error[0], error[1]) < RIGHT_WITHIN_M
                 right &= abs(se2.wrap(error[2])) < RIGHT_WITHIN_RAD
-                rows.append((signs.features(), bool(right), scenario.name))
+                rows.append((signs.vector(), bool(right), scenario.name))
     return rows
 
 

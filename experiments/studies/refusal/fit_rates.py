@@ -24,8 +24,8 @@ from mapfusion.files import write_whole
 from mapfusion.geometry.numerics import Float
 from mapfusion.verification import fitted_rates
 from mapfusion.verification.likelihood import OWN, BetaRate, Rates, log_likelihood
-from mapfusion.verification.regions import Squares, Witness, Witnesses
-from mapfusion.verification.rivals import BETWEEN, Copies, distinct_motions
+from mapfusion.verification.regions import RegionGrid, ViewedMap, ViewedMapPair
+from mapfusion.verification.rivals import BETWEEN, RepeatedLandmarks, distinct_motions
 from mapfusion.verification.verdict import N_RIVALS
 
 EVERY = 3  # of the evaluated iterations: maps of neighbouring ones say the same
@@ -61,11 +61,13 @@ def regions_of(worlds: Sequence[MappedWorld]) -> tuple[Counts, Counts]:
                 judge = settings.acceptance, settings.refinement
                 found = distinct_motions(pairs, N_RIVALS, *judge)
                 motions = [(each.T_a_b, each.inlier) for each in found]
-            witnesses = Witnesses(Witness(case.map_a), Witness(case.map_b), settings.evidence)
-            none = Copies.none(len(case.map_a), len(case.map_b))
+            viewed_maps = ViewedMapPair(
+                ViewedMap(case.map_a), ViewedMap(case.map_b), settings.evidence
+            )
+            none = RepeatedLandmarks.none(len(case.map_a), len(case.map_b))
             for T, inlier in motions:
-                squares = Squares.about(pairs.p_a[inlier], settings.evidence.region_m)
-                found = witnesses.regions(BETWEEN, T, squares, none)
+                squares = RegionGrid.about(pairs.p_a[inlier], settings.evidence.region_m)
+                found = viewed_maps.regions(BETWEEN, T, squares, none)
                 of_kind = right if case.n_common else wrong
                 of_kind.append((found.found[:, OWN], found.expected[:, OWN]))
     return _joined(right), _joined(wrong)

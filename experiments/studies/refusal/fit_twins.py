@@ -21,8 +21,8 @@ from mapfusion.files import write_whole
 from mapfusion.geometry.numerics import Float
 from mapfusion.verification import fitted_twins
 from mapfusion.verification.likelihood import COPIED, OWN, PART, RIGHT, WRONG, log_likelihood
-from mapfusion.verification.regions import Regions, Squares, Witness, Witnesses
-from mapfusion.verification.rivals import BETWEEN, distinct_motions, of_others
+from mapfusion.verification.regions import RegionGrid, Regions, ViewedMap, ViewedMapPair
+from mapfusion.verification.rivals import BETWEEN, distinct_motions, repeated_under_others
 from mapfusion.verification.verdict import N_RIVALS
 
 EVERY = 3  # of the evaluated iterations: maps of neighbouring ones say the same
@@ -52,12 +52,14 @@ def regions_of(worlds: Sequence[MappedWorld]) -> list[Regions]:
             if case.n_common or evidence is None:
                 continue
             motions = distinct_motions(pairs, N_RIVALS, settings.acceptance, settings.refinement)
-            witnesses = Witnesses(Witness(case.map_a), Witness(case.map_b), settings.evidence)
+            viewed_maps = ViewedMapPair(
+                ViewedMap(case.map_a), ViewedMap(case.map_b), settings.evidence
+            )
             laid = [each.copies for each in evidence.motions]  # these motions' are the first
             for number, each in enumerate(motions):
-                squares = Squares.about(pairs.p_a[each.inlier], evidence.region_m)
-                copies = of_others(laid, number)
-                found.append(witnesses.regions(BETWEEN, each.T_a_b, squares, copies))
+                squares = RegionGrid.about(pairs.p_a[each.inlier], evidence.region_m)
+                copies = repeated_under_others(laid, number)
+                found.append(viewed_maps.regions(BETWEEN, each.T_a_b, squares, copies))
     return found
 
 

@@ -1,1 +1,1 @@
-"""Adapters for other people's aligners, one per module (extra `[peers]`)."""
+"""Adapters for aligners of other packages, one per module (extra `[peers]`)."""

@@ -12,26 +12,26 @@ from mapfusion.align.method import Fit, Undetermined, supported
 from mapfusion.geometry.se2 import transform_points
 from mapfusion.parameters import Range, require_in_range
 
-_SMALLEST_BOUND_M = 5e-3  # the package raises below
+_SMALLEST_BOUND_M = 5e-3  # the package rejects smaller values
 
 
 @dataclass(frozen=True)
 class KissMatcher:
     """`KISSMatcher.prune_and_solve` on given correspondences, rotation about the height axis only.
 
-    The correspondences are pruned to the maximum core of those that are pairwise equally far
-    apart in both maps (ROBIN), then solved with graduated non-convexity (Quatro's yaw-only
-    rotation, translation axis by axis). Its own features and matching are not used. It says how
-    many correspondences it kept but not which: supporters are those within the bound.
+    The correspondences are pruned to the maximum core of the graph of pairwise consistent ones
+    (ROBIN) and solved by graduated non-convexity (yaw-only rotation of Quatro, translation per
+    axis). Features and matching of the package are not used. The package does not name the
+    correspondences that it kept; the supporters are the pairs within the bound.
 
-    The package keeps the first noise bound that its rotation solver saw for as long as the process
-    lives; the harness gives each set of parameters a process of its own.
+    The rotation solver of the package keeps its first noise bound for the life of the process;
+    isolated processes therefore serve one set of parameters each.
 
     Attributes:
-        noise_bound_m: largest residual of a true pair: `voxel_size` with `robin_noise_bound_gain`
-            1, as RANSAC's gate.
-        solver_share: of the bound that the solver works with (`solver_noise_bound_gain`, the
-            package's default).
+        noise_bound_m: largest residual of a true pair (`voxel_size` with `robin_noise_bound_gain`
+            1), like the gate of RANSAC.
+        solver_share: noise bound of the solver relative to `noise_bound_m`
+            (`solver_noise_bound_gain`, default of the package).
     """
 
     randomised: ClassVar[bool] = False
@@ -42,8 +42,8 @@ class KissMatcher:
         require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
-        """T_a_b of the pairs it keeps; nothing is drawn from `rng`."""
-        package: Any = importlib.import_module("kiss_matcher")  # it carries no types
+        """Estimate T_a_b; `rng` is not used."""
+        package: Any = importlib.import_module("kiss_matcher")  # without type stubs
 
         del rng
         config = package.KISSMatcherConfig(

@@ -16,16 +16,15 @@ from mapfusion.parameters import Probability, Range, require_in_range
 class OpenCv:
     """`cv2.estimateAffinePartial2D` on the landmarks in plan.
 
-    It fits a similarity, scale included, and our maps share their scale: theta is that of the
-    rotation nearest to its 2x2 block, and the translation is solved again for that theta on the
-    supporters it names. Those that the motion, without the scale, leaves outside the gate are no
-    supporters. Heights are not used.
+    OpenCV fits a similarity with a scale, which the maps do not have. theta is the angle of the
+    nearest rotation, and the translation is solved again for theta on OpenCV's supporters. Only
+    supporters within the gate under this motion are kept. Heights are not used.
 
     Attributes:
-        gate_m: `ransacReprojThreshold`; as RANSAC of our own.
+        gate_m: `ransacReprojThreshold`, as in `Ransac`.
         confidence: `confidence`.
         max_draws: `maxIters`.
-        local_rounds: `refineIters`, Levenberg-Marquardt steps on the supporters (OpenCV's default).
+        local_rounds: `refineIters`, Levenberg-Marquardt steps (default of OpenCV).
     """
 
     randomised: ClassVar[bool] = True
@@ -38,11 +37,10 @@ class OpenCv:
         require_in_range(self)
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
-        """T_a_b of the similarity, without its scale.
+        """Estimate T_a_b from the similarity, without its scale.
 
-        OpenCV's RANSAC draws the same rows at every call, whatever `cv2.setRNGSeed` was told (its
-        issue 24835, intended). So that its spread can be seen, the pairs come in an order from
-        `rng`.
+        OpenCV's RANSAC draws the same rows in every call and ignores `cv2.setRNGSeed` (OpenCV issue
+        24835, intended). The pairs are therefore permuted by `rng`.
         """
         import cv2
 

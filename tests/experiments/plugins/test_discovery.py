@@ -14,6 +14,7 @@ from experiments.plugins.discovery import (
     known_methods,
     make_method,
 )
+from experiments.plugins.process_main import MethodRunner
 
 
 @pytest.fixture
@@ -62,6 +63,17 @@ def test_it_is_made_with_its_parameters(site):
     assert getattr(made, "a") == 3  # noqa: B009
     with pytest.raises(ValueError, match=r"parameters: theirs: .*'b'"):
         make_method("theirs", b=3)
+
+
+def test_a_former_import_is_told_with_the_new_module(site):
+    code = "\n\nfrom mapfusion.align.rigid import fit_rigid\n"
+    (site / "with_former_import.py").write_text(code)
+    install(site, "some_package", "theirs = with_former_import:Method")
+    assert MethodRunner().answer("make", "theirs", {}) == {
+        "error": "raised ModuleNotFoundError: No module named 'mapfusion.align.rigid'; "
+        "mapfusion.align.rigid is now mapfusion.align.rigid_motion: change the import "
+        "(with_former_import.py:3)"
+    }
 
 
 def test_our_own_names_stay_ours(site):

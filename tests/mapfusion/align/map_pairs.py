@@ -14,7 +14,7 @@ SIZE_M = np.array([20.0, 20.0, 2.5])
 
 @dataclass(frozen=True)
 class MapPair:
-    """Two maps, the true motion between them and the pairs, of which `is_true` are one point."""
+    """Two maps, the true motion between them, and correspondences marked by `is_true`."""
 
     map_a: LandmarkMap
     map_b: LandmarkMap
@@ -24,7 +24,7 @@ class MapPair:
 
 
 def landmarks(position_m, sigma_m=0.05, descriptor=None, label=None, planar=False, name="map"):
-    """A map with isotropic covariances."""
+    """Return a map with isotropic covariances."""
     n = len(position_m)
     covariance = np.tile(np.eye(3) * sigma_m**2, (n, 1, 1))
     if planar:
@@ -42,7 +42,7 @@ def landmarks(position_m, sigma_m=0.05, descriptor=None, label=None, planar=Fals
 
 
 def motion(rng):
-    """A motion of the plane with any angle."""
+    """Return a random motion of the plane."""
     return np.array([*rng.uniform(-10, 10, 2), rng.uniform(-np.pi, np.pi)])
 
 
@@ -52,7 +52,7 @@ def unit_vectors(rng, n):
 
 
 def given_pairs(rng, n=100, true_share=1.0, sigma_m=0.0, drift_m=0.0, T_a_b=None, planar=False):
-    """Pairs as RANSAC's bar has them: uniform points, noise on side b, false ones uniform."""
+    """Return pairs of uniform points with noise in map b; false pairs are uniform."""
     T_a_b = motion(rng) if T_a_b is None else T_a_b
     n_true = round(true_share * n)
     p_a = rng.uniform(0, SIZE_M, (n, 3))
@@ -79,7 +79,7 @@ def given_pairs(rng, n=100, true_share=1.0, sigma_m=0.0, drift_m=0.0, T_a_b=None
 
 
 def error(T_estimated, T_a_b):
-    """Translation error (m) and rotation error (rad)."""
+    """Return the translation error (m) and the rotation error (rad)."""
     return (
         float(np.hypot(*(T_estimated - T_a_b)[:2])),
         abs(float(se2.wrap(T_estimated[2] - T_a_b[2]))),
@@ -87,7 +87,7 @@ def error(T_estimated, T_a_b):
 
 
 def swapped(pair):
-    """The same pairs with the maps' roles exchanged."""
+    """Return the same pairs with the maps exchanged."""
     c = pair.correspondences
     return MapPair(
         pair.map_b,
@@ -99,7 +99,7 @@ def swapped(pair):
 
 
 def moved(landmark_map, T_new_old):
-    """A map written in another frame."""
+    """Return a map in another frame."""
     return replace(
         landmark_map,
         position_m=se2.transform_points(T_new_old, landmark_map.position_m),
@@ -108,7 +108,7 @@ def moved(landmark_map, T_new_old):
 
 
 def stretched(rng, landmark_map, ratio=4.0):
-    """The map with covariances `ratio` times as long one way, turned at random."""
+    """Return the map with covariances of random direction and an axis ratio of `ratio`."""
     n = len(landmark_map)
     turn = se2.rotation(rng.uniform(-np.pi, np.pi, n))
     covariance = landmark_map.covariance_m2.copy()
@@ -119,7 +119,7 @@ def stretched(rng, landmark_map, ratio=4.0):
 
 
 def blurred(rng, n, true_share=0.3, sigma_m=0.05):
-    """Planar pairs with noise in both maps, of all sizes and shapes, and covariances to match."""
+    """Return planar pairs with noise of random anisotropic covariances in both maps."""
     pair = given_pairs(rng, n, true_share, planar=True)
     maps = []
     for landmarks in (pair.map_a, pair.map_b):
@@ -135,6 +135,6 @@ def blurred(rng, n, true_share=0.3, sigma_m=0.05):
 
 
 def covariances(rng, n, dimensions=3):
-    """(n, d, d) random symmetric positive definite matrices of about a decimetre."""
+    """Return random covariances of about (0.1 m)^2, shape (n, d, d)."""
     root = rng.normal(0, 0.1, (n, dimensions, dimensions))
     return root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(dimensions)

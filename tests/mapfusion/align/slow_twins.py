@@ -1,4 +1,4 @@
-"""Kernels that several tests share, written the slow and obvious way."""
+"""Slow reference implementations of kernels, shared by several tests."""
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -9,7 +9,7 @@ _WORD = 2**64 - 1
 
 
 def draw(state):
-    """Next state of the xorshift generator with 64 bits."""
+    """Return the next state of the 64-bit xorshift generator."""
     state ^= (state << 13) & _WORD
     state ^= state >> 7
     state ^= (state << 17) & _WORD
@@ -17,14 +17,14 @@ def draw(state):
 
 
 def slow_squares(T_a_b, pairs, variance):
-    """Residuals, their covariances and their squared Mahalanobis distances."""
+    """Return residuals, their covariances and their squared Mahalanobis distances."""
     e = residuals(T_a_b, pairs.p_a, pairs.p_b)
     C = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b) + variance * np.eye(2)
     return e, C, np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
 
 
 def slow_consistency(pairs, variance, bound):
-    """Distances and the variances along their lines, with whole matrices."""
+    """Return distances and the variances along the connecting lines, by matrix products."""
     total = 2 * variance
     for p, S in ((pairs.p_a, pairs.S_a), (pairs.p_b, pairs.S_b)):
         line = p[None] - p[:, None]

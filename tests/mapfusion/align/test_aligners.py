@@ -1,4 +1,4 @@
-"""What holds for every aligner."""
+"""Properties of every aligner."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ NAMED = {name: make_aligner(name) for name in NAMES} | {"svd solved": Svd("solve
 
 
 def estimate(name, pair, seed=0):
-    """By name; "refined" is RANSAC's estimate after the refinement, "oracle" knows the truth."""
+    """Align by name; "refined" is RANSAC with refinement, "oracle" receives the true pairs."""
     maps = pair.map_a, pair.map_b, pair.correspondences
     if name == "oracle":
         return Oracle().align(Pairs(*maps), pair.is_true)
@@ -186,7 +186,7 @@ def test_oracle_ignores_false_pairs():
 
 
 def test_oracle_starts_from_the_true_pairs_alone():
-    """False ones that agree on a motion 10 m away would pull a start over all out of the gate."""
+    """False pairs agree on a motion 10 m away; a fit to all pairs would be out of the gate."""
     pair = given_pairs(np.random.default_rng(6), 100)
     position, is_true = pair.map_b.position_m.copy(), np.arange(100) < 40
     position[~is_true, :2] += [8.0, -6.0]
@@ -197,7 +197,7 @@ def test_oracle_starts_from_the_true_pairs_alone():
 
 
 def test_true_pairs_outside_the_gate_are_no_inliers_of_the_oracle():
-    """Three true pairs are metres off, as drift may leave them."""
+    """Three true pairs have residuals of metres because of drift."""
     pair = given_pairs(np.random.default_rng(7), 60)
     far = np.array([3, 10, 41])
     position = pair.map_b.position_m.copy()

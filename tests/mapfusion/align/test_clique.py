@@ -3,7 +3,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapfusion.align.clique import everyone, greedy_clique, keep_core, larger_clique, may_hold
+from mapfusion.align.clique import (
+    full_set,
+    greedy_clique,
+    larger_clique,
+    may_contain_clique,
+    reduce_to_core,
+)
 
 UNLIMITED = 1_000_000
 
@@ -25,7 +31,7 @@ def random_graph(seed, n, density, planted=0):
 
 
 def bron_kerbosch(adjacent):
-    """Size of the largest clique (Bron and Kerbosch 1973, with a pivot)."""
+    """Return the size of the largest clique (Bron and Kerbosch 1973, with a pivot)."""
     neighbours = [set(np.flatnonzero(row)) for row in adjacent]
     largest = 0
 
@@ -45,7 +51,7 @@ def bron_kerbosch(adjacent):
 
 
 def larger_of(adjacent, at_least, budget=UNLIMITED):
-    return larger_clique(on_bits(adjacent), everyone(len(adjacent)), at_least, budget)
+    return larger_clique(on_bits(adjacent), full_set(len(adjacent)), at_least, budget)
 
 
 def is_clique(adjacent, vertices):
@@ -105,8 +111,8 @@ def test_core_is_what_taking_away_leaves(adjacent, least):
     left = np.ones(len(adjacent), dtype=bool)
     while np.any(poor := left & (adjacent[:, left].sum(axis=1) < least)):
         left &= ~poor
-    chosen, rows = everyone(len(adjacent)), np.empty(len(adjacent), np.int64)
-    count = keep_core(on_bits(adjacent), chosen, least, rows)
+    chosen, rows = full_set(len(adjacent)), np.empty(len(adjacent), np.int64)
+    count = reduce_to_core(on_bits(adjacent), chosen, least, rows)
     np.testing.assert_array_equal(rows[:count], np.flatnonzero(left))
 
 
@@ -127,7 +133,7 @@ def test_a_spent_budget_is_told_and_what_was_found_is_a_clique(budget):
 
 
 def may_be_larger(adjacent, size):
-    return may_hold(on_bits(adjacent), everyone(len(adjacent)), size)
+    return may_contain_clique(on_bits(adjacent), full_set(len(adjacent)), size)
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -14,10 +14,10 @@ from scipy.stats import f as f_distribution
 from mapfusion.align.aligners import make_aligner
 from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.clique import Clique, CliqueSearch
-from mapfusion.align.consensus import consistency, in_rows
+from mapfusion.align.consensus import consistency_graphs, packed_rows
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
-from mapfusion.align.mahalanobis_gate import mean_variances, settle
+from mapfusion.align.mahalanobis_gate import mean_variances, refit_to_support
 from mapfusion.align.method import Fit
 from mapfusion.align.oracle import Oracle
 from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, least_truncated_squares
@@ -50,7 +50,7 @@ def estimate(aligner, pair, seed=0):
 
 
 def with_noise_in_both(seed, n, true_share, sigma_m=0.05, drift_m=0.0):
-    """A planar pair whose noise, sigma_m per axis of a residual, is shared by both maps."""
+    """Return a planar pair with noise in both maps; sigma_m per axis of a residual."""
     rng = np.random.default_rng(seed)
     share = sigma_m / math.sqrt(2)
     pair = given_pairs(rng, n, true_share, share, drift_m, planar=True)
@@ -79,7 +79,7 @@ def test_exchanged_maps_give_the_inverse(name):
 
 
 def normalised_errors(name, true_share, drift_m, parameters):
-    """Squared errors of 3 parameters over their covariance, where the maps were aligned."""
+    """Return the NEES of the three parameters over the aligned pairs of maps."""
     for seed in range(200):
         rng = np.random.default_rng(seed)
         maps, pair = blurred(rng, 100, true_share, sigma_m=0.02)
@@ -104,7 +104,7 @@ def normalised_errors(name, true_share, drift_m, parameters):
     ],
 )
 def test_covariance_covers_the_error(name, true_share, parameters, least, drift_m):
-    """Landmarks of many shapes and sizes, which most of these fits weigh alike or nearly so."""
+    """Covariances differ in size and shape, while most methods use nearly equal weights."""
     nees = list(normalised_errors(name, true_share, drift_m, parameters))
     assert len(nees) >= least
     mean, variance = f_distribution.stats(3, 2 * 100 * true_share - 3)
@@ -114,7 +114,7 @@ def test_covariance_covers_the_error(name, true_share, parameters, least, drift_
 @pytest.mark.parametrize("name", ["clique", "ransac_mahalanobis"])
 @pytest.mark.parametrize(("n", "outliers", "least"), [(1000, 0.99, 100), (60, 0.9, 99)])
 def test_the_bars(name, n, outliers, least):
-    """Successes of 100 on planar maps, and the median error beside the oracle's."""
+    """Successes of 100 on planar maps, and the median error relative to the oracle."""
     found, best = [], []
     for seed in range(100):
         pair = with_noise_in_both(seed, n, 1 - outliers)
@@ -127,7 +127,7 @@ def test_the_bars(name, n, outliers, least):
 
 @pytest.mark.parametrize("name", ["clique", "ransac_mahalanobis"])
 def test_five_thousand_pairs(name):
-    """A tenth of the bar's hundred; the benchmark has its time."""
+    """Run ten of the hundred pairs; the benchmark runs all."""
     for seed in range(10):
         pair = with_noise_in_both(seed, 5000, 0.01)
         found = error(estimate(name, pair, seed).T_a_b, pair.T_a_b)
@@ -156,7 +156,7 @@ def test_heights_count_unless_planar(name):
 
 
 def test_clique_is_the_largest_set_that_agrees():
-    """Of 14 pairs, the best of all subsets tried one by one agrees with the answer."""
+    """The best of all subsets of 14 pairs, by exhaustive search, gives the same result."""
     aligner = Clique(drift_sigma_m=0.0)
     bound = chi2.ppf(aligner.agreement_probability, 1)
     for seed in range(5):
@@ -170,7 +170,7 @@ def test_clique_is_the_largest_set_that_agrees():
         largest = np.array(next(s for s in sets if agree[np.ix_(s, s)].all()))
         planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
         T, inside = np.array(fit_rigid(a, b, largest)), np.empty(14, dtype=bool)
-        settle(T, planar, mean_variances(planar), 1e-12, aligner.bound, inside)
+        refit_to_support(T, planar, mean_variances(planar), 1e-12, aligner.bound, inside)
         found = estimate(aligner, pair)
         np.testing.assert_array_equal(found.inlier, inside)
         assert error(found.T_a_b, T) == pytest.approx((0, 0), abs=1e-6)
@@ -178,14 +178,14 @@ def test_clique_is_the_largest_set_that_agrees():
 
 @pytest.mark.parametrize("true_share", [0.9, 0.5, 0.25, 0.1])
 def test_what_the_clique_leaves_out_changes_nothing(true_share, monkeypatch):
-    """The same motion as when the whole graph is searched."""
+    """The search of the whole graph gives the same motion."""
     pair = with_noise_in_both(3, 400, true_share, drift_m=0.05)
     quick = estimate("clique", pair)
     monkeypatch.setattr("mapfusion.align.clique._WORTH_A_LOOK", 1.0)
     monkeypatch.setattr("mapfusion.align.clique._PART", 100)
     parts = estimate("clique", pair)
     monkeypatch.setattr("mapfusion.align.clique._PART", 400)
-    monkeypatch.setattr("mapfusion.align.clique.may_hold", lambda *_: True)
+    monkeypatch.setattr("mapfusion.align.clique.may_contain_clique", lambda *_: True)
     whole = estimate("clique", pair)
     for found in (quick, parts):
         np.testing.assert_array_equal(found.inlier, whole.inlier)
@@ -194,7 +194,7 @@ def test_what_the_clique_leaves_out_changes_nothing(true_share, monkeypatch):
 
 @pytest.mark.parametrize(("n_other", "none"), [(14, True), (30, False)])
 def test_parts_without_half_as_large_a_clique_rule_out_another_motion(n_other, none):
-    """Half of 42 pairs are 21, of which either of two parts would hold more than ten."""
+    """A clique of more than half of 42 pairs would have more than ten in one of two parts."""
     n, motions = 200, {0: with_noise_in_both(1, 200, 1.0), 50: with_noise_in_both(2, 200, 1.0)}
     chance, sizes, position = with_noise_in_both(3, n, 0.0), {0: 42, 50: n_other}, {}
     for side in ("map_a", "map_b"):
@@ -212,7 +212,7 @@ def test_parts_without_half_as_large_a_clique_rule_out_another_motion(n_other, n
 
 @pytest.mark.parametrize("n_true", [190, 120])
 def test_a_clique_that_the_sample_does_not_see_is_found(n_true):
-    """Every third pair is of a second motion, and so are all that the clique looks at first."""
+    """Every third pair supports a second motion, including the whole sample of the clique."""
     n = 300
     pair, other = with_noise_in_both(1, n, 1.0), with_noise_in_both(2, n, 1.0)
     chance = with_noise_in_both(3, n, 0.0)
@@ -228,7 +228,7 @@ def test_a_clique_that_the_sample_does_not_see_is_found(n_true):
 
 
 def slow_search(pairs, variance, bound, agreement, max_draws, seed):
-    """The search as its docstring has it, with the twins of what it is made of."""
+    """Run a slow reference of the search with slow references of its parts."""
     n, state, draws, needed = len(pairs), seed, 0, max_draws
     agree, planar = slow_consistency(pairs.in_plan(), variance, agreement), pairs.in_plan()
     best_T, best_score, best_raw = None, 0.0, 0.0
@@ -247,7 +247,9 @@ def slow_search(pairs, variance, bound, agreement, max_draws, seed):
         if np.sum(raw > 0) < 2 or np.sum(raw) <= best_raw:
             continue
         best_raw = np.sum(raw)
-        settle(T, planar, mean_variances(planar), variance, bound, np.empty(n, dtype=bool))
+        refit_to_support(
+            T, planar, mean_variances(planar), variance, bound, np.empty(n, dtype=bool)
+        )
         score = scores(T, pairs, variance, bound)
         if np.sum(score > 0) >= 2 and np.sum(score) > best_score:
             best_T, best_score, count = T, np.sum(score), np.sum(score > 0)
@@ -265,7 +267,7 @@ def test_search_equals_its_twin(seed):
     pairs = Pairs(*maps, pair.correspondences)
     bound, agreement = float(chi2.ppf(0.99, 2)), float(chi2.ppf(0.99, 1))
     planar = pairs.in_plan()
-    given = planar, mean_variances(planar), in_rows(planar)
+    given = planar, mean_variances(planar), packed_rows(planar)
     draws, T = least_truncated_squares(
         *given, 0.0025, bound, agreement, 1.0, LOG_MISS, 3000, np.uint64(seed + 1)
     )
@@ -275,7 +277,7 @@ def test_search_equals_its_twin(seed):
 
 
 def test_a_sharp_landmark_is_held_to_more_than_a_blurred_one():
-    """Half a metre off is support where the landmark is known to a metre along that way only."""
+    """A residual of 0.5 m is support along the uncertain direction of a landmark only."""
     rng = np.random.default_rng(3)
     p = rng.uniform(0, 20, (40, 3)) * [1, 1, 0]
     off = p.copy()
@@ -314,7 +316,7 @@ def test_wrong_parameters_are_named(aligner, name, value):
 
 
 def test_what_was_settled_before_of_the_same_pairs_is_settled_so_again():
-    """Whatever the seed; but with other parameters by itself."""
+    """Results are kept for all seeds, separately for each set of parameters."""
     pair = given_pairs(np.random.default_rng(3), 80, 0.6, 0.05)
     maps = pair.map_a, pair.map_b, pair.correspondences
     pairs, methods = Pairs(*maps), [RansacMahalanobis(), RansacMahalanobis(probability=0.9)]
@@ -346,19 +348,19 @@ def test_kernel_equals_its_twin(n):
     (map_a, map_b), pair = blurred(np.random.default_rng(n), n)
     pairs = Pairs(map_a, map_b, pair.correspondences).in_plan()
     scales = 0.0025 * (n > 64), 0.01
-    found = unpacked(consistency(in_rows(pairs), scales, BOUND), n)
+    found = unpacked(consistency_graphs(packed_rows(pairs), scales, BOUND), n)
     for graph, variance in zip(found, scales, strict=True):
         np.testing.assert_array_equal(graph, slow_consistency(pairs, variance, BOUND))
         np.testing.assert_array_equal(graph, graph.T)
 
 
 def test_single_precision_loses_no_pair():
-    """A kilometre apart, landmarks known better than single precision can tell there."""
+    """Landmarks 1 km from the origin are more precise than single precision there."""
     (map_a, map_b), pair = blurred(np.random.default_rng(3), 200, true_share=1.0, sigma_m=1e-7)
     maps = [replace(m, position_m=50 * m.position_m) for m in (map_a, map_b)]
     maps = [replace(m, covariance_m2=2500 * m.covariance_m2) for m in maps]
     pairs = Pairs(*maps, pair.correspondences).in_plan()
-    found = unpacked(consistency(in_rows(pairs), (0.0, 1e-12), BOUND), 200)
+    found = unpacked(consistency_graphs(packed_rows(pairs), (0.0, 1e-12), BOUND), 200)
     np.testing.assert_array_equal(found[0], slow_consistency(pairs, 0.0, BOUND))
     assert np.sum(found[0]) > 0.99 * 200 * 199
 
@@ -371,7 +373,7 @@ def test_true_pairs_agree_with_the_probability_stated(drift_m):
         (map_a, map_b), pair = blurred(rng, n, true_share=1.0)
         map_b.position_m[:, :2] += rng.normal(0, drift_m, (n, 2))
         pairs = Pairs(map_a, map_b, pair.correspondences).in_plan()
-        graph = consistency(in_rows(pairs), (drift_m**2, 0.01), BOUND)[:1]
+        graph = consistency_graphs(packed_rows(pairs), (drift_m**2, 0.01), BOUND)[:1]
         disagreeing.append(1 - np.sum(unpacked(graph, n)) / (n * (n - 1)))
     # one landmark is in 199 comparisons: the scatter over the maps tells how sure the mean is
     sure = 4 * np.std(disagreeing) / np.sqrt(30)
@@ -382,16 +384,18 @@ def test_does_not_depend_on_the_frames():
     rng = np.random.default_rng(1)
     (map_a, map_b), pair = blurred(rng, 150)
     graphs = [
-        consistency(in_rows(Pairs(a, b, pair.correspondences).in_plan()), (0.0, 0.01), BOUND)
+        consistency_graphs(
+            packed_rows(Pairs(a, b, pair.correspondences).in_plan()), (0.0, 0.01), BOUND
+        )
         for a, b in ((map_a, map_b), (moved(map_a, motion(rng)), moved(map_b, motion(rng))))
     ]
     np.testing.assert_array_equal(*graphs)
 
 
 def test_exact_maps_without_covariance_agree():
-    """Nothing but rounding keeps these distances apart, a kilometre from the origin."""
+    """Distances of landmarks 1 km from the origin differ by rounding only."""
     rng = np.random.default_rng(2)
     pair = given_pairs(rng, 100, planar=True, T_a_b=np.array([1000.0, -700.0, 2.0]))
     pairs = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
-    graph = unpacked(consistency(in_rows(pairs), (1e-12, 0.01), BOUND), 100)[0]
+    graph = unpacked(consistency_graphs(packed_rows(pairs), (1e-12, 0.01), BOUND), 100)[0]
     assert np.sum(graph) == 100 * 99

@@ -24,7 +24,7 @@ def two_maps(rng, n=120, noise=0.03):
 
 
 def slow_match(a, b, parameters):
-    """Pairs by the definition: each the nearest of the other among those of compatible height."""
+    """Return pairs by definition: mutually nearest among landmarks of compatible height."""
     distance = np.full((len(a), len(b)), np.inf)
     for i in range(len(a)):
         for j in range(len(b)):
@@ -52,7 +52,7 @@ def test_pairs_are_those_of_the_definition(noise, monkeypatch):
 
 
 def test_heights_of_all_certainties_a_kilometre_up(monkeypatch):
-    """Some are sure to a millimetre and some to a metre; blocks of alike heights leave none out."""
+    """Height deviations range from 1 mm to 1 m; blocks of similar height lose no pair."""
     monkeypatch.setattr(module, "_BLOCK_ROWS", 16)
     rng = np.random.default_rng(5)
     maps = []
@@ -151,7 +151,7 @@ def test_wrong_arguments_are_named():
 
 
 def test_heights_of_one_point_agree_as_often_as_stated():
-    """With what sightings leave of each, and tracks that each stray by the smoother's 4 mm."""
+    """Height variances and track offsets of 4 mm together explain the height differences."""
     rng, n, sigma_m = np.random.default_rng(0), 200_000, 0.003
     z_a, z_b = rng.normal(0, sigma_m, (2, n)) + rng.normal(0, 0.004, (2, n))
     variance = np.full(n, sigma_m**2)
@@ -160,7 +160,7 @@ def test_heights_of_one_point_agree_as_often_as_stated():
 
 
 def unlike_maps(rng, n=40):
-    """Two maps of the same landmarks, the second moved in plan, with descriptors of norm one."""
+    """Return two maps of the same landmarks, the second moved in plan, with unit descriptors."""
     descriptor, p = unit_vectors(rng, n), rng.uniform(-6, 6, (n, 3)) * [1, 1, 0.1]
     moved = p @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + [2.0, 5.0, 0.0]
     return landmarks(p, descriptor=descriptor), landmarks(moved, descriptor=descriptor)
@@ -173,7 +173,7 @@ def told_apart(a, b, **parameters):
 
 
 def test_the_test_that_left_too_few_pairs_is_named():
-    """Each of the causes, once and by itself; what else is told is true of the maps."""
+    """Each cause occurs alone; the other counts in the message are those of the maps."""
     a, b = unlike_maps(np.random.default_rng(7))
     label = np.arange(40, dtype=np.int32)
     assert match(a, b).shortage == ""

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from mapfusion.align.aligners import make_aligner
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.drift import DRIFT_FLOOR_M, calibration_part, estimate_drift_m
+from mapfusion.align.drift import DRIFT_FLOOR_M, calibration_covariance, estimate_drift_m
 from mapfusion.align.refinement import Refinement
 from mapfusion.fusion.fused_map import AlignedPair
 from mapfusion.fusion.fusers import make_fuser
@@ -49,7 +49,7 @@ def spoiled(landmarks: LandmarkMap, row: int, by: CalibrationError, share: float
 
 @pytest.mark.parametrize("camera", ["", "one"])
 def test_equals_solving_again_with_spoiled_maps(pair: MapPair, camera: str) -> None:
-    """Each error a hundredth of its sigma; the refinement knows nothing of them."""
+    """Each calibration error is a hundredth of its sigma; the refinement ignores them."""
     share, columns = 0.01, []
     of_both = {"map_a": replace(OF_A, camera=camera), "map_b": replace(OF_B, camera=camera)}
     together = [["map_a", "map_b"]] if camera else [["map_a"], ["map_b"]]
@@ -72,7 +72,9 @@ def test_equals_solving_again_with_spoiled_maps(pair: MapPair, camera: str) -> N
 def test_headings_alone_turn_one_map_about_either_beginning(pair: MapPair) -> None:
     a, b = CalibrationError(0.002), CalibrationError(0.001)
     own = with_errors(pair, a, b)
-    found = calibration_part(pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences), 0.1)
+    found = calibration_covariance(
+        pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences), 0.1
+    )
     x, y, _ = pair.T_a_b
     by = np.array([[-y, x, 1.0], [0.0, 0.0, -1.0]]).T * [0.002, 0.001]
     # the maps' noise leaves residuals, which turn with neither
@@ -80,7 +82,7 @@ def test_headings_alone_turn_one_map_about_either_beginning(pair: MapPair) -> No
 
 
 def test_fused_motions_are_no_surer_than_the_cameras(pair: MapPair) -> None:
-    """The joint fuser's, too: nothing tells whose heading is off; common extent tells the scale."""
+    """The joint fuser agrees: headings are ambiguous, common extent determines the scale."""
     a, b = CalibrationError(0.01), CalibrationError(0.02)
 
     def motion_covariance(pair: MapPair) -> np.ndarray:
@@ -99,11 +101,13 @@ def test_fused_motions_are_no_surer_than_the_cameras(pair: MapPair) -> None:
 
 def test_inverse_alignments_are_equally_sure(pair: MapPair) -> None:
     own = with_errors(pair, OF_A, OF_B)
-    there = calibration_part(pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences), 1.0)
+    there = calibration_covariance(
+        pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences), 1.0
+    )
     c = own.correspondences
     turned = type(c)(c.index_b, c.index_a, c.distance)
     T = se2.inverse(pair.T_a_b)
-    back = calibration_part(T, Pairs(own.map_b, own.map_a, turned), 1.0)
+    back = calibration_covariance(T, Pairs(own.map_b, own.map_a, turned), 1.0)
     cos, sin = np.cos(T[2]), np.sin(T[2])
     J = np.array([[-cos, sin, T[1]], [-sin, -cos, -T[0]], [0, 0, -1]])  # d inverse / dT
     sigma = np.sqrt(np.diag(back))
@@ -111,7 +115,7 @@ def test_inverse_alignments_are_equally_sure(pair: MapPair) -> None:
 
 
 def residuals_with(rng, n, drift_m):
-    """Residuals about a known motion, and the anisotropic covariances that explain a part."""
+    """Return residuals about a known motion, and the covariances that explain a part of them."""
     turn = rotation(rng.uniform(-np.pi, np.pi, n))
     S = turn @ np.diag([0.08**2, 0.02**2]) @ np.swapaxes(turn, 1, 2)
     C = S + drift_m**2 * np.eye(2)
@@ -132,7 +136,7 @@ def test_is_the_most_likely_value():
 
 
 def slow_score(e, S, variance_m2, gate_m):
-    """Derivative of the log-likelihood by s_drift^2, as the text has it."""
+    """Return the derivative of the documented log-likelihood by s_drift^2."""
     share = 2 * len(e) / (2 * len(e) - 3)
     C = S + variance_m2 * np.eye(2)
     inverse, v = np.linalg.inv(C), np.trace(C, axis1=1, axis2=2) / 2
@@ -146,7 +150,7 @@ def slow_score(e, S, variance_m2, gate_m):
 
 @pytest.mark.parametrize("gate_m", [0.3, np.inf])
 def test_landmarks_of_all_certainties_leave_it_where_no_step_is_taken(gate_m):
-    """Heavy tails: plain steps of Fisher scoring go to and fro for ever on one in fifteen."""
+    """With heavy tails plain Fisher scoring oscillates on one in fifteen."""
     rng = np.random.default_rng(5)
     above = 0
     for _ in range(60):

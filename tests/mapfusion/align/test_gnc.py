@@ -53,7 +53,7 @@ def test_pairs_that_all_fit_end_it_at_once():
     ("outliers", "least", "most"), [(0.5, 100, 100), (0.8, 85, 100), (0.9, 30, 80)]
 )
 def test_breaks_down_where_it_is_known_to(outliers, least, most):
-    """60 pairs; published and measured elsewhere: 86 of 100 at 80 % outliers, 43 at 90 %."""
+    """60 pairs; published rates: 86 of 100 at 80 % outliers, 43 at 90 %."""
     good = 0
     for seed in range(100):
         pair = given_pairs(np.random.default_rng(seed), 60, 1 - outliers, 0.05, planar=True)

@@ -17,7 +17,7 @@ def closest_points(pair):
 
 
 def slow_icp(p_a, p_b, T, max_rounds):
-    """Pairs every landmark anew in every round, by looking at all."""
+    """Run ICP with an exhaustive search of all pairs in every round."""
     everyone = np.arange(len(p_b))
 
     def pair(T):
@@ -98,7 +98,7 @@ def test_a_better_start_makes_a_good_answer_more_probable():
 
 
 def test_starts_come_from_the_best_matching():
-    """False pairs with bad descriptors alone cannot spoil the start."""
+    """False pairs with large descriptor distances do not affect the start."""
     pair = given_pairs(np.random.default_rng(4), 100, 0.5, 0.02)
     pair.correspondences.distance[:] = np.where(pair.is_true, 0.1, 0.2)
     for seed in range(10):

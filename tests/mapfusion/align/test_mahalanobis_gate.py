@@ -9,15 +9,15 @@ from scipy.stats import chi2, f, multivariate_normal
 from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.mahalanobis_gate import (
+    PairSpread,
     PlanarPairs,
-    Spread,
-    is_unlike_the_others,
+    highest_leverage_pair,
+    is_outlier_to_others,
     log_likelihood,
     mark_supporters,
     mean_variances,
-    most_leverage,
-    settle,
-    settle_at_best_scale,
+    refit_at_best_drift,
+    refit_to_support,
     spread_area_m2,
 )
 from mapfusion.align.refinement import Refinement
@@ -51,7 +51,7 @@ def planar_map(p: np.ndarray, *, named: bool = False) -> LandmarkMap:
 def a_corner_and_one_far(
     turned_rad: float, seed: int = 0, *, named: bool = False
 ) -> tuple[LandmarkMap, LandmarkMap, Correspondences, np.ndarray]:
-    """25 true pairs within 0.3 m, and one 7 m away that is true for a map turned about them."""
+    """25 true pairs lie within 0.3 m; one 7 m away is consistent with a rotation about them."""
     rng = np.random.default_rng(seed)
     p_b = np.vstack([rng.uniform(-0.15, 0.15, (25, 2)), [[7.0, 0.5]]])
     p_a = se2.transform_points(T_TRUE, p_b) + rng.normal(0, SIGMA_M, p_b.shape)
@@ -64,7 +64,7 @@ def a_corner_and_one_far(
 
 @pytest.mark.parametrize("named", [False, True])
 def test_a_false_far_pair_turns_the_map_and_is_found_out(named: bool) -> None:
-    """A name that was misread is a false pair, too."""
+    """A wrong label is a false pair as well."""
     map_a, map_b, pairs, T_turned = a_corner_and_one_far(0.7, named=named)
     found = Refinement().refine(Pairs(map_a, map_b, pairs), T_turned)
     assert np.hypot(*(found.T_a_b - T_turned)[:2]) < 0.1  # it did go there: residuals fit the gate
@@ -95,12 +95,12 @@ def test_leverage_is_the_hat_matrix_s_trace() -> None:
         covariance = np.linalg.inv(np.einsum("nki,nkl,nlj->ij", J, W, J))
         hat = np.einsum("nki,ij,nlj,nlk->n", J, covariance, J, W)
         assert hat.sum() == pytest.approx(3)  # as many as parameters
-        assert most_leverage(T, pairs, variance, truth, covariance) == np.argmax(hat)
+        assert highest_leverage_pair(T, pairs, variance, truth, covariance) == np.argmax(hat)
 
 
 @pytest.mark.parametrize("n", [4, 6, 12])
 def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
-    """Bent maps: all pairs are off alike, and the one of most leverage is as good as the others."""
+    """In bent maps the pair of highest leverage has a residual like the others."""
     rng, called, tried = np.random.default_rng(n), 0, 300
     S = np.tile(np.eye(2) * 1e-6, (n, 1, 1))
     for _ in range(tried):
@@ -113,16 +113,16 @@ def test_true_pairs_are_called_false_as_seldom_as_promised(n: int) -> None:
         variance = float(np.sum(e**2)) / (2 * (n - 1) - 3)
         J = motion_jacobian(T, others.p_b)
         covariance = np.linalg.inv(np.einsum("nki,nkj->ij", J, J)) * variance
-        called += is_unlike_the_others(T, covariance, variance, pairs, 0)
+        called += is_outlier_to_others(T, covariance, variance, pairs, 0)
     assert called <= 2  # 0.075 are expected at n = 4
     far = p_a.copy()
     far[0] += 300.0
-    assert is_unlike_the_others(T, covariance, variance, pairs._replace(p_a=far), 0)
+    assert is_outlier_to_others(T, covariance, variance, pairs._replace(p_a=far), 0)
 
 
 @pytest.mark.parametrize("n", [4, 6, 20])
 def test_the_limit_of_a_pair_is_that_of_the_f_distribution(n: int) -> None:
-    """The other n - 1 pairs leave m = 2 (n - 1) - 3 degrees of freedom, so D is 2 F(2, m)."""
+    """The other n - 1 pairs have m = 2 (n - 1) - 3 degrees of freedom, so that D is 2 F(2, m)."""
     rng, sigma_m, k = np.random.default_rng(n), 0.05, 2
     p_b = rng.uniform(0, 9, (n, 2))
     p_a, none, known = se2.transform_points(T_TRUE, p_b), np.zeros((n, 2, 2)), np.zeros((3, 3))
@@ -131,7 +131,7 @@ def test_the_limit_of_a_pair_is_that_of_the_f_distribution(n: int) -> None:
         moved = p_a.copy()
         moved[k] += sigma_m * np.sqrt(share * limit) * np.array([0.6, -0.8])
         pairs = PlanarPairs(moved, p_b, none, none)
-        assert is_unlike_the_others(T_TRUE, known, sigma_m**2, pairs, k) == unlike
+        assert is_outlier_to_others(T_TRUE, known, sigma_m**2, pairs, k) == unlike
 
 
 BOUND = float(chi2.ppf(0.99, 2))
@@ -176,7 +176,7 @@ def test_settled_motion_fits_its_own_support(case):
     pairs, T_a_b = case
     planar, inside = pairs.in_plan(), np.empty(200, dtype=bool)
     T = T_a_b + np.array([0.05, -0.05, 0.002])
-    count = settle(T, planar, mean_variances(planar), 0.0025, BOUND, inside)
+    count = refit_to_support(T, planar, mean_variances(planar), 0.0025, BOUND, inside)
     fitted = np.empty(3)
     fit_weighted(planar.p_a, planar.p_b, inside / mean_variances(planar, 0.0025), fitted)
     assert error(T, fitted) == pytest.approx((0, 0), abs=1e-12)
@@ -195,21 +195,21 @@ def test_area_of_a_turned_rectangle():
 
 @pytest.mark.parametrize(("drift_m", "level"), [(0.0, 0), (0.05, 1), (0.1, 2)])
 def test_the_scale_that_the_residuals_have_is_chosen(drift_m, level):
-    """Sixty of three hundred pairs true: the likeliest of three s_drift is the one they have."""
+    """60 of 300 pairs are true; the most likely of three s_drift is the true one."""
     for seed in range(10):
         rng = np.random.default_rng(seed)
         pair = given_pairs(rng, 300, 0.2, 0.03, drift_m, planar=True)
         planar = Pairs(pair.map_a, stretched(rng, pair.map_b, 1), pair.correspondences).in_plan()
         T, inside = pair.T_a_b.copy(), np.empty(300, dtype=bool)
         scales = np.array([0.0, 0.05, 0.1]) ** 2 + 1e-12
-        spread = Spread.of(planar)
-        assert settle_at_best_scale(T, planar, spread, scales, BOUND, inside)[1] == level
+        spread = PairSpread.of(planar)
+        assert refit_at_best_drift(T, planar, spread, scales, BOUND, inside)[1] == level
 
 
 def test_no_support_at_any_scale():
     pair = given_pairs(np.random.default_rng(3), 50, 1.0, 0.01, planar=True)
     planar = Pairs(pair.map_a, pair.map_b, pair.correspondences).in_plan()
     T, inside = pair.T_a_b + np.array([500.0, 0, 0]), np.ones(50, dtype=bool)
-    spread = Spread.of(planar)
-    assert settle_at_best_scale(T, planar, spread, np.array([1e-4]), BOUND, inside)[1] == -1
+    spread = PairSpread.of(planar)
+    assert refit_at_best_drift(T, planar, spread, np.array([1e-4]), BOUND, inside)[1] == -1
     assert not inside.any()

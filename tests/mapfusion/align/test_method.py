@@ -1,4 +1,4 @@
-"""Whether landmarks span enough, against the definition in products of whole arrays."""
+"""Tests of `mapfusion.align.method`: extent of landmarks against its definition."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,12 @@ from scipy.stats import chi2
 from mapfusion.align import method as module
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.method import SHAPE_FALSE_ALARM, lacks_extent, why_one_place
+from mapfusion.align.method import SHAPE_FALSE_ALARM, lacks_extent, why_angle_is_open
 from tests.mapfusion.align.map_pairs import covariances, landmarks
 
 
 def slow_share(p, covariance, drift_m2, dimensions):
-    """The squared deviations along the axis, each over its variance, over the most noise gives."""
+    """Return the chi-square of the deviations along an axis over its bound under noise."""
     C = covariance[:, :2, :2] + drift_m2 * np.eye(2)
     weight = np.array([2 / np.trace(S) for S in C])
     plan = p[:, :2] - np.average(p[:, :2], axis=0, weights=weight)
@@ -25,7 +25,7 @@ def slow_share(p, covariance, drift_m2, dimensions):
 
 
 def test_landmarks_of_one_point_pass_for_a_shape_as_seldom_as_stated(monkeypatch):
-    """However different their noise."""
+    """Landmarks have very different noise."""
     monkeypatch.setattr(module, "SHAPE_FALSE_ALARM", 0.1)
     rng, n, trials = np.random.default_rng(3), 30, 2000
     sigma = np.where(np.arange(n) % 3, 0.01, 0.5)
@@ -51,7 +51,7 @@ def test_one_uncertain_landmark_does_not_hide_the_extent_of_the_others():
 @pytest.mark.parametrize("dimensions", [1, 2])
 @pytest.mark.parametrize("drift_m2", [0.0, 0.04])
 def test_decides_as_the_definition_does(dimensions, drift_m2):
-    """Of the same shape just too small and just large enough, far from the origin."""
+    """The same shape is tested just below and just above the bound, far from the origin."""
     rng = np.random.default_rng(0)
     for n in (3, 5, 200):
         covariance = covariances(rng, n)
@@ -74,9 +74,9 @@ def test_points_without_noise_have_the_extent_that_rounding_leaves(dimensions):
 def test_either_map_at_one_point_leaves_the_angle_open(at_one_point):
     p = np.random.default_rng(1).uniform(0, 9, (20, 3))
     maps = {name: landmarks(p, name=name) for name in "ab"}
-    assert why_one_place(pairs_of(maps)) == ""
+    assert why_angle_is_open(pairs_of(maps)) == ""
     maps[at_one_point] = landmarks(np.tile(p[:1], (20, 1)), name=at_one_point)
-    assert f"map {at_one_point}" in why_one_place(pairs_of(maps))
+    assert f"map {at_one_point}" in why_angle_is_open(pairs_of(maps))
 
 
 def pairs_of(maps):

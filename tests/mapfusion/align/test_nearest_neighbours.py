@@ -10,9 +10,9 @@ from mapfusion.align.nearest_neighbours import (
     BoxTree,
     Grid,
     Groups,
-    look_up_group,
-    room_for_groups,
-    runs_about,
+    find_nearest_of_group,
+    new_search_state,
+    ranges_within,
 )
 from mapfusion.geometry import se2
 
@@ -35,7 +35,7 @@ def test_all_within_a_radius_are_in_the_runs_about_a_point(kind):
     runs = np.empty((grid.shape[1], 2), np.int64)
     queries = np.vstack([rng.uniform(-2, 22, (200, 3)), rng.uniform(-1000, 1000, (20, 3)), p[:20]])
     for q, radius in zip(queries, rng.uniform(0, 3, len(queries)), strict=True):
-        ranges = runs[: runs_about(q[0], q[1], radius, grid, runs)]
+        ranges = runs[: ranges_within(q[0], q[1], radius, grid, runs)]
         found = np.concatenate([grid.row[first:end] for first, end in ranges] + [np.zeros(0, int)])
         near = np.flatnonzero(np.hypot(*(p - q)[:, :2].T) <= radius)
         assert len(set(found)) == len(found)
@@ -47,7 +47,7 @@ def test_all_within_a_radius_are_in_the_runs_about_a_point(kind):
 def test_of_no_points_there_is_a_grid():
     grid = Grid.of(np.zeros((0, 2)))
     runs = np.empty((grid.shape[1], 2), np.int64)
-    assert runs_about(0.0, 0.0, 1.0, grid, runs) <= 1
+    assert ranges_within(0.0, 0.0, 1.0, grid, runs) <= 1
     np.testing.assert_array_equal(grid.start, 0)
 
 
@@ -84,7 +84,7 @@ def test_each_box_holds_its_points_and_halves_those_of_the_one_above(kind):
 
 @pytest.mark.parametrize("n", [1, POINTS_PER_LEAF, 10 * POINTS_PER_LEAF])
 def test_kernels_get_arrays_of_one_layout_from_trees_of_any_size(n: int) -> None:
-    """Of another layout they would be compiled once more."""
+    """Another memory layout would compile the kernels again."""
     tree = BoxTree.of(np.random.default_rng(0).uniform(0, 9, (n, 3)))
     assert all(part.flags.c_contiguous for part in tree)
 
@@ -97,7 +97,7 @@ def test_finds_what_looking_at_all_finds(kind: str, begins: str, n: int) -> None
     p, T = points(kind, rng), np.array([3.0, -1.0, 0.7])
     asked = np.vstack([rng.uniform(-2, 22, (40, 3)), rng.uniform(-100, 100, (20, 3)), p[:20]])
     asked = rng.permutation(np.tile(asked, (2, 1)))[:n]
-    tree, groups, room = BoxTree.of(p), Groups.of(asked), room_for_groups()
+    tree, groups, room = BoxTree.of(p), Groups.of(asked), new_search_state()
     away = cdist(se2.transform_points(T, asked[groups.row]), tree.p)
     nearest = np.full(len(groups.row), -1)
     if begins == "with others":
@@ -105,7 +105,7 @@ def test_finds_what_looking_at_all_finds(kind: str, begins: str, n: int) -> None
     elif begins == "with the answer":
         nearest[:] = away.argmin(axis=1)
     for first in range(0, len(groups.row), GROUP):
-        look_up_group(T, first, groups, tree, nearest, room)
+        find_nearest_of_group(T, first, groups, tree, nearest, room)
         own = away[first : first + GROUP]
         np.testing.assert_allclose(np.sqrt(room.square), own.min(axis=1), rtol=0, atol=1e-10)
         found = own[np.arange(GROUP), room.nearest.astype(int)]
@@ -114,15 +114,15 @@ def test_finds_what_looking_at_all_finds(kind: str, begins: str, n: int) -> None
 
 @pytest.mark.parametrize("apart_m", [0.05, 1.0, 30.0])
 def test_close_groups_find_theirs_in_a_large_tree(apart_m: float) -> None:
-    """Where most of the tree is passed over, and what is passed over matters."""
+    """Most of the tree is excluded, and a wrong exclusion changes the result."""
     rng = np.random.default_rng(1)
     p = rng.uniform(0, [20, 20, 2], (3000, 3))
     asked = rng.permutation(p)[:1600] + rng.normal(0, apart_m, (1600, 3))
-    tree, groups, room = BoxTree.of(p), Groups.of(asked), room_for_groups()
+    tree, groups, room = BoxTree.of(p), Groups.of(asked), new_search_state()
     away = cdist(asked[groups.row], tree.p)
     for before in (np.full(1600, -1), away.argpartition(9, axis=1)[:, 9]):
         for first in range(0, 1600, GROUP):
-            look_up_group(np.zeros(3), first, groups, tree, before, room)
+            find_nearest_of_group(np.zeros(3), first, groups, tree, before, room)
             own = away[first : first + GROUP].min(axis=1)
             np.testing.assert_allclose(np.sqrt(room.square), own, rtol=0, atol=1e-10)
 
@@ -139,7 +139,7 @@ def test_each_point_is_in_a_group_and_the_last_one_is_filled_up(n: int) -> None:
 
 
 def test_groups_lie_close_together() -> None:
-    """On a wall of 512 points each group is a sixteenth or so of the wall's extent."""
+    """On a wall of 512 points a group has about 1/16 of the wall's extent."""
     along = np.random.default_rng(0).permutation(np.linspace(0, 1, 512))
     groups = Groups.of(np.column_stack([along, np.zeros((512, 2))]))
     assert np.ptp(groups.x.reshape(-1, GROUP), axis=1).max() == pytest.approx(15 / 511)

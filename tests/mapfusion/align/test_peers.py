@@ -1,4 +1,4 @@
-"""Other people's aligners behind our interface."""
+"""Tests of the adapters for aligners of other packages."""
 
 import numpy as np
 import pytest

@@ -20,7 +20,7 @@ LOG_MISS = math.log(1e-4)
 
 
 def closed_form(p_a, p_b):
-    """Least squares by the SVD of the cross-covariance (Arun et al. 1987)."""
+    """Fit a motion by the SVD of the cross-covariance (Arun et al. 1987)."""
     a, b = p_a[:, :2], p_b[:, :2]
     u, _, vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
     R = u @ np.diag([1, np.linalg.det(u @ vt)]) @ vt
@@ -34,7 +34,7 @@ def supporters(T, p_a, p_b):
 
 
 def hypothesis(p_a, p_b, i, j):
-    """The motion of a minimal set, settled on its support; None when it is no minimal set."""
+    """Return the motion of a minimal set, refitted to its support; None for a rejected set."""
     lengths = [np.linalg.norm(p[i, :2] - p[j, :2]) for p in (p_a, p_b)]
     if min(lengths) < BASELINE_M or abs(lengths[0] - lengths[1]) > 2 * GATE_M:
         return None
@@ -103,7 +103,7 @@ def test_no_minimal_set_of_all_has_more_support(seed):
 
 
 def test_of_equal_support_the_nearer_wins():
-    """Twenty pairs obey either of two motions, but one of them exactly."""
+    """Each of two motions has twenty supporters, one of them exactly."""
     rng = np.random.default_rng(8)
     p_b = rng.uniform(0, 10, (40, 3))
     exact, rough = np.array([1.0, 2.0, 0.3]), np.array([-4.0, 7.0, -2.0])
@@ -127,7 +127,7 @@ def test_every_two_pairs_are_drawn_equally_often():
 
 @pytest.mark.parametrize(("outliers", "least"), [(0.95, 100), (0.99, 95)])
 def test_the_bar(outliers, least):
-    """1000 pairs, noise 0.05 m: successes of 100, and the median error beside the oracle's."""
+    """1000 pairs, noise 0.05 m: successes of 100, and the median error relative to the oracle."""
     estimated, refined, best = [], [], []
     for seed in range(100):
         rng = np.random.default_rng(1000 + seed)
@@ -165,7 +165,7 @@ def test_heights_count_unless_planar():
 
 
 def test_support_is_within_the_gate_in_all_dimensions_there_are():
-    """0.3 m off in the plane and 0.4 m in height: 0.5 m off."""
+    """Residuals of 0.3 m in the plane and 0.4 m in height make 0.5 m."""
     p_a, p_b = np.array([[1.0, 2.0, 3.0]]), np.array([[1.3, 2.0, 3.4]])
     for gate_m, counted, counted_flat in ((0.29, 0, 0), (0.49, 0, 1), (0.51, 1, 1)):
         for points, n in (((p_a, p_b), counted), ((p_a[:, :2], p_b[:, :2]), counted_flat)):

@@ -16,7 +16,7 @@ from tests.mapfusion.align.map_pairs import error, given_pairs, stretched
 
 
 def slow_iterate(pairs, T, gate_m, least_drift_m, rounds, variance=None, share=0.5):
-    """Expectation maximisation written out with whole matrices, every step a whole one."""
+    """Run expectation maximisation with matrix products and full steps."""
     variance = (gate_m / 3) ** 2 if variance is None else variance
     for _ in range(rounds):
         e = residuals(T, pairs.p_a, pairs.p_b)
@@ -65,7 +65,7 @@ def test_kernel_equals_its_twin(rounds):
 
 
 def test_pairs_that_come_within_the_gate_on_the_way_count():
-    """From a start so turned that most of them begin far beyond the gate."""
+    """The initial rotation moves most pairs out of the gate."""
     rng = np.random.default_rng(13)
     pair, maps = offered(rng, 200, 0.7, 0.05)
     pairs = Pairs(*maps)
@@ -88,7 +88,7 @@ def test_pairs_that_come_within_the_gate_on_the_way_count():
 
 @pytest.mark.parametrize("seed", [12, 192, 0])
 def test_few_pairs_far_surer_than_the_rest_do_not_swing_it(seed):
-    """With whole steps of s_drift seeds 12 and 192 go to and fro between two answers for ever."""
+    """With full steps of s_drift seeds 12 and 192 oscillate between two results."""
     rng = np.random.default_rng(seed)
     n, T_a_b = 60, np.array([1.0, 2.0, 0.5])
     p_b = rng.uniform(-5, 5, (n, 2))
@@ -111,7 +111,7 @@ def test_few_pairs_far_surer_than_the_rest_do_not_swing_it(seed):
 
 
 def test_answer_is_where_the_likelihood_is_flat():
-    """With round covariances, weights do not turn with theta, and the fixed point is a maximum."""
+    """Isotropic weights do not depend on theta, so that the fixed point is a maximum."""
     pair, maps = offered(np.random.default_rng(1), 150, 0.4, 0.1)
     refinement = Refinement(gate_m=0.5, least_drift_m=0.0)
     found = refinement.refine(Pairs(*maps), pair.T_a_b)
@@ -170,7 +170,7 @@ def test_error_falls_with_the_root_of_the_number_of_pairs():
 
 @pytest.mark.parametrize("drift_m", [0.0, 0.1])
 def test_covariance_covers_the_error(drift_m):
-    """Mean normalised squared error of 3 parameters, true covariances stretched, 40 % false."""
+    """The mean NEES is 3 with anisotropic covariances and 40 % false pairs."""
     nees, drifts = [], []
     for seed in range(400):
         rng = np.random.default_rng(seed)
@@ -218,7 +218,7 @@ def test_covariance_covers_the_error_among_planar_outliers(n, n_true, drift_m):
 
 
 def test_a_part_that_moved_as_one_is_not_taken_for_false():
-    """A fifth of the true pairs lies 0.3 m aside: still one answer, from wherever one begins."""
+    """A fifth of the true pairs is displaced by 0.3 m; all initial estimates give one result."""
     pair, (map_a, map_b, c) = offered(np.random.default_rng(9), 300, 1.0, 0.02, 0.01)
     aside = map_b.position_m[:, 0] > np.quantile(map_b.position_m[:, 0], 0.8)
     map_b = replace(map_b, position_m=map_b.position_m + 0.3 * aside[:, None] * np.array([0, 1, 0]))
@@ -233,7 +233,7 @@ def test_a_part_that_moved_as_one_is_not_taken_for_false():
 
 
 def test_drift_is_at_most_what_false_pairs_over_the_gate_would_look_like():
-    """Residuals spread evenly over the gate of 0.5 m fit any s_drift: a third of it is the most."""
+    """Uniform residuals over the gate fit any s_drift; its limit is a third of the gate."""
     rng = np.random.default_rng(10)
     pair = given_pairs(rng, 400, planar=True)
     angle, radius = rng.uniform(0, 2 * np.pi, 400), 0.5 * np.sqrt(rng.uniform(0, 1, 400))

@@ -64,7 +64,7 @@ def test_residual_covariance_against_monte_carlo(noisy):
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_motion_covariance_against_monte_carlo(noisy, weighted):
-    """Noise of every size and direction: of the fit that was made, not of the best one."""
+    """The covariance is that of the given weights, not of the optimal ones."""
     T_a_b, _, p_b = noisy
     rng = np.random.default_rng(2)
     exact = se2.transform_points(T_a_b, p_b)[:, :2]
@@ -86,7 +86,7 @@ def test_motion_covariance_against_monte_carlo(noisy, weighted):
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_kernels_equal_their_twins(noisy, weighted):
-    """The same in products of whole arrays."""
+    """Compute the same by products of whole arrays."""
     T_a_b, p_a, p_b = noisy
     rng = np.random.default_rng(4)
     S_a, S_b = covariances(rng, 30), covariances(rng, 30)

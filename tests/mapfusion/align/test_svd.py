@@ -13,7 +13,7 @@ RNG = np.random.default_rng(0)  # SVD draws nothing
 
 
 def listing(m, m_prime):
-    """Algorithm 1 line by line, on homogeneous points one a row."""
+    """Run algorithm 1 line by line, on homogeneous points, one per row."""
     m, m_prime = (np.column_stack([p, np.ones(len(p))]) for p in (m, m_prime))
     u, d, vt = np.linalg.svd(m_prime, full_matrices=False)
     z = u.T @ m
@@ -47,7 +47,7 @@ def test_solved_translation_brings_centroids_together():
 
 
 def test_printed_translation_depends_on_where_map_b_begins():
-    """Only the solved translation stays the same motion when map b gets another origin."""
+    """Only the solved translation is equivariant under a change of map b's origin."""
     pair = given_pairs(np.random.default_rng(4), 50, 0.5, 0.1)
     T_new_b = np.array([30.0, -20.0, 0.0])
     shifted = moved(pair.map_b, T_new_b)
@@ -62,7 +62,7 @@ def test_printed_translation_depends_on_where_map_b_begins():
 
 @pytest.mark.parametrize("translation", ["printed", "solved"])
 def test_covariance_against_monte_carlo(translation):
-    """Noise in map a, of a size of its own for each landmark, which the fit does not know."""
+    """Map a has different noise for each landmark, which the fit does not use."""
     pair = given_pairs(np.random.default_rng(6), 30)
     rng = np.random.default_rng(7)
     sigma = rng.uniform(0.01, 0.2, 30)
@@ -82,7 +82,7 @@ def test_covariance_against_monte_carlo(translation):
 
 @pytest.mark.parametrize(("across_m", "status"), [(0.0, "degenerate"), (2.0, "accepted")])
 def test_one_common_wall_is_degenerate(across_m, status):
-    """Landmarks of one wall, whose spread across it is their noise, beside a room."""
+    """Compare landmarks of one wall, with noise across it, and landmarks of a room."""
     rng = np.random.default_rng(5)
     sigma, n = 0.05, 60
     p = np.column_stack(

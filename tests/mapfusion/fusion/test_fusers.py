@@ -1,6 +1,7 @@
 """Fusers by name, our own and those of installed packages."""
 
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
@@ -31,6 +32,7 @@ def offered(monkeypatch: pytest.MonkeyPatch) -> None:
         EntryPoint("joint", f"{__name__}:Other", GROUP),
         EntryPoint("none", f"{__name__}:NoFuser", GROUP),
         EntryPoint("gone", f"{__name__}:Gone", GROUP),
+        EntryPoint("former", "fuser_with_former_import:Fuser", GROUP),
     ]
     monkeypatch.setattr(fusers, "entry_points", lambda group: entries)
 
@@ -44,6 +46,27 @@ def test_all_of_ours_can_be_made(name: str) -> None:
 def test_others_are_found_and_ours_come_first() -> None:
     assert isinstance(make_fuser("other"), Other)
     assert isinstance(make_fuser("joint"), JointFuser)
+
+
+@pytest.mark.usefixtures("offered")
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (
+            "from mapfusion.fuse.component import Component",
+            "mapfusion.fuse.component is now mapfusion.fusion.fused_map",
+        ),
+        ("import mapfusion.fused_map", "mapfusion.fused_map is now mapfusion.fusion.fused_map"),
+        ("from mapfusion import se2", "mapfusion.se2 is now mapfusion.geometry.se2"),
+    ],
+)
+def test_a_former_import_is_told_with_the_new_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str, told: str
+) -> None:
+    (tmp_path / "fuser_with_former_import.py").write_text(f"{line}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=f"fuser former: .*; {told}: change the import$"):
+        make_fuser("former")
 
 
 @pytest.mark.usefixtures("offered")

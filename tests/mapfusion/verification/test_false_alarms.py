@@ -25,10 +25,10 @@ from mapfusion.verification.false_alarms import (
     chance_of_agreeing,
     fewest_false_alarms,
     independent_pairs,
+    independent_rows,
     log10_tail,
     minimal_motion,
     named_false_alarms,
-    thin,
 )
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks, motion, moved, swapped
 
@@ -48,7 +48,7 @@ def judged(pair, T_a_b=None, **parameters):
 
 
 def random_pairs(rng, n, planar=True):
-    """All false: positions of both maps drawn apart, on walls and in clumps."""
+    """Return false pairs: independent positions of both maps, on walls and in clusters."""
 
     def points():
         wall = rng.integers(6, size=n)
@@ -68,7 +68,7 @@ def random_pairs(rng, n, planar=True):
 
 @pytest.mark.parametrize("planar", [True, False])
 def test_false_alarms_are_at_most_the_stated_number(planar):
-    """RANSAC on 200 pairs of random maps, at a rate high enough to be seen to be exceeded."""
+    """Run RANSAC on 200 pairs of random maps, at a rate that such a sample can reject."""
     rng = np.random.default_rng(4)
     stated, n = 1.0, 200
     test = Acceptance(false_alarms=stated)
@@ -114,7 +114,7 @@ def test_clumped_supporters_are_one():
 
 
 def test_few_true_pairs_among_good_matches_are_found():
-    """12 true ones hide among 400 in a room, but match best: the smaller selections see them."""
+    """12 of 400 pairs are true and match best, so that smaller selections find them."""
     rng = np.random.default_rng(7)
     pair = given_pairs(rng, 400, 12 / 400, 0.02, 0.5, np.array([1.0, 0.5, 0.3]), planar=True)
     T_a_b = pair.T_a_b * [0.2, 0.2, 1.0]
@@ -158,7 +158,7 @@ def test_verdict_does_not_depend_on_the_frames():
 
 
 def test_a_few_landmarks_with_known_labels_pass_when_all_agree():
-    """MRCLAM: 15 of 15. The fewest that can be accepted are 6 of 6."""
+    """MRCLAM has 15 of 15; the smallest accepted number is 6 of 6."""
     rng = np.random.default_rng(9)
     for n, accepted in ((3, False), (4, False), (5, False), (6, True), (15, True)):
         p_a = np.column_stack([1.5 * np.arange(n), 3 * np.cos(np.arange(n)), np.zeros(n)])
@@ -268,12 +268,12 @@ def test_thinning_keeps_the_first_of_neighbours_in_both_maps():
         if not any(near):
             kept.append(i)
     assert 100 < len(kept) < 195
-    np.testing.assert_array_equal(thin(p_a, p_b, 0.4), kept)
-    np.testing.assert_array_equal(thin(p_a, p_b, 0.0), np.arange(200))
+    np.testing.assert_array_equal(independent_rows(p_a, p_b, 0.4), kept)
+    np.testing.assert_array_equal(independent_rows(p_a, p_b, 0.0), np.arange(200))
 
 
 def twin_counts(T_a_b, p_a, p_b, heights, n):
-    """(G,) re-pairings among the first n that agree, and how many there are."""
+    """Return the number of agreeing re-pairings among the first n by gate (G,), and of all."""
     distance = np.linalg.norm(p_a[:n, None] - se2.transform_points(T_a_b, p_b)[None, :n], axis=2)
     dz2 = (heights[:n, None, 0] - heights[None, :n, 1]) ** 2
     possible = (dz2 <= heights[:n, None, 2] + heights[None, :n, 3]) & ~np.eye(n, dtype=bool)
@@ -299,7 +299,7 @@ def test_repairings_are_counted_right():
 
 
 def test_chance_is_the_larger_of_the_selections_and_of_all():
-    """Counted by hand, one more than was counted: 1/5 and 3/101, 5/5 and 4/101, 1/5 and 101/101."""
+    """Counts plus one, by hand: 1/5 and 3/101, 5/5 and 4/101, 1/5 and 101/101."""
     agreeing, possible = np.array([[0, 4, 0], [2, 3, 100]]), np.array([4, 100])
     found = [chance_of_agreeing(agreeing, g, *possible) for g in range(3)]
     np.testing.assert_allclose(found, [0.2, 1.0, 1.0], rtol=1e-12)
@@ -326,7 +326,7 @@ def test_minimal_motion_is_the_nearest_of_all():
 
 
 def twin_nfa(p_a, p_b, heights, T_a_b):
-    """The documented formula, a selection and a gate at a time."""
+    """Evaluate the documented formula for each selection and gate."""
     sizes = [len(p_a) >> s for s in range(20) if s == 0 or len(p_a) >> s >= 16]
     distance = np.linalg.norm(p_a - se2.transform_points(T_a_b, p_b), axis=1)
     best = math.inf
@@ -352,7 +352,7 @@ def twin_nfa(p_a, p_b, heights, T_a_b):
 
 @pytest.mark.parametrize(("true_share", "sigma_m"), [(0.0, 0.03), (0.2, 0.03), (0.6, 0.2)])
 def test_the_whole_is_the_documented_formula(true_share, sigma_m):
-    """With noise of half a gate, support under the motion judged is not that under two pairs'."""
+    """With noise of half a gate the support differs between the motion and that of two pairs."""
     rng = np.random.default_rng(3)
     for n in (20, 70):
         pair = given_pairs(rng, n, true_share, sigma_m, planar=True)
@@ -390,7 +390,7 @@ def test_it_is_what_the_formula_says() -> None:
 
 
 def test_namesakes_may_be_twice_as_far_off_as_the_widest_gate() -> None:
-    """The pairs are 0.6 m off: outside the widest gate of 0.4 m, inside twice that gate."""
+    """Residuals are 0.6 m: outside the widest gate of 0.4 m, inside twice that gate."""
     rng = np.random.default_rng(4)
     p_a, way = rng.uniform(0, [40, 30], (10, 2)), rng.uniform(-np.pi, np.pi, 10)
     off = np.array([0.01, 0.01] + [0.6] * 6 + [0.81, 5.0])
@@ -414,7 +414,7 @@ def test_three_namesakes_that_agree_are_evidence(sigma_m: float, accepted: bool)
 
 
 def test_maps_that_are_wrong_have_no_more_false_alarms_than_stated() -> None:
-    """Namesakes anywhere on the same ground: every motion of two of them, judged."""
+    """Test every motion of two of the labelled landmarks with uniform positions."""
     rng, bound, n_maps, accepted = np.random.default_rng(2), 0.1, 200, 0
     for _ in range(n_maps):
         p_a, p_b = rng.uniform(0, 10, (2, 8, 2))
@@ -430,7 +430,7 @@ def test_maps_that_are_wrong_have_no_more_false_alarms_than_stated() -> None:
 
 
 def test_maps_that_are_bent_are_fitted_by_all_that_has_a_name() -> None:
-    """One half of each map is turned aside: a gate would lay the larger half on its like alone."""
+    """One half of each map is rotated; a narrow gate would align the larger half only."""
     rng = np.random.default_rng(3)
     p_a = rng.uniform(0, [12, 8], (11, 2))
     bent = p_a.copy()

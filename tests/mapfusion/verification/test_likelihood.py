@@ -12,24 +12,24 @@ from mapfusion.verification.likelihood import (
     RIGHT,
     WRONG,
     BetaRate,
-    Signs,
+    EvidenceFeatures,
     TwinShares,
     log10_against_chance,
-    log10_beside_one,
     log10_ratio,
-    probability,
+    log10_without_discovery,
+    probability_correct,
 )
 
 
 def must_own(k: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Regions (R, 2, 2) of nothing but landmarks that must be seen, where nothing is a copy."""
+    """Return regions (R, 2, 2) of landmarks that must be seen, without copies."""
     regions = np.zeros((2, len(k), 2, 2), np.int64)
     regions[:, :, 0, 0] = k, n
     return regions[0], regions[1]
 
 
 def pmf(k: np.ndarray, n: np.ndarray, rates) -> np.ndarray:
-    """(R, 2) of both parts, each a product over both classes."""
+    """Return the likelihoods of both parts (R, 2), each a product over both classes."""
     return np.prod([betabinom.pmf(k[..., c], n[..., c], *rates[c]) for c in (0, 1)], axis=0)
 
 
@@ -67,7 +67,7 @@ def test_a_rate_in_part_has_the_mean_and_spread_of_a_rate_times_any_share(rate: 
 
 
 def test_half_of_a_region_speaks_for_a_twin_in_part() -> None:
-    """What is found throughout is likelier of a right motion; half of it of the edge of a twin."""
+    """A fully matched region favours a right motion, a half-matched one a partial copy."""
     found = np.array([170, 100])
     throughout, half = log10_ratio(*must_own(found, np.full(2, 200)), TwinShares(0.2, 0.2))
     assert throughout > 0.7
@@ -75,7 +75,7 @@ def test_half_of_a_region_speaks_for_a_twin_in_part() -> None:
 
 
 def test_of_a_copy_that_is_found_less_is_learnt_than_of_what_surrounds_it() -> None:
-    """The same picture, its surroundings found, not looked for, and missing."""
+    """Compare a texture with its surroundings matched, not expected, and missing."""
     found, expected = np.zeros((3, 2, 2), np.int64), np.zeros((3, 2, 2), np.int64)
     found[:, 1, 0] = expected[:, 1, 0] = 20
     found[0, 0, 0], expected[[0, 2], 0, 0] = 12, 12
@@ -95,12 +95,12 @@ def test_where_all_is_a_twin_only_that_it_is_one_throughout_speaks_for_a_motion(
 
 
 def of_twin(k: np.ndarray, n: int) -> np.ndarray:
-    """The likelihood of k of n that must be seen where they are their like."""
+    """Return the likelihood of k of n that must be seen in a copy."""
     return WHOLE * betabinom.pmf(k, n, *RIGHT[0]) + (1 - WHOLE) * betabinom.pmf(k, n, *PART[0])
 
 
 def test_the_ratio_s_mean_under_wrong_motions_is_one() -> None:
-    """E[right / wrong] over the wrong model is 1, whatever the numbers: a likelihood ratio."""
+    """E[right / wrong] under the wrong model is 1, as for every likelihood ratio."""
     n, s = 12, 0.15
     k = np.arange(n + 1)
     wrong = s * of_twin(k, n) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
@@ -109,7 +109,7 @@ def test_the_ratio_s_mean_under_wrong_motions_is_one() -> None:
 
 
 def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
-    """The wrong model is enumerated: of two regions either, at even odds, is as if right."""
+    """The wrong model is enumerated: either of two regions, with equal odds, is a copy."""
     n, s = 7, 0.15
     k = np.arange(n + 1)
     wrong = s * of_twin(k, n) + (1 - s) * betabinom.pmf(k, n, *WRONG[0])
@@ -117,7 +117,7 @@ def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
     found_by_one = (np.outer(right, wrong) + np.outer(wrong, right)) / 2
     by_region = log10_ratio(*must_own(k, np.full(n + 1, n)), TwinShares(s, 0.5))
     ratio = [
-        [10 ** log10_beside_one(np.array([first, second])) for second in by_region]
+        [10 ** log10_without_discovery(np.array([first, second])) for second in by_region]
         for first in by_region
     ]
     np.testing.assert_allclose(found_by_one * ratio, np.outer(right, right), rtol=1e-9)
@@ -125,13 +125,13 @@ def test_beside_the_region_that_found_it_the_mean_is_one_too() -> None:
 
 
 def test_one_region_alone_is_no_evidence_for_what_it_found() -> None:
-    assert log10_beside_one(np.array([1.3])) == pytest.approx(0.0)
-    assert log10_beside_one(np.zeros(0)) == 0.0
-    assert log10_beside_one(np.full(4, 0.8)) == pytest.approx(3 * 0.8)
-    assert log10_beside_one(np.array([1.3, -1.2])) == pytest.approx(-0.9, abs=0.01)
+    assert log10_without_discovery(np.array([1.3])) == pytest.approx(0.0)
+    assert log10_without_discovery(np.zeros(0)) == 0.0
+    assert log10_without_discovery(np.full(4, 0.8)) == pytest.approx(3 * 0.8)
+    assert log10_without_discovery(np.array([1.3, -1.2])) == pytest.approx(-0.9, abs=0.01)
 
 
-FAIR = Signs(-20.0, 1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
+FAIR = EvidenceFeatures(-20.0, 1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
 
 
 @pytest.mark.parametrize(
@@ -146,15 +146,15 @@ FAIR = Signs(-20.0, 1.0, 4, 0, 50, 8.0, repeats=False, one_place=False)
     ],
 )
 def test_it_grows_with_what_speaks_for_it(better: dict, worse: dict) -> None:
-    high, low = (probability(FAIR._replace(**signs)) for signs in (better, worse))
+    high, low = (probability_correct(FAIR._replace(**signs)) for signs in (better, worse))
     assert 0 < low < high < 1
 
 
 def test_the_features_are_bounded_so_that_nothing_is_certain() -> None:
-    most = Signs(-1e9, 1e9, 10**6, 0, 10**6, 1e9, repeats=False, one_place=False)
-    assert probability(most) < 1
-    assert np.isfinite(most.features()).all()
-    np.testing.assert_allclose(most.features()[[0, 1, 4]], [10.0, 3.0, 12.0])
+    most = EvidenceFeatures(-1e9, 1e9, 10**6, 0, 10**6, 1e9, repeats=False, one_place=False)
+    assert probability_correct(most) < 1
+    assert np.isfinite(most.vector()).all()
+    np.testing.assert_allclose(most.vector()[[0, 1, 4]], [10.0, 3.0, 12.0])
 
 
 @pytest.mark.parametrize(
@@ -173,12 +173,12 @@ def test_a_contradiction_weighs_as_much_as_three_confirmations(
     n_confirmed: int, n_contradicted: int, net: float
 ) -> None:
     signs = FAIR._replace(n_confirmed=n_confirmed, n_contradicted=n_contradicted)
-    assert signs.features()[2] == pytest.approx(net, abs=1e-15)
+    assert signs.vector()[2] == pytest.approx(net, abs=1e-15)
 
 
 @pytest.mark.parametrize(("n_support", "decades"), [(0, 0.0), (9, 1.0), (99, 2.0)])
 def test_support_counts_by_its_decades(n_support: int, decades: float) -> None:
-    assert FAIR._replace(n_support=n_support).features()[3] == pytest.approx(decades)
+    assert FAIR._replace(n_support=n_support).vector()[3] == pytest.approx(decades)
 
 
 def test_coefficients_belong_to_their_features(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,5 +188,5 @@ def test_coefficients_belong_to_their_features(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(model, "INTERCEPT", -0.25)
     for k, feature in enumerate(expected):
         monkeypatch.setattr(model, "WEIGHTS", tuple(0.5 * (i == k) for i in range(7)))
-        p = probability(signs)
+        p = probability_correct(signs)
         assert np.log(p / (1 - p)) == pytest.approx(0.5 * feature - 0.25)

@@ -8,18 +8,17 @@ from mapfusion.align.nearest_neighbours import Grid
 from mapfusion.align.refinement import Refinement
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import Witness, Witnesses
+from mapfusion.verification.regions import EvidenceParameters, ViewedMap, ViewedMapPair
 from mapfusion.verification.rivals import (
     BETWEEN,
-    Copies,
-    about_each,
-    apart_m,
-    laid_on_like,
-    largest_patch_m,
-    of_others,
+    RepeatedLandmarks,
+    count_neighbours,
+    longest_patch_side_m,
+    mark_repeated,
+    repeated_under_others,
+    rms_distance_m,
     self_motions,
-    twins,
+    similar_landmarks,
 )
 from tests.mapfusion.verification.two_rooms import Wall, between, mapped
 
@@ -32,31 +31,31 @@ def test_equals_the_slow_twin() -> None:
     hits = near @ found.astype(int)
     expected = (hits >= 5) & (hits >= 0.3 * near.sum(axis=1))
     grid, every = Grid.of(p), np.ones(len(p), np.bool_)
-    np.testing.assert_array_equal(about_each(found, grid), hits)
-    laid = laid_on_like(found, about_each(every, grid), grid)
+    np.testing.assert_array_equal(count_neighbours(found, grid), hits)
+    laid = mark_repeated(found, count_neighbours(every, grid), grid)
     np.testing.assert_array_equal(laid, expected)
     assert 20 < laid.sum() < 300
 
 
 def test_a_picture_that_hangs_twice_is_marked_at_both_places_and_nothing_else() -> None:
     wall = Wall(16, seed=1, copies=[(2, 2.0, 9.0)])
-    a = Witness(mapped(wall, 1, 14, seed=2))
-    witnesses = Witnesses(a, Witness(mapped(wall, 1, 14, seed=3)), EvidenceParameters())
-    onto_itself = witnesses.copies("a", between(9, 2))
+    a = ViewedMap(mapped(wall, 1, 14, seed=2))
+    viewed_maps = ViewedMapPair(a, ViewedMap(mapped(wall, 1, 14, seed=3)), EvidenceParameters())
+    onto_itself = viewed_maps.copies("a", between(9, 2))
     x = 1 - a.landmarks.position_m[:, 1]  # the map's y is the world's -x
     picture = ((x > 2.2) & (x < 3.8)) | ((x > 9.2) & (x < 10.8))
     away = (x < 1.5) | ((x > 4.5) & (x < 8.5)) | (x > 11.5)
     assert onto_itself.in_a[picture].mean() > 0.95
     assert not onto_itself.in_a[away].any()
     assert not onto_itself.in_b.any()
-    there = witnesses.copies(BETWEEN, np.zeros(3))
+    there = viewed_maps.copies(BETWEEN, np.zeros(3))
     assert there.in_a.mean() > 0.95
     assert there.in_b.mean() > 0.95
 
 
 def test_of_several_motions_all_count_but_one_s_own() -> None:
-    each = [Copies(np.arange(3) == k, np.arange(2) == k) for k in range(3)]
-    others = of_others(each, 1)
+    each = [RepeatedLandmarks(np.arange(3) == k, np.arange(2) == k) for k in range(3)]
+    others = repeated_under_others(each, 1)
     assert others.in_a.tolist() == [True, False, True]
     assert others.in_b.tolist() == [True, False]
 
@@ -81,7 +80,7 @@ def test_equals_all_pairs() -> None:
     unlike[near | ~level | np.isnan(unlike)] = np.inf
     best = unlike.argmin(axis=1)
     rows = np.flatnonzero((best[best] == np.arange(600)) & (unlike.min(axis=1) <= 0.6))
-    found = twins(landmarks)
+    found = similar_landmarks(landmarks)
     np.testing.assert_array_equal(found.index_a, rows)
     np.testing.assert_array_equal(found.index_b, best[rows])
     assert len(rows) > 50
@@ -97,7 +96,7 @@ def test_a_picture_that_hangs_twice_is_found_and_one_that_hangs_once_is_not() ->
         if repeats:
             np.testing.assert_allclose(np.abs(motions[0].T_a_b), [0, 7, 0], atol=0.05)
             p = np.ascontiguousarray(pairs.p_a[motions[0].inlier, :2])
-            assert largest_patch_m(p, 0.7, 5) == pytest.approx(1.5, abs=0.3)
+            assert longest_patch_side_m(p, 0.7, 5) == pytest.approx(1.5, abs=0.3)
 
 
 def test_patches_are_single_linkage_clusters() -> None:
@@ -106,8 +105,8 @@ def test_patches_are_single_linkage_clusters() -> None:
         p = rng.uniform(0, 8, (n, 2))
         of = fcluster(linkage(p, "single"), 0.7, "distance")
         sizes = [np.ptp(p[of == k], axis=0).max() for k in np.unique(of) if (of == k).sum() >= 5]
-        assert largest_patch_m(p, 0.7, 5) == pytest.approx(max(sizes, default=0.0))
-    assert largest_patch_m(np.zeros((0, 2)), 0.7, 5) == 0.0
+        assert longest_patch_side_m(p, 0.7, 5) == pytest.approx(max(sizes, default=0.0))
+    assert longest_patch_side_m(np.zeros((0, 2)), 0.7, 5) == 0.0
 
 
 def test_a_room_that_is_its_own_half_turn_says_so_once() -> None:
@@ -134,8 +133,8 @@ def test_motions_lie_apart_by_the_root_mean_square_over_the_points() -> None:
     """A turn by an angle t moves a point at distance r from the origin by 2 r sin(t / 2)."""
     p = np.array([[1.0, 0.0], [0.0, -2.0], [3.0, 4.0]])
     shift = np.array([0.3, -0.4, 0.0])
-    assert apart_m(shift, np.zeros(3), p) == pytest.approx(0.5)
+    assert rms_distance_m(shift, np.zeros(3), p) == pytest.approx(0.5)
     turn = np.array([0.0, 0.0, 0.6])
     expected = 2 * np.sin(0.3) * np.sqrt((1 + 4 + 25) / 3)
-    assert apart_m(turn, np.zeros(3), p) == pytest.approx(expected)
-    assert apart_m(np.zeros(3), turn, p) == pytest.approx(expected)
+    assert rms_distance_m(turn, np.zeros(3), p) == pytest.approx(expected)
+    assert rms_distance_m(np.zeros(3), turn, p) == pytest.approx(expected)

@@ -15,10 +15,9 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.registration import Registration
 from mapfusion.verification import verdict as verdict_module
 from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.parameters import EvidenceParameters
-from mapfusion.verification.regions import Witness
-from mapfusion.verification.rivals import BETWEEN, Copies, self_motions
-from mapfusion.verification.verdict import Judge, RivalMotion, laid_sigma_m
+from mapfusion.verification.regions import EvidenceParameters, ViewedMap
+from mapfusion.verification.rivals import BETWEEN, RepeatedLandmarks, self_motions
+from mapfusion.verification.verdict import Judge, RivalMotion, landmark_sigma_m
 from tests.mapfusion.verification.two_rooms import Wall, between, mapped
 
 JUDGE = Judge()
@@ -56,14 +55,14 @@ def test_what_is_likelier_wrong_is_not_accepted_whatever_else_speaks_for_it() ->
 def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
     log10_by_chance: float, status: str
 ) -> None:
-    """Another motion, as well seen again: what chance gives anyway is none."""
+    """Another motion with as many confirmed regions is a rival only beyond chance."""
     pairs = match(A, B)
     sought = Registration(Clique()).on(A, B, pairs)
     assert sought.judge is not None
     evidence, (said, refined) = sought.judge.evidence, verdict(A, B)
     assert evidence is not None
     elsewhere = refined.T_a_b + np.array([0.0, 30.0, 0.0])
-    none = Copies.none(len(A), len(B))
+    none = RepeatedLandmarks.none(len(A), len(B))
     told = log10_by_chance, 9, 2, 0, 2, said.log10_evidence
     rival = RivalMotion(BETWEEN, elsewhere, *told, none)
     assert said.log10_evidence > 2.5
@@ -75,13 +74,13 @@ def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
 
 @pytest.mark.parametrize(("n_others", "status"), [(2, "accepted"), (4, "ambiguous")])
 def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str) -> None:
-    """Others that are more than chance by their pairs, and fit by no region."""
+    """Other motions are beyond chance by their pairs and have no confirmed region."""
     pairs, (said, refined) = match(A, B), verdict(A, B)
     sought = Registration(Clique()).on(A, B, pairs)
     assert sought.judge is not None
     evidence = sought.judge.evidence
     assert evidence is not None
-    none = Copies.none(len(A), len(B))
+    none = RepeatedLandmarks.none(len(A), len(B))
     others = [
         RivalMotion(
             BETWEEN, refined.T_a_b + np.array([0.0, 30.0 * k, 0.0]), -5.0, 9, 0, 3, 3, -4.0, none
@@ -97,7 +96,7 @@ def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str
 
 
 def walls_with_one_picture(first_x: float, last_x: float) -> tuple[Wall, Wall]:
-    """Two walls that have nothing but a picture in common."""
+    """Two walls share one texture only."""
     first, second = Wall(16, seed=1), Wall(16, seed=8)
     inside = (first.p[:, 0] >= first_x) & (first.p[:, 0] < last_x)
     hidden = (second.p[:, 0] >= first_x) & (second.p[:, 0] < last_x)
@@ -107,7 +106,7 @@ def walls_with_one_picture(first_x: float, last_x: float) -> tuple[Wall, Wall]:
 
 
 def test_what_is_missing_makes_doubt_though_nothing_repeats() -> None:
-    """A picture larger than a region, one of which led to the motion; as much is missing."""
+    """A texture covers several regions, one of which led to the motion; as many are missing."""
     first, second = walls_with_one_picture(4, 8)
     anyhow = Judge(evidence=EvidenceParameters(least_probability=0.0))
     said, _ = verdict(mapped(first, 4, 12, seed=4), mapped(second, 4, 12, seed=5), anyhow)
@@ -126,7 +125,7 @@ def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
 
 
 def test_a_picture_that_hangs_twice_leaves_two_places() -> None:
-    """Map a saw both copies and nothing else of b's ground; map b saw one."""
+    """Map a contains both copies and nothing else of b's area; map b contains one copy."""
     wall = Wall(30, seed=6, copies=[(4, 2.0, 12.0)])
     other = Wall(30, seed=7)
     picture = (wall.p[:, 0] >= 4) & (wall.p[:, 0] < 6)
@@ -138,7 +137,7 @@ def test_a_picture_that_hangs_twice_leaves_two_places() -> None:
 
 
 def test_a_room_that_is_all_there_is_may_be_another_s_like() -> None:
-    """Both robots see 4 m of one wall and nothing else; with ground around it they are sure."""
+    """Both robots see 4 m of one wall only; with surroundings the alignment is accepted."""
     room = Wall(4, seed=11)
     said, refined = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13))
     assert refined.ok
@@ -178,11 +177,11 @@ def test_what_was_found_before_gives_the_same_verdict() -> None:
 
 
 def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> None:
-    """Each as `a` and as `b`: what it holds twice, and what of that must be seen, is its own."""
+    """Results of one map are kept for several pairs, with the map as `a` and as `b`."""
     wall = Wall(20, seed=1, copies=[(2, 2, 12), (5, 1.5, 16)])
     ends = (1, 11), (4, 16), (7, 19)
     maps = [mapped(wall, *each, seed=k, name=f"R{k}") for k, each in enumerate(ends)]
-    ready, asked = [Witness(each) for each in maps], []
+    ready, asked = [ViewedMap(each) for each in maps], []
 
     def counted(landmarks: LandmarkMap, *settings):
         asked.append(landmarks.name)
@@ -192,7 +191,7 @@ def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> 
     for _ in range(2):
         for a, b in itertools.permutations(range(3), 2):
             pairs = Pairs(maps[a], maps[b], match(maps[a], maps[b]))
-            found = JUDGE.on(pairs, witnesses=(ready[a], ready[b])).evidence
+            found = JUDGE.on(pairs, viewed_maps=(ready[a], ready[b])).evidence
             n, fresh = len(asked), JUDGE.on(pairs).evidence
             assert len(asked) == n + 2
             del asked[n:]
@@ -204,13 +203,13 @@ def test_a_map_in_several_pairs_is_asked_once_and_says_the_same(monkeypatch) -> 
                 np.testing.assert_equal(asdict(own), asdict(other))
     assert sorted(asked) == ["R0", "R1", "R2"]
     other = replace(JUDGE, acceptance=Acceptance(patch_m=0.5))
-    changed = other.on(pairs, witnesses=(ready[a], ready[b])).evidence
+    changed = other.on(pairs, viewed_maps=(ready[a], ready[b])).evidence
     assert changed is not None
     assert len(asked) == 5
 
 
 def test_the_sigma_is_of_landmarks_wherever_the_origins_are() -> None:
-    """Moving both maps' origins far away changes an angle's lever, not the verdict."""
+    """Distant origins of both maps do not change the verdict."""
     far = np.array([1000.0, -500.0, 0.0])
     moved = [replace(m, position_m=m.position_m + far, viewing=None) for m in (A, B)]
     near, _ = verdict(replace(A, viewing=None), replace(B, viewing=None))
@@ -234,15 +233,15 @@ def test_it_is_the_rms_of_what_drawn_alignments_do(T_a_b: list[float]) -> None:
     laid = np.stack([se2.transform_points(each, P_B) for each in drawn])
     off = laid - se2.transform_points(T, P_B)
     expected = np.sqrt(np.mean(np.sum(off**2, axis=2)))
-    assert laid_sigma_m(T, COVARIANCE, P_B) == pytest.approx(expected, rel=0.03)
+    assert landmark_sigma_m(T, COVARIANCE, P_B) == pytest.approx(expected, rel=0.03)
 
 
 def test_where_the_frames_have_their_origins_does_not_matter() -> None:
-    """The same two maps with b's origin elsewhere: T, its covariance and p_b change, not this."""
+    """The value does not depend on the origin of map b."""
     T, shift = np.array([1.0, 2.0, 0.7]), np.array([300.0, -80.0])
     cos, sin = np.cos(T[2]), np.sin(T[2])
     moved = se2.rotation(T[2]) @ shift
     J = np.eye(3)
     J[:2, 2] = sin * shift[0] + cos * shift[1], -cos * shift[0] + sin * shift[1]
-    there = laid_sigma_m(T - [*moved, 0.0], J @ COVARIANCE @ J.T, P_B + shift)
-    assert there == pytest.approx(laid_sigma_m(T, COVARIANCE, P_B), rel=1e-9)
+    there = landmark_sigma_m(T - [*moved, 0.0], J @ COVARIANCE @ J.T, P_B + shift)
+    assert there == pytest.approx(landmark_sigma_m(T, COVARIANCE, P_B), rel=1e-9)

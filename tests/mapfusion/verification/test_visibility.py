@@ -1,4 +1,4 @@
-"""What must have been seen, against a slow twin and a wall that is known."""
+"""Tests of `mapfusion.verification.visibility`, with a slow reference and a known wall."""
 
 import inspect
 import math
@@ -7,15 +7,23 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.mapping import run_log
-from mapfusion.verification.regions import Witness
-from mapfusion.verification.visibility import LEAST_FRAMES, MAY, MUST, UNSEEN, Seen, Watch, how_seen
+from mapfusion.verification.regions import ViewedMap
+from mapfusion.verification.visibility import (
+    LEAST_FRAMES,
+    MAY,
+    MUST,
+    UNSEEN,
+    ObservedLandmarks,
+    ViewingHistory,
+    classify_visibility,
+)
 from mapfusion.viewing import BEARINGS, RANGES, FieldOfView, Viewing
 from mapfusion.vision.tracking import TrackParameters
 from tests.mapfusion.verification.two_rooms import Wall, between, mapped
 
 
-def slowly(seen: Seen, viewing: Viewing) -> list[int]:
-    """How each lay in view, pose by pose, from angles alone."""
+def slowly(seen: ObservedLandmarks, viewing: Viewing) -> list[int]:
+    """Classify the visibility pose by pose, by angles."""
     how, field = [], viewing.field
     for p, direction, before in zip(*seen, strict=True):
         alike, frames = 0, 0
@@ -49,15 +57,15 @@ def test_equals_the_slow_twin_on_any_places() -> None:
     n, angle = 8000, rng.uniform(-0.8, 0.8, 8000)
     places = np.stack([rng.uniform(1, 4, n), rng.uniform(-6, 2, n), rng.uniform(0, 1.3, n)], axis=1)
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    seen = Seen(places, direction, rng.uniform(1.5, 7, n))
-    how = how_seen(seen, Watch.of(landmarks.viewing))
+    seen = ObservedLandmarks(places, direction, rng.uniform(1.5, 7, n))
+    how = classify_visibility(seen, ViewingHistory.of(landmarks.viewing))
     assert how.tolist() == slowly(seen, landmarks.viewing)
     assert np.bincount(how, minlength=3).min() > 50
 
 
 @pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
 def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None:
-    """Stretches of frames in which the robot turns, and a last one that is shorter."""
+    """The robot turns within blocks of frames, and the last block is shorter."""
     rng = np.random.default_rng(1)
     n_frames, n = 100 * LEAST_FRAMES + 3, 3000
     theta = np.cumsum(rng.normal(0, 0.2, n_frames))
@@ -72,15 +80,15 @@ def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     distance = rng.uniform(0.5, 6, n)
     places = np.column_stack([at + distance[:, None] * direction, rng.uniform(0, 1.4, n)])
-    seen = Seen(places, direction, distance)
-    how = how_seen(seen, Watch.of(viewing))
+    seen = ObservedLandmarks(places, direction, distance)
+    how = classify_visibility(seen, ViewingHistory.of(viewing))
     assert how.tolist() == slowly(seen, viewing)
     assert np.bincount(how, minlength=3).min() > 50
 
 
 @pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
 def test_what_is_straight_behind_is_not_in_view(half_view_rad: float) -> None:
-    """Of a robot that turns once, so that its frames are not told all at once to look elsewhere."""
+    """The robot turns once, so that a block contains different headings."""
     n_frames, one = LEAST_FRAMES + 1, np.ones(1)
     path = np.zeros((n_frames, 3))
     path[0, 2] = 3.1
@@ -92,8 +100,8 @@ def test_what_is_straight_behind_is_not_in_view(half_view_rad: float) -> None:
     reach = np.full((n_frames, BEARINGS), 5.0, np.float32)
     ways = one, one, np.ones(1, np.int32), path, reach, field
     for x, how in ((2.0, MUST), (-2.0, UNSEEN)):
-        seen = Seen(np.array([[x, 0.0, 0.5]]), np.array([[np.sign(x), 0.0]]), 2 * one)
-        assert how_seen(seen, Watch.of(Viewing(*ways))).tolist() == [how]
+        seen = ObservedLandmarks(np.array([[x, 0.0, 0.5]]), np.array([[np.sign(x), 0.0]]), 2 * one)
+        assert classify_visibility(seen, ViewingHistory.of(Viewing(*ways))).tolist() == [how]
 
 
 def test_where_nothing_was_seen_nothing_is_in_view() -> None:
@@ -101,8 +109,8 @@ def test_where_nothing_was_seen_nothing_is_in_view() -> None:
     one, path = np.ones(1), np.zeros((9, 3))
     reach = np.zeros((9, BEARINGS), np.float32)
     viewing = Viewing(one, one, np.ones(1, np.int32), path, reach, nowhere)
-    seen = Seen(np.array([[0.2, 0.0, 0.5]]), np.array([[1.0, 0.0]]), 0.2 * one)
-    assert how_seen(seen, Watch.of(viewing)).tolist() == [UNSEEN]
+    seen = ObservedLandmarks(np.array([[0.2, 0.0, 0.5]]), np.array([[1.0, 0.0]]), 0.2 * one)
+    assert classify_visibility(seen, ViewingHistory.of(viewing)).tolist() == [UNSEEN]
 
 
 def test_what_must_be_seen_was_in_view_for_as_long_as_a_landmark_takes() -> None:
@@ -113,9 +121,9 @@ def test_what_must_be_seen_was_in_view_for_as_long_as_a_landmark_takes() -> None
 
 def test_of_the_same_wall_what_lies_before_both_robots_must_be_seen() -> None:
     wall = Wall(12, seed=5)
-    a, b = (Witness(mapped(wall, *ends, seed=6)) for ends in ((1, 6), (4, 10)))
-    own = b.seen_from(between(1, 4))
-    rows = np.flatnonzero(how_seen(own, a.watch) == MUST)
+    a, b = (ViewedMap(mapped(wall, *ends, seed=6)) for ends in ((1, 6), (4, 10)))
+    own = b.observed_from(between(1, 4))
+    rows = np.flatnonzero(classify_visibility(own, a.history) == MUST)
     along_wall_m = 1 - own.p[:, 1]  # frame a looks at the wall: its y is the world's -x
     inside = (along_wall_m > 4.5) & (along_wall_m < 5.5)
     assert np.isin(np.flatnonzero(inside), rows).mean() > 0.95
@@ -123,16 +131,16 @@ def test_of_the_same_wall_what_lies_before_both_robots_must_be_seen() -> None:
 
 
 def test_behind_a_wall_nothing_must_be_seen() -> None:
-    a = Witness(mapped(Wall(8, seed=7), 1, 6, seed=8))
-    here = a.seen_from(np.zeros(3))
+    a = ViewedMap(mapped(Wall(8, seed=7), 1, 6, seed=8))
+    here = a.observed_from(np.zeros(3))
     behind = here._replace(p=here.p + np.array([1.5, 0.0, 0.0]))
     along_wall_m = 1 - here.p[:, 1]
     passed = (along_wall_m > 1) & (along_wall_m < 6)  # what lies at the ends was in view for less
-    assert np.mean(how_seen(here, a.watch)[passed] == MUST) > 0.95
-    assert not how_seen(behind, a.watch).any()
+    assert np.mean(classify_visibility(here, a.history)[passed] == MUST) > 0.95
+    assert not classify_visibility(behind, a.history).any()
 
 
 def test_from_the_other_side_nothing_must_be_seen() -> None:
-    a = Witness(mapped(Wall(8, seed=7), 1, 6, seed=8))
-    here = a.seen_from(np.zeros(3))
-    assert not how_seen(here._replace(direction=-here.direction), a.watch).any()
+    a = ViewedMap(mapped(Wall(8, seed=7), 1, 6, seed=8))
+    here = a.observed_from(np.zeros(3))
+    assert not classify_visibility(here._replace(direction=-here.direction), a.history).any()

@@ -1,4 +1,4 @@
-"""Maps with viewing evidence of walls that are known, by robots that look at them from a line."""
+"""Maps with viewing evidence of known walls, observed by robots that drive along a line."""
 
 import numpy as np
 
@@ -12,9 +12,9 @@ HALF_VIEW_RAD, FARTHEST_M = 0.45, 8.0
 
 
 class Wall:
-    """A wall along x at y = 3, with landmarks all over it: places (N, 3) and what they look like.
+    """Wall along x at y = 3 with landmarks: positions (N, 3) and descriptors.
 
-    `copies` of (first_x, width, at_x): what lies in an interval of x is there again, elsewhere.
+    Each of `copies` (first_x, width, at_x) repeats an interval of x elsewhere.
     """
 
     def __init__(self, length_m: float, seed: int, copies=(), per_m: int = 12) -> None:
@@ -39,9 +39,9 @@ class Wall:
 def mapped(
     wall: Wall, first_x: float, last_x: float, seed: int, name: str = "R1", noise_m: float = 0.01
 ) -> LandmarkMap:
-    """The map of a robot that drives along the wall and looks at it, in the frame of its start.
+    """Return the map of a robot that drives along the wall, in the frame of its start.
 
-    It looks straight at the wall, from 3 m.
+    The camera faces the wall at a distance of 3 m.
     """
     rng = np.random.default_rng(seed)
     x = np.arange(first_x, last_x, 0.25)
@@ -83,6 +83,6 @@ def mapped(
 
 
 def between(first_a: float, first_b: float) -> Float:
-    """T_a_b of maps whose robots started at these places along the wall."""
+    """Return T_a_b of maps whose robots started at these positions along the wall."""
     start_a, start_b = (np.array([x, 0.0, np.pi / 2]) for x in (first_a, first_b))
     return se2.between(start_a, start_b)
