@@ -22,7 +22,7 @@ from mapfusion.files import Write, write_together
 from mapfusion.fusion.fused_map import AlignedPair, Fusion, name_order
 from mapfusion.fusion.fusers import make_fuser
 from mapfusion.fusion.merge import merge as merge_maps
-from mapfusion.fusion.team_graph import Place
+from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.registration import Registration
 from mapfusion.robot_log import read_log, read_odometry_covariance, read_true_poses
@@ -112,9 +112,9 @@ def _save(path: Path, writes: Mapping[Path, Write]) -> None:
 
 # Why an alignment that is accepted by itself is not used.
 _OF_THE_TEAM = {
-    Place.UNCONFIRMED: "no other alignment confirms this one",
-    Place.CONTRADICTED: "other alignments contradict this one",
-    Place.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
+    EdgeStatus.UNCONFIRMED: "no other alignment confirms this one",
+    EdgeStatus.CONTRADICTED: "other alignments contradict this one",
+    EdgeStatus.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
 }
 
 
@@ -140,7 +140,7 @@ class Merged(NamedTuple):
         found: dict[tuple[int, int], str] = {}
         for pair, place in zip(self.pairs, self.fusion.place, strict=True):
             reason = pair.alignment.reason or _OF_THE_TEAM.get(place, "")
-            if place in (Place.CONFIRMED, Place.BRIDGE):
+            if place in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
                 found[pair.a, pair.b] = ""
             else:
                 found.setdefault((pair.a, pair.b), reason)

@@ -87,7 +87,7 @@ class AlignedLandmarks:
     def __getitem__(self, rows: np.ndarray) -> "AlignedLandmarks":
         return with_rows(self, rows)
 
-    def joined(
+    def fuse_with(
         self,
         other: "AlignedLandmarks",
         rows: np.ndarray,
@@ -137,7 +137,7 @@ class AlignedLandmarks:
 
 
 @dataclass(frozen=True)
-class SamePoint:
+class AssociationTest:
     """The test by which two landmarks in one frame can be one point of the world.
 
     Attributes:
@@ -166,12 +166,12 @@ class SamePoint:
         inside = self._inside(a, b, i, j)
         i, j = i[inside], j[inside]
         labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
-        unlike = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
-        passes = ~labelled & (unlike <= self.max_descriptor_distance)  # False for NaN
+        dissimilarity = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
+        passes = ~labelled & (dissimilarity <= self.max_descriptor_distance)  # False for NaN
         return (
             np.concatenate([known_i, i[passes]]),
             np.concatenate([known_j, j[passes]]),
-            np.concatenate([np.zeros(len(known_i)), unlike[passes]]),
+            np.concatenate([np.zeros(len(known_i)), dissimilarity[passes]]),
         )
 
     def duplicate_share(self, landmarks: AlignedLandmarks) -> float:
@@ -228,12 +228,14 @@ def _of_one_label(label_a: np.ndarray, label_b: np.ndarray) -> tuple[np.ndarray,
     return rows_a[i], rows_b[j]
 
 
-def one_to_one(i: np.ndarray, j: np.ndarray, unlike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def one_to_one(
+    i: np.ndarray, j: np.ndarray, dissimilarity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The most alike first, each landmark once."""
     taken_i: set[int] = set()
     taken_j: set[int] = set()
     kept = []
-    rows = np.argsort(unlike, kind="stable")
+    rows = np.argsort(dissimilarity, kind="stable")
     for row, at_i, at_j in zip(rows, i[rows].tolist(), j[rows].tolist(), strict=True):
         if at_i not in taken_i and at_j not in taken_j:
             taken_i.add(at_i)
@@ -242,7 +244,7 @@ def one_to_one(i: np.ndarray, j: np.ndarray, unlike: np.ndarray) -> tuple[np.nda
     return i[kept], j[kept]
 
 
-class Pair(NamedTuple):
+class CandidatePairs(NamedTuple):
     """Landmarks of two maps that may be one point: n of them.
 
     Attributes:
@@ -250,17 +252,17 @@ class Pair(NamedTuple):
         b: place of the other.
         row_a: (n,) landmarks of the one.
         row_b: (n,) landmarks of the other.
-        unlike: (n,) how little they look alike.
+        dissimilarity: (n,) how little they look alike.
     """
 
     a: int
     b: int
     row_a: np.ndarray
     row_b: np.ndarray
-    unlike: np.ndarray
+    dissimilarity: np.ndarray
 
 
-def joined(pairs: list[Pair], sizes: list[int]) -> np.ndarray:
+def cluster_landmarks(pairs: list[CandidatePairs], sizes: list[int]) -> np.ndarray:
     """Points (C, M): the row of each of M maps, ABSENT for none; those of one map come last.
 
     What is most alike is joined first, unless the point would then have two landmarks of one map.
@@ -277,8 +279,8 @@ def joined(pairs: list[Pair], sizes: list[int]) -> np.ndarray:
     nothing = [np.empty(0, np.int64)]
     one = np.concatenate([first[pair.a] + pair.row_a for pair in pairs] or nothing)
     other = np.concatenate([first[pair.b] + pair.row_b for pair in pairs] or nothing)
-    unlike = np.concatenate([pair.unlike for pair in pairs] or nothing)
-    for row in np.argsort(unlike, kind="stable"):
+    dissimilarity = np.concatenate([pair.dissimilarity for pair in pairs] or nothing)
+    for row in np.argsort(dissimilarity, kind="stable"):
         i, j = int(root[one[row]]), int(root[other[row]])
         if i == j or members[i].keys() & members[j].keys():
             continue

@@ -13,7 +13,7 @@ from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.smoother.joint_smoothing import Recording, SmoothedTogether, smooth_together
+from mapfusion.smoother.joint_smoothing import AssociatedLog, JointlySmoothed, smooth_jointly
 from mapfusion.smoother.smooth import condensed_points
 
 _NO_POINT = -1
@@ -42,13 +42,13 @@ class Batch:
         ]
         start = joint.T_first_map[component.members]
         try:
-            together = smooth_together(recordings, points, start, self.max_memory_gb)
+            together = smooth_jointly(recordings, points, start, self.max_memory_gb)
         except (np.linalg.LinAlgError, MemoryError) as error:
             return replace(joint, fallback=f"smoothing all logs at once: {error}")
         return _fused_map(joint, component.members, together)
 
 
-def _recordings(component: Component) -> Sequence[Recording] | str:
+def _recordings(component: Component) -> Sequence[AssociatedLog] | str:
     """Those of the members, or why they cannot be smoothed together."""
     known = dict(enumerate(component.recordings))
     found = [known.get(int(k)) for k in component.members]
@@ -75,7 +75,7 @@ def _points(landmarks: LandmarkMap, parents: np.ndarray, landmark: np.ndarray) -
     return np.array([point.get(int(name), _NO_POINT) for name in names], dtype=np.int64)[inverse]
 
 
-def _fused_map(joint: FusedMap, members: np.ndarray, together: SmoothedTogether) -> FusedMap:
+def _fused_map(joint: FusedMap, members: np.ndarray, together: JointlySmoothed) -> FusedMap:
     """The joint map's points, where all logs say they are."""
     position, covariance = condensed_points(together.smoothed)
     landmarks = replace(

@@ -7,7 +7,7 @@ correlations": of w A^-1 + (1 - w) B^-1 that of the smallest determinant of the 
 import numpy as np
 
 from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
-from mapfusion.fusion.kalman import fused_in_turn
+from mapfusion.fusion.kalman import fuse_sequentially
 from mapfusion.geometry.numerics import Float
 
 _HALVINGS = 40  # of the unit interval: what is left of it is far below any use
@@ -20,10 +20,10 @@ class CovarianceIntersection:
 
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the component's members."""
-        return fused_in_turn(component, parameters, intersected, use_drift=True)
+        return fuse_sequentially(component, parameters, intersect_covariances, use_drift=True)
 
 
-def intersected(
+def intersect_covariances(
     position_i: Float, covariance_i: Float, position_j: Float, covariance_j: Float
 ) -> tuple[Float, Float]:
     """Pairs of landmarks in one frame.

@@ -10,12 +10,12 @@ import numpy as np
 
 from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.fusion.aligned_landmarks import SamePoint
-from mapfusion.fusion.team_graph import Place, TeamParameters
+from mapfusion.fusion.aligned_landmarks import AssociationTest
+from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Probability, Range, require_in_range
-from mapfusion.smoother.joint_smoothing import Recording
+from mapfusion.smoother.joint_smoothing import AssociatedLog
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Fusion:
     """
 
     fused: tuple[FusedMap, ...]
-    place: tuple[Place, ...]
+    place: tuple[EdgeStatus, ...]
 
 
 _DIGITS = re.compile("([0-9]+)")
@@ -129,9 +129,11 @@ class MergeParameters:
     def __post_init__(self) -> None:
         require_in_range(self)
 
-    def same_point(self, planar: bool) -> SamePoint:
+    def association_test(self, planar: bool) -> AssociationTest:
         """The test for landmarks that no alignment names."""
-        return SamePoint(self.max_descriptor_distance, self.gate_probability, self.height, planar)
+        return AssociationTest(
+            self.max_descriptor_distance, self.gate_probability, self.height, planar
+        )
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class Component:
     T_first_map: Float
     motion_covariance: Float
     left_out: tuple[tuple[str, str], ...]
-    recordings: tuple[Recording | None, ...] = ()
+    recordings: tuple[AssociatedLog | None, ...] = ()
 
     @property
     def by_name(self) -> list[int]:

@@ -15,7 +15,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from mapfusion.align.alignment import MIN_PAIRS
-from mapfusion.fusion.aligned_landmarks import ABSENT, AlignedLandmarks, Pair, joined
+from mapfusion.fusion.aligned_landmarks import (
+    ABSENT,
+    AlignedLandmarks,
+    CandidatePairs,
+    cluster_landmarks,
+)
 from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint_estimate import (
     JointEstimate,
@@ -71,7 +76,7 @@ class JointlyFused:
             T,
             covariance,
             drift,
-            parameters.same_point(self.component.planar).duplicate_share(still),
+            parameters.association_test(self.component.planar).duplicate_share(still),
             self.component.left_out,
         )
 
@@ -112,17 +117,19 @@ class JointlyFused:
         weight[: len(estimate.weight)] = estimate.weight
         factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
         rows = [np.flatnonzero(has[:, k]) for k in range(len(self.maps))]
-        said = [estimate.said(self.maps, k, self.points[own, k]) for k, own in enumerate(rows)]
+        transformed = [
+            estimate.transformed(self.maps, k, self.points[own, k]) for k, own in enumerate(rows)
+        ]
         W = [
             weighted_information(each, weight[own, k])
-            for k, (own, each) in enumerate(zip(rows, said, strict=True))
+            for k, (own, each) in enumerate(zip(rows, transformed, strict=True))
         ]
         information = np.zeros((n, n_dimensions, n_dimensions))
         for own, its in zip(rows, W, strict=True):
             information[own] += its
         V = inverses(information)
         total, moved = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
-        for k, (own, each, its) in enumerate(zip(rows, said, W, strict=True)):
+        for k, (own, each, its) in enumerate(zip(rows, transformed, W, strict=True)):
             gain = V[own] @ its
             total[own] += np.einsum("nij,nj->ni", gain, each.y_m)
             moved[own] += gain @ estimate.moved_m(self.maps, k, each, factor)
@@ -174,13 +181,13 @@ class JointFuser:
             for landmarks, k in zip(given, component.members, strict=True)
         ]
         sizes, inliers = [len(landmarks) for landmarks in given], _inliers(component)
-        points = joined(inliers, sizes)
+        points = cluster_landmarks(inliers, sizes)
         if not _tied(points):
             return f"fewer than {MIN_PAIRS} landmarks tie some map to the others"
         estimate = _estimated(maps, component.T_first_map[component.members], points)
         for _ in range(_MOST_ROUNDS):
             pairs = _candidates(given, _placed(maps, estimate), inliers, parameters, estimate.dof)
-            now = joined(pairs, sizes)
+            now = cluster_landmarks(pairs, sizes)
             if np.array_equal(points, now) or not _tied(now):
                 break
             points, estimate = now, _estimated(maps, estimate.T_first_map, now)
@@ -203,14 +210,14 @@ def _estimated(maps: Sequence[JointMap], T_first_map: Float, points: np.ndarray)
     return estimate_jointly(maps, T_first_map, points[several])
 
 
-def _inliers(component: Component) -> list[Pair]:
+def _inliers(component: Component) -> list[CandidatePairs]:
     """What alignments say is one; places are among the members, the lesser first."""
     place = {int(k): row for row, k in enumerate(component.members)}
     found = []
     for p in component.pairs:
         sides = [(place[p.a], p.inliers.index_a), (place[p.b], p.inliers.index_b)]
         (a, row_a), (b, row_b) = sorted(sides, key=lambda side: side[0])
-        found.append(Pair(a, b, row_a, row_b, p.inliers.distance))
+        found.append(CandidatePairs(a, b, row_a, row_b, p.inliers.distance))
     return found
 
 
@@ -237,18 +244,20 @@ class _Placed:
 
 def _placed(maps: Sequence[JointMap], estimate: JointEstimate) -> list[_Placed]:
     factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
-    said = [estimate.said(maps, k, np.arange(len(own))) for k, own in enumerate(maps)]
-    shared = [estimate.moved_m(maps, k, own, factor) for k, own in enumerate(said)]
-    return [_Placed(own.y_m, own.own_m2, moved) for own, moved in zip(said, shared, strict=True)]
+    transformed = [estimate.transformed(maps, k, np.arange(len(own))) for k, own in enumerate(maps)]
+    shared = [estimate.moved_m(maps, k, own, factor) for k, own in enumerate(transformed)]
+    return [
+        _Placed(own.y_m, own.own_m2, moved) for own, moved in zip(transformed, shared, strict=True)
+    ]
 
 
 def _candidates(
     given: Sequence[LandmarkMap],
     placed: Sequence[_Placed],
-    inliers: Sequence[Pair],
+    inliers: Sequence[CandidatePairs],
     parameters: MergeParameters,
     dof: float,
-) -> list[Pair]:
+) -> list[CandidatePairs]:
     """Landmarks of every two maps that may be one point.
 
     Those of one label need nothing else and are not unlike at all. All others have to pass the
@@ -260,23 +269,29 @@ def _candidates(
     bound = student_bound(parameters.gate_probability, dof, placed[0].position_m.shape[1])
     found = []
     for a, b in combinations(range(len(given)), 2):
-        i, j, unlike = _alike(given[a], given[b], *_near(placed[a], placed[b], bound))
-        near = unlike <= parameters.max_descriptor_distance
-        i, j, unlike = i[near], j[near], unlike[near]
+        i, j, dissimilarity = _alike(given[a], given[b], *_near(placed[a], placed[b], bound))
+        near = dissimilarity <= parameters.max_descriptor_distance
+        i, j, dissimilarity = i[near], j[near], dissimilarity[near]
         if given[a].descriptor is None or given[b].descriptor is None:
-            i, j, unlike = _named(inliers, a, b)
+            i, j, dissimilarity = _named(inliers, a, b)
         kept = _inside(placed[a], placed[b], i, j, bound)
         known_i, known_j = _of_one_label(given[a], given[b])
         i, j = np.concatenate([known_i, i[kept]]), np.concatenate([known_j, j[kept]])
-        found.append(Pair(a, b, i, j, np.concatenate([np.zeros(len(known_i)), unlike[kept]])))
+        found.append(
+            CandidatePairs(
+                a, b, i, j, np.concatenate([np.zeros(len(known_i)), dissimilarity[kept]])
+            )
+        )
     return found
 
 
-def _named(inliers: Sequence[Pair], a: int, b: int) -> tuple[np.ndarray, np.ndarray, Float]:
+def _named(
+    inliers: Sequence[CandidatePairs], a: int, b: int
+) -> tuple[np.ndarray, np.ndarray, Float]:
     named = [pair for pair in inliers if (pair.a, pair.b) == (a, b)]
     rows = [(pair.row_a, pair.row_b) for pair in named]
     i, j = np.concatenate([np.empty((2, 0), np.int64), *map(np.stack, rows)], axis=1)
-    return i, j, np.concatenate([np.empty(0), *(pair.unlike for pair in named)])
+    return i, j, np.concatenate([np.empty(0), *(pair.dissimilarity for pair in named)])
 
 
 def _inside(a: _Placed, b: _Placed, i: np.ndarray, j: np.ndarray, bound: float) -> np.ndarray:

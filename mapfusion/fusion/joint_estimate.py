@@ -28,7 +28,7 @@ from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float, inverses
 from mapfusion.geometry.se2 import inverse, rotation_about_z, transform_points, wrap
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.smoother.robust_loss import MOST_DOF, fitted_dof, information_share, student_weights
+from mapfusion.smoother.robust_loss import MOST_DOF, fit_dof, information_share, student_weights
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class JointMap:
         return cls(landmarks.position_m[:, :n_dimensions], joint, landmarks.calibration)
 
 
-class Said(NamedTuple):
+class TransformedLandmarks(NamedTuple):
     """What a map says of some landmarks, at a guess of the unknowns.
 
     Attributes:
@@ -87,7 +87,7 @@ class Said(NamedTuple):
     by_unknown: Float
 
 
-class MapRows(NamedTuple):
+class LandmarkRows(NamedTuple):
     """Some of a map's landmarks as they enter each step.
 
     Attributes:
@@ -105,7 +105,7 @@ class MapRows(NamedTuple):
     calibration: CalibrationError
 
     @classmethod
-    def of(cls, own_map: JointMap, rows: np.ndarray) -> "MapRows":
+    def of(cls, own_map: JointMap, rows: np.ndarray) -> "LandmarkRows":
         """The landmarks `rows` (n,) of a map."""
         position = own_map.position_m[rows]
         d, joint = position.shape[1], own_map.joint
@@ -114,7 +114,9 @@ class MapRows(NamedTuple):
         return cls(position, own, inverses(own), np.ascontiguousarray(moved), own_map.calibration)
 
 
-def said_of(own: MapRows, T: Float, shared: Float, arm_m: Float) -> Said:
+def transform_landmarks(
+    own: LandmarkRows, T: Float, shared: Float, arm_m: Float
+) -> TransformedLandmarks:
     """What a map says of its rows under its motion and shared variables.
 
     The camera's errors move points at `arm_m` (n, D).
@@ -129,12 +131,12 @@ def said_of(own: MapRows, T: Float, shared: Float, arm_m: Float) -> Said:
     by[:, :2, :3], by[:, 2:, :3] = motion_jacobian(T, point), 0.0
     np.matmul(R, moved, out=by[:, :, 3:])
     turned = R @ own.own_m2 @ R.T, R @ own.information @ R.T
-    return Said(transform_points(T, point), *turned, by)
+    return TransformedLandmarks(transform_points(T, point), *turned, by)
 
 
-def weighted_information(said: Said, weight: Float) -> Float:
+def weighted_information(transformed: TransformedLandmarks, weight: Float) -> Float:
     """W (n, D, D)."""
-    return weight[:, None, None] * said.information
+    return weight[:, None, None] * transformed.information
 
 
 # The next step would move what is sought, as a whole and in squared sigmas, by no more than this.
@@ -169,27 +171,33 @@ class JointEstimate:
             found[k] = self.covariance[own, own]
         return found
 
-    def said(self, maps: Sequence[JointMap], k: int, rows: np.ndarray) -> Said:
+    def transformed(
+        self, maps: Sequence[JointMap], k: int, rows: np.ndarray
+    ) -> TransformedLandmarks:
         """What map k says of its landmarks `rows` (n,), by its own unknowns: see `unknowns`."""
-        own = MapRows.of(maps[k], rows)
-        return said_of(own, self.T_first_map[k], self.shared[k], own.position_m)
+        own = LandmarkRows.of(maps[k], rows)
+        return transform_landmarks(own, self.T_first_map[k], self.shared[k], own.position_m)
 
     def unknowns(self, maps: Sequence[JointMap], k: int) -> np.ndarray:
         """(U_k,) where those that map k depends on stand among all, ABSENT for none."""
         return _columns(maps)[k]
 
-    def moved_m(self, maps: Sequence[JointMap], k: int, said: Said, factor: Float) -> Float:
+    def moved_m(
+        self, maps: Sequence[JointMap], k: int, transformed: TransformedLandmarks, factor: Float
+    ) -> Float:
         """(n, D, U) how far a sigma of each independent variable moves what map k says.
 
         These are the columns of a lower triangular `factor` (U, U) of the unknowns' covariance.
         """
         columns = self.unknowns(maps, k)
         known = columns != ABSENT
-        by = said.by_unknown[:, :, known].reshape(said.y_m.size, np.count_nonzero(known))
+        by = transformed.by_unknown[:, :, known].reshape(
+            transformed.y_m.size, np.count_nonzero(known)
+        )
         n = 1 + int(columns.max(initial=ABSENT))  # what comes after them in the factor is zero
-        moved = np.zeros((said.y_m.size, len(factor)))
+        moved = np.zeros((transformed.y_m.size, len(factor)))
         np.matmul(by, factor[columns[known], :n], out=moved[:, :n])
-        return moved.reshape(*said.y_m.shape, len(factor))
+        return moved.reshape(*transformed.y_m.shape, len(factor))
 
 
 def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
@@ -221,12 +229,12 @@ def estimate_jointly(
     T, shared = np.array(T_first_map), [np.zeros(each.n_shared) for each in maps]
     columns = _columns(maps)
     has = parents != ABSENT
-    rows = [MapRows.of(own, parents[has[:, k], k]) for k, own in enumerate(maps)]
+    rows = [LandmarkRows.of(own, parents[has[:, k], k]) for k, own in enumerate(maps)]
     weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
-    said = _all_said(rows, T, shared, has, weight)
+    transformed = _all_said(rows, T, shared, has, weight)
     while True:
-        points = _points(said, has, weight)
-        A, gradient = _equations(said, has, weight, points, columns, shared)
+        points = _points(transformed, has, weight)
+        A, gradient = _equations(transformed, has, weight, points, columns, shared)
         factor = scipy.linalg.cholesky(A, lower=True)
         step = -scipy.linalg.cho_solve((factor, True), gradient)
         moved = float(np.sum((factor.T @ step) ** 2))
@@ -243,27 +251,29 @@ def estimate_jointly(
             if k:
                 T[k] += step[own[:3]]
         T[:, 2] = wrap(T[:, 2])
-        said = _all_said(rows, T, shared, has, weight)
-        weight, dof = _reweighted(said, has, weight, dof)
+        transformed = _all_said(rows, T, shared, has, weight)
+        weight, dof = _reweighted(transformed, has, weight, dof)
         if not all(own.calibration.is_none for own in maps):
-            said = _all_said(rows, T, shared, has, weight)  # from where points are seen now
+            transformed = _all_said(rows, T, shared, has, weight)  # from where points are seen now
         n_steps += 1
 
 
 def _all_said(
-    rows: Sequence[MapRows], T: Float, shared: Sequence[Float], has: np.ndarray, weight: Float
-) -> list[Said]:
+    rows: Sequence[LandmarkRows], T: Float, shared: Sequence[Float], has: np.ndarray, weight: Float
+) -> list[TransformedLandmarks]:
     """What each map says of its `rows`.
 
     Errors of cameras move points from where all maps together see them. Moved from where the one
     map does, they would move its noise too, and all maps shrink, since that shrinks residuals.
     """
-    said = [said_of(*each, each[0].position_m) for each in zip(rows, T, shared, strict=True)]
+    transformed = [
+        transform_landmarks(*each, each[0].position_m) for each in zip(rows, T, shared, strict=True)
+    ]
     if all(own.calibration.is_none for own in rows):
-        return said
-    g = _points(said, has, weight).g_m
+        return transformed
+    g = _points(transformed, has, weight).g_m
     arms = [transform_points(inverse(T[k]), g[has[:, k]]) for k in range(len(rows))]
-    return list(map(said_of, rows, T, shared, arms))
+    return list(map(transform_landmarks, rows, T, shared, arms))
 
 
 class _Points(NamedTuple):
@@ -273,11 +283,11 @@ class _Points(NamedTuple):
     covariance_m2: Float
 
 
-def _points(said: Sequence[Said], has: np.ndarray, weight: Float) -> _Points:
-    n_dimensions = said[0].y_m.shape[1]
+def _points(transformed: Sequence[TransformedLandmarks], has: np.ndarray, weight: Float) -> _Points:
+    n_dimensions = transformed[0].y_m.shape[1]
     information = np.zeros((len(has), n_dimensions, n_dimensions))
     total = np.zeros((len(has), n_dimensions))
-    for k, own in enumerate(said):
+    for k, own in enumerate(transformed):
         W = weighted_information(own, weight[has[:, k], k])
         information[has[:, k]] += W
         total[has[:, k]] += np.einsum("nij,nj->ni", W, own.y_m)
@@ -286,7 +296,7 @@ def _points(said: Sequence[Said], has: np.ndarray, weight: Float) -> _Points:
 
 
 def _equations(
-    said: Sequence[Said],
+    transformed: Sequence[TransformedLandmarks],
     has: np.ndarray,
     weight: Float,
     points: _Points,
@@ -296,15 +306,15 @@ def _equations(
     """The normal equations of a step: matrix (U, U) and gradient (U,)."""
     n_unknowns = 1 + max(int(own.max(initial=ABSENT)) for own in columns)
     A, gradient = np.zeros((n_unknowns + 1,) * 2), np.zeros(n_unknowns + 1)  # the last: ABSENT
-    W = [weighted_information(own, weight[has[:, k], k]) for k, own in enumerate(said)]
-    for k, own in enumerate(said):
+    W = [weighted_information(own, weight[has[:, k], k]) for k, own in enumerate(transformed)]
+    for k, own in enumerate(transformed):
         off = own.y_m - points.g_m[has[:, k]]
         pulled = (W[k] @ off[:, :, None]).ravel()
         gradient[columns[k]] += own.by_unknown.reshape(-1, len(columns[k])).T @ pulled
         by, its = own.by_unknown, columns[k]
         between = W[k] - W[k] @ points.covariance_m2[has[:, k]] @ W[k]
         A[np.ix_(its, its)] += by.reshape(-1, len(its)).T @ (between @ by).reshape(-1, len(its))
-        for m, other in enumerate(said[:k]):
+        for m, other in enumerate(transformed[:k]):
             both = has[:, k] & has[:, m]
             here, there = both[has[:, k]], both[has[:, m]]
             between = -W[k][here] @ points.covariance_m2[both] @ W[m][there]
@@ -327,7 +337,7 @@ def _shared(columns: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _reweighted(
-    said: Sequence[Said], has: np.ndarray, weight: Float, dof: float
+    transformed: Sequence[TransformedLandmarks], has: np.ndarray, weight: Float, dof: float
 ) -> tuple[Float, float]:
     """Weights (C, K) of the Student-t, and its degrees of freedom, for what is off now.
 
@@ -335,12 +345,12 @@ def _reweighted(
 
     The squares are those expected about the true points (the E step of Lange et al., 1989).
     """
-    new, points = np.zeros_like(weight), _points(said, has, weight)
+    new, points = np.zeros_like(weight), _points(transformed, has, weight)
     n_dimensions = points.g_m.shape[1]
-    dof = fitted_dof(
-        _disagreement(said, has), n_dimensions * (np.count_nonzero(has, axis=1) - 1), dof
+    dof = fit_dof(
+        _disagreement(transformed, has), n_dimensions * (np.count_nonzero(has, axis=1) - 1), dof
     )
-    for k, own in enumerate(said):
+    for k, own in enumerate(transformed):
         off = own.y_m - points.g_m[has[:, k]]
         spread = off[:, :, None] * off[:, None, :] + points.covariance_m2[has[:, k]]
         squares = np.einsum("nij,nij->n", own.information, spread)
@@ -348,13 +358,13 @@ def _reweighted(
     return new, dof
 
 
-def _disagreement(said: Sequence[Said], has: np.ndarray) -> Float:
+def _disagreement(transformed: Sequence[TransformedLandmarks], has: np.ndarray) -> Float:
     """(C,) how far what maps say of a point lies from its mean, all with their whole weight.
 
     Of M maps in D dimensions a chi-square with D (M - 1) degrees of freedom, if Gaussian.
     """
-    points, total = _points(said, has, has.astype(np.float64)), np.zeros(len(has))
-    for k, own in enumerate(said):
+    points, total = _points(transformed, has, has.astype(np.float64)), np.zeros(len(has))
+    for k, own in enumerate(transformed):
         off = own.y_m - points.g_m[has[:, k]]
         total[has[:, k]] += np.einsum("ni,nij,nj->n", off, own.information, off)
     return total

@@ -11,15 +11,15 @@ import numpy as np
 from mapfusion.fusion.aligned_landmarks import (
     ABSENT,
     AlignedLandmarks,
+    AssociationTest,
     FusePairs,
-    SamePoint,
     one_to_one,
 )
 from mapfusion.fusion.fused_map import AlignedPair, Component, FusedMap, MergeParameters
 from mapfusion.geometry.numerics import Float
 
 
-def fused_in_turn(
+def fuse_sequentially(
     component: Component, parameters: MergeParameters, fuse_pairs: FusePairs, use_drift: bool
 ) -> FusedMap:
     """The members fused.
@@ -30,7 +30,7 @@ def fused_in_turn(
         fuse_pairs: what becomes of two landmarks.
         use_drift: weigh with, and report, S + s_drift^2 I instead of the paper's S.
     """
-    fused = landmarks_in_turn(component, parameters, fuse_pairs, use_drift)
+    fused = fuse_landmarks_sequentially(component, parameters, fuse_pairs, use_drift)
     planar, drift = component.planar, component.drift_sigma_m
     return FusedMap(
         fused.landmark_map(planar, component.maps[component.members[0]].name),
@@ -38,17 +38,17 @@ def fused_in_turn(
         component.T_first_map,
         component.motion_covariance,
         drift if use_drift else np.where(np.isnan(drift), np.nan, 0.0),
-        parameters.same_point(planar).duplicate_share(fused),
+        parameters.association_test(planar).duplicate_share(fused),
         component.left_out,
     )
 
 
-def landmarks_in_turn(
+def fuse_landmarks_sequentially(
     component: Component, parameters: MergeParameters, fuse_pairs: FusePairs, use_drift: bool
 ) -> AlignedLandmarks:
     """The landmarks alone, of the same."""
     members, planar = component.by_name, component.planar
-    test, drift = parameters.same_point(planar), component.drift_sigma_m
+    test, drift = parameters.association_test(planar), component.drift_sigma_m
 
     def moved(k: int) -> AlignedLandmarks:
         sigma_T = component.motion_covariance[k] if parameters.use_alignment_uncertainty else None
@@ -59,7 +59,7 @@ def landmarks_in_turn(
     for k in members[1:]:
         other = moved(k)
         rows, others = _paired(fused, other, *_inliers(fused, k, component.pairs), test)
-        fused = fused.joined(other, rows, others, 2 if planar else 3, fuse_pairs)
+        fused = fused.fuse_with(other, rows, others, 2 if planar else 3, fuse_pairs)
     return fused
 
 
@@ -70,7 +70,7 @@ def _inliers(
 
     Where two say different things, what is most alike counts.
     """
-    rows, others, unlike = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
+    rows, others, dissimilarity = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
     for pair in pairs:
         if k not in (pair.a, pair.b):
             continue
@@ -84,8 +84,8 @@ def _inliers(
         has = row_of[index] != ABSENT
         rows.append(row_of[index[has]])
         others.append(own[has])
-        unlike.append(pair.inliers.distance[has])
-    return one_to_one(np.concatenate(rows), np.concatenate(others), np.concatenate(unlike))
+        dissimilarity.append(pair.inliers.distance[has])
+    return one_to_one(np.concatenate(rows), np.concatenate(others), np.concatenate(dissimilarity))
 
 
 def _paired(
@@ -93,7 +93,7 @@ def _paired(
     other: AlignedLandmarks,
     rows: np.ndarray,
     others: np.ndarray,
-    test: SamePoint,
+    test: AssociationTest,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the fused and of the other map that are one: those given, then what they missed."""
     missed_rows = np.setdiff1d(np.arange(len(fused)), rows)
@@ -112,10 +112,10 @@ class Kalman:
 
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the component's members."""
-        return fused_in_turn(component, parameters, kalman_fused, use_drift=False)
+        return fuse_sequentially(component, parameters, kalman_update, use_drift=False)
 
 
-def kalman_fused(
+def kalman_update(
     position_i: Float, covariance_i: Float, position_j: Float, covariance_j: Float
 ) -> tuple[Float, Float]:
     """Stationary Kalman filter on pairs of landmarks in one frame (eq. 12 to 14).
@@ -138,4 +138,4 @@ class KalmanDrift:
 
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the component's members."""
-        return fused_in_turn(component, parameters, kalman_fused, use_drift=True)
+        return fuse_sequentially(component, parameters, kalman_update, use_drift=True)

@@ -9,12 +9,12 @@ from mapfusion.align.alignment import Status
 from mapfusion.align.drift import whole_map_covariance
 from mapfusion.fusion.fused_map import AlignedPair, Component, Fusion, MergeParameters, name_order
 from mapfusion.fusion.fusers import Fuser, make_fuser
-from mapfusion.fusion.pose_graph import Relations
-from mapfusion.fusion.team_graph import Place, TeamGraph, TeamParameters, team_graph
+from mapfusion.fusion.pose_graph import AlignmentEdges
+from mapfusion.fusion.team_graph import EdgeStatus, TeamGraph, TeamParameters, team_graph
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import require_shape
-from mapfusion.smoother.joint_smoothing import Recording
+from mapfusion.smoother.joint_smoothing import AssociatedLog
 
 DEFAULTS = MergeParameters()
 
@@ -30,14 +30,14 @@ class ConnectedMaps:
     """
 
     components: tuple[Component, ...]
-    place: tuple[Place, ...]
+    place: tuple[EdgeStatus, ...]
 
     def fused_by(
         self,
         fuser: Fuser,
         parameters: MergeParameters,
         smoothed: Sequence[LandmarkMap] | None = None,
-        recordings: Sequence[Recording | None] = (),
+        recordings: Sequence[AssociatedLog | None] = (),
     ) -> Fusion:
         """Each component made one map.
 
@@ -92,12 +92,12 @@ def connect(
     rank = _ranks(maps)
     order = sorted(range(len(pairs)), key=lambda e: sorted((rank[pairs[e].a], rank[pairs[e].b])))
     accepted = [e for e in order if pairs[e].alignment.ok]
-    open_ = [e for e in order if pairs[e].alignment.status is Status.AMBIGUOUS]
-    by_itself, left_open = ([pairs[e] for e in some] for some in (accepted, open_))
+    ambiguous_edges = [e for e in order if pairs[e].alignment.status is Status.AMBIGUOUS]
+    by_itself, left_open = ([pairs[e] for e in some] for some in (accepted, ambiguous_edges))
     graph = _graph(maps, by_itself, left_open, rank, parameters)
-    said = dict(zip([*accepted, *open_], graph.place, strict=True))
-    place = tuple(said.get(e, Place.REFUSED) for e in range(len(pairs)))
-    believed = [pairs[e] for e in order if place[e] in (Place.CONFIRMED, Place.BRIDGE)]
+    said = dict(zip([*accepted, *ambiguous_edges], graph.place, strict=True))
+    place = tuple(said.get(e, EdgeStatus.REFUSED) for e in range(len(pairs)))
+    believed = [pairs[e] for e in order if place[e] in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE)]
     several = np.flatnonzero(np.bincount(graph.component) > 1)
     components = []
     for name in several if len(several) else graph.component[:1]:
@@ -133,14 +133,14 @@ def _graph(
     """All alignments judged together, robots by their rank; each component's root is its first."""
     by_rank = np.argsort(rank)
     both = (_relations(maps, some) for some in (accepted, alternatives))
-    ranked, open_ = (replace(each, robots=rank[each.robots]) for each in both)
-    graph = team_graph(ranked, parameters, by_rank, open_)
+    ranked, ambiguous_edges = (replace(each, robots=rank[each.robots]) for each in both)
+    graph = team_graph(ranked, parameters, by_rank, ambiguous_edges)
     return TeamGraph(
         graph.component[rank], graph.T_root_robot[rank], graph.covariance[rank], graph.place
     )
 
 
-def _relations(maps: Sequence[LandmarkMap], accepted: Sequence[AlignedPair]) -> Relations:
+def _relations(maps: Sequence[LandmarkMap], accepted: Sequence[AlignedPair]) -> AlignmentEdges:
     covariance = [
         whole_map_covariance(
             pair.alignment.T_a_b,
@@ -150,7 +150,7 @@ def _relations(maps: Sequence[LandmarkMap], accepted: Sequence[AlignedPair]) -> 
         )
         for pair in accepted
     ]
-    return Relations(
+    return AlignmentEdges(
         len(maps),
         np.array([(pair.a, pair.b) for pair in accepted], dtype=np.int64).reshape(-1, 2),
         np.array([pair.alignment.T_a_b for pair in accepted]).reshape(-1, 3),
@@ -163,7 +163,7 @@ def _left_out(
     maps: Sequence[LandmarkMap],
     members: np.ndarray,
     pairs: Sequence[AlignedPair],
-    place: Sequence[Place],
+    place: Sequence[EdgeStatus],
 ) -> tuple[tuple[str, str], ...]:
     """Name of each other map, in their order, with the reason."""
     inside, why = set(members.tolist()), []
@@ -173,12 +173,12 @@ def _left_out(
             for pair, said in zip(reversed(pairs), reversed(place), strict=True)
             if (pair.a == k and pair.b in inside) or (pair.b == k and pair.a in inside)
         }
-        if Place.AMBIGUOUS in told or Place.CONTRADICTED in told:
+        if EdgeStatus.AMBIGUOUS in told or EdgeStatus.CONTRADICTED in told:
             reason = "the team's alignments contradict each other about it"
-        elif Place.UNCONFIRMED in told:
+        elif EdgeStatus.UNCONFIRMED in told:
             reason = "no other alignment confirms its own"
         elif told:
-            reason = told[Place.REFUSED].alignment.reason
+            reason = told[EdgeStatus.REFUSED].alignment.reason
         else:
             reason = "no alignment connects it"
         why.append((maps[k].name, reason))

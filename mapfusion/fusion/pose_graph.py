@@ -14,7 +14,7 @@ from mapfusion.parameters import require_finite, require_shape
 
 
 @dataclass(frozen=True)
-class Relations:
+class AlignmentEdges:
     """E alignments between N robots' maps.
 
     Attributes:
@@ -47,18 +47,18 @@ class Relations:
     def __len__(self) -> int:
         return len(self.robots)
 
-    def __getitem__(self, rows: np.ndarray) -> "Relations":
+    def __getitem__(self, rows: np.ndarray) -> "AlignmentEdges":
         """Some of them."""
         parts = (self.robots, self.T_a_b, self.covariance, self.log10_false_alarms)
-        return Relations(self.n_robots, *(part[rows] for part in parts))
+        return AlignmentEdges(self.n_robots, *(part[rows] for part in parts))
 
-    def joined(self, other: "Relations") -> "Relations":
+    def concatenated(self, other: "AlignmentEdges") -> "AlignmentEdges":
         """With others between the same robots behind them."""
         names = ("robots", "T_a_b", "covariance", "log10_false_alarms")
         both = (np.concatenate([getattr(self, n), getattr(other, n)]) for n in names)
-        return Relations(self.n_robots, *both)
+        return AlignmentEdges(self.n_robots, *both)
 
-    def reach_m(self) -> float:
+    def max_distance_m(self) -> float:
         """The farthest that any of them moves a map."""
         return float(np.linalg.norm(self.T_a_b[:, :2], axis=1).max(initial=0.0))
 
@@ -83,7 +83,7 @@ class Motions:
         J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = back[:, 1], -back[:, 0], -1.0
         return Motions(back, J @ self.covariance @ J.swapaxes(1, 2))
 
-    def then(self, other: "Motions") -> "Motions":
+    def compose_independent(self, other: "Motions") -> "Motions":
         """Chained with motions that are independent of these, to first order."""
         cos, sin = np.cos(self.T[:, 2]), np.sin(self.T[:, 2])
         x, y = other.T[:, 0], other.T[:, 1]
@@ -115,7 +115,7 @@ class Placement:
     T_root_robot: Float
     covariance: Float
 
-    def holds(self, robots: np.ndarray) -> np.ndarray:
+    def contains(self, robots: np.ndarray) -> np.ndarray:
         """Whether robots (...) are placed."""
         return self.row[robots] >= 0
 
@@ -141,21 +141,21 @@ class Placement:
         return Motions(T, S)
 
 
-def placed(relations: Relations, which: np.ndarray, root: int | None = None) -> Placement:
-    """Place the robots that alignments `which` (rows) connect, in the frame of one of them.
+def optimize_poses(edges: AlignmentEdges, rows: np.ndarray, root: int | None = None) -> Placement:
+    """Place the robots that alignments `rows` (rows) connect, in the frame of one of them.
 
     That is the first, unless a root is named.
 
     Raises:
         ValueError: they do not connect their robots.
     """
-    robots = np.unique(relations.robots[which])
+    robots = np.unique(edges.robots[rows])
     if root is not None:
         robots = np.concatenate([[root], robots[robots != root]])
-    row = np.full(relations.n_robots, -1)
+    row = np.full(edges.n_robots, -1)
     row[robots] = np.arange(len(robots))
-    a, b = row[relations.robots[which]].T
-    T, covariance = relations.T_a_b[which], relations.covariance[which]
+    a, b = row[edges.robots[rows]].T
+    T, covariance = edges.T_a_b[rows], edges.covariance[rows]
     at = _chained(len(robots), a, b, T)
     information = np.asarray(np.linalg.inv(covariance), np.float64)
     for _ in range(_STEPS):

@@ -11,7 +11,7 @@ other: of the alternatives the one that closes this loop is right, if no other c
 chance would not. Loops of alternatives alone tell nothing: what made one of them fit, a room that
 is there twice, makes false ones agree.
 
-Alignments that confirm each other around loops make a reading (`readings.py`). Where two readings
+Alignments that confirm each other around loops make a reading (`consistent_sets.py`). Where two readings
 contradict each other, at most one is true. Kim, Mangelson et al. look for the largest set alone
 (PCM, 2018); whatever made one false alignment may have made others that agree with it, so here a
 smaller set counts as a warning, too.
@@ -24,7 +24,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.fusion.pose_graph import Motions, Placement, Relations, placed
+from mapfusion.fusion.pose_graph import AlignmentEdges, Motions, Placement, optimize_poses
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.parameters import Probability, Range, require_in_range
 
@@ -53,18 +53,18 @@ class LoopTest:
         """Largest squared Mahalanobis distance."""
         return chi_square_bound(self.gate_probability, 3)
 
-    def chance(self, S: Float, reach_m: float) -> Float:
+    def chance(self, S: Float, max_distance_m: float) -> Float:
         """(n,) that a motion drawn within reach, turned by anything, lies in gates S (n, 3, 3)."""
         inside = 4 / 3 * np.pi * self.gate**1.5 * np.sqrt(np.linalg.det(S))
-        anywhere = np.pi * reach_m**2 * 2 * np.pi
+        anywhere = np.pi * max_distance_m**2 * 2 * np.pi
         return np.minimum(inside / anywhere, 1.0)
 
 
 @dataclass(frozen=True)
-class Reading:
+class ConsistentSet:
     """Alignments that agree, and where they put their robots."""
 
-    which: np.ndarray  # (n,) rows of the relations, ascending
+    rows: np.ndarray  # (n,) rows of the relations, ascending
     placement: Placement
 
     @property
@@ -103,37 +103,37 @@ class _Loops:
         return self.steps[np.lexsort([self.distance, -confirmed])[0]]
 
 
-class Team:
+class LoopSearch:
     """The alignments of a team, in both directions."""
 
-    def __init__(self, relations: Relations, test: LoopTest) -> None:
-        self.relations, self.test = relations, test
-        self._reach_m = relations.reach_m()
-        there = Motions(relations.T_a_b, relations.covariance)
+    def __init__(self, edges: AlignmentEdges, test: LoopTest) -> None:
+        self.edges, self.test = edges, test
+        self._reach_m = edges.max_distance_m()
+        there = Motions(edges.T_a_b, edges.covariance)
         back = there.inverse()
-        self._from = np.concatenate([relations.robots[:, 0], relations.robots[:, 1]])
-        self._to = np.concatenate([relations.robots[:, 1], relations.robots[:, 0]])
+        self._from = np.concatenate([edges.robots[:, 0], edges.robots[:, 1]])
+        self._to = np.concatenate([edges.robots[:, 1], edges.robots[:, 0]])
         self._motions = Motions(
             np.concatenate([there.T, back.T]), np.concatenate([there.covariance, back.covariance])
         )
 
-    def readings(self, allowed: np.ndarray) -> list[Reading]:
+    def consistent_sets(self, allowed: np.ndarray) -> list[ConsistentSet]:
         """Readings of the `allowed` (E,) alignments, those of most alignments first.
 
         Each loop of them is in one reading at least.
         """
-        found: list[Reading] = []
+        found: list[ConsistentSet] = []
         for loop in self._all_loops(allowed):
-            if not any(np.isin(loop, reading.which).all() for reading in found):
+            if not any(np.isin(loop, edge_set.rows).all() for edge_set in found):
                 found.append(self._grown(loop, allowed))
-        return sorted(found, key=lambda reading: -len(reading.which))
+        return sorted(found, key=lambda edge_set: -len(edge_set.rows))
 
-    def agreeing(self, placement: Placement, among: np.ndarray) -> np.ndarray:
+    def consistent_rows(self, placement: Placement, among: np.ndarray) -> np.ndarray:
         """Rows of `among` (E,) between placed robots that agree with the placement."""
-        relations = self.relations
-        rows = np.flatnonzero(among & placement.holds(relations.robots).all(axis=1))
+        edges = self.edges
+        rows = np.flatnonzero(among & placement.contains(edges.robots).all(axis=1))
         distance, _ = placement.squared_distances(
-            relations.robots[rows], Motions(relations.T_a_b, relations.covariance)[rows]
+            edges.robots[rows], Motions(edges.T_a_b, edges.covariance)[rows]
         )
         return rows[distance <= self.test.gate]
 
@@ -143,32 +143,32 @@ class Team:
             return []
         found: dict[tuple[int, ...], float] = {}
         for seed in np.flatnonzero(allowed):
-            placement = placed(self.relations, np.array([seed]))
+            placement = optimize_poses(self.edges, np.array([seed]))
             for loops in self._closed_loops(placement, allowed):
                 for loop, distance in zip(loops.steps, loops.distance, strict=True):
                     found.setdefault(tuple(np.union1d(seed, loop).tolist()), distance)
         ordered = sorted(found, key=lambda loop: (len(loop), found[loop]))
         return [np.array(loop) for loop in ordered]
 
-    def _grown(self, which: np.ndarray, allowed: np.ndarray) -> Reading:
+    def _grown(self, rows: np.ndarray, allowed: np.ndarray) -> ConsistentSet:
         """All that loops can add to some alignments that agree."""
         while True:
-            placement = placed(self.relations, which)
+            placement = optimize_poses(self.edges, rows)
             loops = next(self._closed_loops(placement, allowed), None)
             if loops is None:
-                return Reading(which, placement)
-            which = np.union1d(which, loops.best())
-            inside = self.agreeing(placed(self.relations, which), allowed)
-            which = np.union1d(which, inside)
+                return ConsistentSet(rows, placement)
+            rows = np.union1d(rows, loops.best())
+            inside = self.consistent_rows(optimize_poses(self.edges, rows), allowed)
+            rows = np.union1d(rows, inside)
 
     def _closed_loops(self, placement: Placement, allowed: np.ndarray) -> Iterator[_Loops]:
         """Those that chance would not close, the shortest first, until there are too many."""
-        n = len(self.relations)
+        n = len(self.edges)
         usable = np.concatenate([allowed, allowed])
         paths = self._first_steps(placement, usable)
         while 0 < len(paths.last) <= _MOST_PATHS:
             paths = self._extended(paths, usable)
-            home = placement.holds(paths.last)
+            home = placement.contains(paths.last)
             closed, paths = _rows(paths, home), _rows(paths, ~home)
             first = closed.steps[:, 0]
             ends = np.stack([self._from[first], closed.last], axis=1)
@@ -181,8 +181,10 @@ class Team:
                 yield _Loops(closed.steps[true] % n, distance[true])
 
     def _first_steps(self, placement: Placement, usable: np.ndarray) -> _Paths:
-        steps = np.flatnonzero(usable & placement.holds(self._from) & ~placement.holds(self._to))
-        visited = np.zeros((len(steps), self.relations.n_robots), dtype=bool)
+        steps = np.flatnonzero(
+            usable & placement.contains(self._from) & ~placement.contains(self._to)
+        )
+        visited = np.zeros((len(steps), self.edges.n_robots), dtype=bool)
         visited[np.arange(len(steps)), self._from[steps]] = True
         visited[np.arange(len(steps)), self._to[steps]] = True
         return _Paths(steps[:, None], self._to[steps], visited, self._motions[steps])
@@ -194,36 +196,42 @@ class Team:
         visited = paths.visited[path]
         visited[np.arange(len(path)), self._to[step]] = True
         steps = np.column_stack([paths.steps[path], step])
-        motions = paths.motions[path].then(self._motions[step])
+        motions = paths.motions[path].compose_independent(self._motions[step])
         return _Paths(steps, self._to[step], visited, motions)
 
 
-def _rows(paths: _Paths, which: np.ndarray) -> _Paths:
-    return _Paths(paths.steps[which], paths.last[which], paths.visited[which], paths.motions[which])
+def _rows(paths: _Paths, rows: np.ndarray) -> _Paths:
+    return _Paths(paths.steps[rows], paths.last[rows], paths.visited[rows], paths.motions[rows])
 
 
-def told_apart(
-    relations: Relations, kept: np.ndarray, component: np.ndarray, open_: Relations, test: LoopTest
+def resolve_alternatives(
+    edges: AlignmentEdges,
+    kept: np.ndarray,
+    component: np.ndarray,
+    ambiguous_edges: AlignmentEdges,
+    test: LoopTest,
 ) -> np.ndarray:
     """Rows (n,) of the alternatives that accepted alignments tell from their rivals.
 
     Args:
-        relations: that were accepted.
+        edges: that were accepted.
         kept: (E,) bool, those that are believed.
         component: (N,) of the robots, as they connect them.
-        open_: the alternatives; those of the same two robots are each other's rivals.
+        ambiguous_edges: the alternatives; those of the same two robots are each other's rivals.
         test: when a loop counts as closed.
     """
-    low, high = np.sort(open_.robots, axis=1).T
+    low, high = np.sort(ambiguous_edges.robots, axis=1).T
     together = np.flatnonzero(component[low] == component[high])
-    distance, by_chance = np.full(len(open_), np.inf), np.ones(len(open_))
+    distance, by_chance = np.full(len(ambiguous_edges), np.inf), np.ones(len(ambiguous_edges))
     for name in np.unique(component[low[together]]):
-        inside = kept & (component[relations.robots] == name).all(axis=1)
-        placement = placed(relations, np.flatnonzero(inside))
+        inside = kept & (component[edges.robots] == name).all(axis=1)
+        placement = optimize_poses(edges, np.flatnonzero(inside))
         rows = together[component[low[together]] == name]
-        motions = Motions(open_.T_a_b, open_.covariance)[rows]
-        distance[rows], S = placement.squared_distances(open_.robots[rows], motions)
-        by_chance[rows] = test.chance(S, max(relations.reach_m(), open_.reach_m()))
+        motions = Motions(ambiguous_edges.T_a_b, ambiguous_edges.covariance)[rows]
+        distance[rows], S = placement.squared_distances(ambiguous_edges.robots[rows], motions)
+        by_chance[rows] = test.chance(
+            S, max(edges.max_distance_m(), ambiguous_edges.max_distance_m())
+        )
     closes = distance <= test.gate
     told = []
     for pair in np.unique(np.stack([low, high], axis=1)[together], axis=0):
@@ -242,7 +250,7 @@ class Unconfirmed(StrEnum):
     DROP = "drop"  # nothing counts that no loop confirms, or that another loop speaks against
 
 
-class Place(StrEnum):
+class EdgeStatus(StrEnum):
     """What the others say of an alignment."""
 
     CONFIRMED = "confirmed"  # a loop of others agrees
@@ -290,10 +298,10 @@ class TeamGraph:
 
 
 def team_graph(
-    relations: Relations,
+    edges: AlignmentEdges,
     parameters: TeamParameters = TeamParameters(),
     rank: np.ndarray | None = None,
-    alternatives: Relations | None = None,
+    alternatives: AlignmentEdges | None = None,
 ) -> TeamGraph:
     """Find the alignments that are true together, and place the robots by them.
 
@@ -301,74 +309,80 @@ def team_graph(
     answers are equally good.
 
     Args:
-        relations: between the robots' maps.
+        edges: between the robots' maps.
         parameters: which of them are believed.
         rank: (N,) of the robots; a component's root is the one of least rank, by default its first.
         alternatives: motions that robots' maps leave open, one or more for two robots. At most one
             of these is believed, and only where the alignments tell it (`alternatives.py`).
     """
     if alternatives is None or not len(alternatives):
-        return _judged(relations, parameters, rank)
-    connected = _judged(relations, replace(parameters, unconfirmed=Unconfirmed.KEEP), rank)
-    kept = np.isin(connected.place, [Place.CONFIRMED, Place.BRIDGE])
-    told = told_apart(relations, kept, connected.component, alternatives, parameters.loop)
-    graph = _judged(relations.joined(alternatives[told]), parameters, rank)
-    of_alternatives = np.full(len(alternatives), Place.REFUSED, dtype=object)
-    of_alternatives[told] = graph.place[len(relations) :]
-    place = np.concatenate([graph.place[: len(relations)], of_alternatives])
+        return _judged(edges, parameters, rank)
+    connected = _judged(edges, replace(parameters, unconfirmed=Unconfirmed.KEEP), rank)
+    kept = np.isin(connected.place, [EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE])
+    told = resolve_alternatives(edges, kept, connected.component, alternatives, parameters.loop)
+    graph = _judged(edges.concatenated(alternatives[told]), parameters, rank)
+    of_alternatives = np.full(len(alternatives), EdgeStatus.REFUSED, dtype=object)
+    of_alternatives[told] = graph.place[len(edges) :]
+    place = np.concatenate([graph.place[: len(edges)], of_alternatives])
     return replace(graph, place=place)
 
 
-def _judged(relations: Relations, parameters: TeamParameters, rank: np.ndarray | None) -> TeamGraph:
+def _judged(
+    edges: AlignmentEdges, parameters: TeamParameters, rank: np.ndarray | None
+) -> TeamGraph:
     """The graph of alignments that were accepted, or told apart."""
-    team = Team(relations, parameters.loop)
-    everything = np.ones(len(relations), dtype=bool)
-    confirmed, ambiguous = _without_rivals(team, team.readings(everything), parameters.unconfirmed)
+    team = LoopSearch(edges, parameters.loop)
+    everything = np.ones(len(edges), dtype=bool)
+    confirmed, ambiguous = _without_rivals(
+        team, team.consistent_sets(everything), parameters.unconfirmed
+    )
     kept, bridge = confirmed.copy(), np.zeros_like(confirmed)
     if parameters.unconfirmed is Unconfirmed.KEEP:
         bridge = _bridges(team, kept, ~confirmed & ~ambiguous)
         kept |= bridge
-    component = _components(relations, kept)
-    rank = np.arange(relations.n_robots) if rank is None else rank
+    component = _components(edges, kept)
+    rank = np.arange(edges.n_robots) if rank is None else rank
     T, covariance, agrees = _solved(team, component, kept, rank)
-    place = np.full(len(relations), Place.UNCONFIRMED, dtype=object)
-    together = component[relations.robots[:, 0]] == component[relations.robots[:, 1]]
-    place[ambiguous] = Place.AMBIGUOUS
-    place[together & ~agrees] = Place.CONTRADICTED
-    place[bridge] = Place.BRIDGE
-    place[confirmed] = Place.CONFIRMED
+    place = np.full(len(edges), EdgeStatus.UNCONFIRMED, dtype=object)
+    together = component[edges.robots[:, 0]] == component[edges.robots[:, 1]]
+    place[ambiguous] = EdgeStatus.AMBIGUOUS
+    place[together & ~agrees] = EdgeStatus.CONTRADICTED
+    place[bridge] = EdgeStatus.BRIDGE
+    place[confirmed] = EdgeStatus.CONFIRMED
     return TeamGraph(component, T, covariance, place)
 
 
 def _without_rivals(
-    team: Team, readings: list[Reading], unconfirmed: Unconfirmed
+    team: LoopSearch, consistent_sets: list[ConsistentSet], unconfirmed: Unconfirmed
 ) -> tuple[np.ndarray, np.ndarray]:
     """Masks (E,) of alignments in readings that stand, and of those that rivals leave open."""
-    E = len(team.relations)
+    E = len(team.edges)
     kept, ambiguous = np.zeros(E, dtype=bool), np.zeros(E, dtype=bool)
-    standing: list[Reading] = []
-    for reading in readings:  # the larger ones first
-        larger = (other for other in standing if len(other.which) > len(reading.which))
+    standing: list[ConsistentSet] = []
+    for edge_set in consistent_sets:  # the larger ones first
+        larger = (other for other in standing if len(other.rows) > len(edge_set.rows))
         if unconfirmed is Unconfirmed.DROP or not any(
-            _contradict(team, reading, other) for other in larger
+            _contradict(team, edge_set, other) for other in larger
         ):
-            standing.append(reading)
-    for reading in standing:
-        others = (other for other in standing if other is not reading)
-        rivals = [other for other in others if _contradict(team, reading, other)]
-        stands = _undisputed(team, reading, rivals)
+            standing.append(edge_set)
+    for edge_set in standing:
+        others = (other for other in standing if other is not edge_set)
+        rivals = [other for other in others if _contradict(team, edge_set, other)]
+        stands = _undisputed(team, edge_set, rivals)
         kept[stands] = True
-        ambiguous[np.setdiff1d(reading.which, stands)] = True
+        ambiguous[np.setdiff1d(edge_set.rows, stands)] = True
     return kept, ambiguous & ~kept
 
 
-def _contradict(team: Team, one: Reading, other: Reading) -> bool:
+def _contradict(team: LoopSearch, one: ConsistentSet, other: ConsistentSet) -> bool:
     """Whether two readings put two robots differently."""
     shared = np.intersect1d(one.robots, other.robots)
     return not _alike(team, one, other, shared).all()
 
 
-def _alike(team: Team, one: Reading, other: Reading, shared: np.ndarray) -> np.ndarray:
+def _alike(
+    team: LoopSearch, one: ConsistentSet, other: ConsistentSet, shared: np.ndarray
+) -> np.ndarray:
     """(n, n) bool, whether both put the shared robots (n,) alike, two by two."""
     i, j = np.triu_indices(len(shared), 1)
     pairs = np.stack([shared[i], shared[j]], axis=1)
@@ -379,44 +393,46 @@ def _alike(team: Team, one: Reading, other: Reading, shared: np.ndarray) -> np.n
     return alike
 
 
-def _undisputed(team: Team, reading: Reading, rivals: list[Reading]) -> np.ndarray:
+def _undisputed(
+    team: LoopSearch, edge_set: ConsistentSet, rivals: list[ConsistentSet]
+) -> np.ndarray:
     """Its alignments (rows) that no rival touches and that loops of such alone confirm.
 
     A rival splits a reading's robots into groups that both put alike, and the rest.
     """
-    robots, relations = reading.robots, team.relations
-    group = np.zeros((relations.n_robots, len(rivals)), dtype=np.int64)
+    robots, edges = edge_set.robots, team.edges
+    group = np.zeros((edges.n_robots, len(rivals)), dtype=np.int64)
     for k, rival in enumerate(rivals):
         shared = np.intersect1d(robots, rival.robots)
-        alike = _alike(team, reading, rival, shared)
+        alike = _alike(team, edge_set, rival, shared)
         group[shared, k] = 1 + np.argmax(alike, axis=1)
-    a, b = relations.robots.T
-    inside = np.zeros(len(relations), dtype=bool)
-    inside[reading.which] = True
+    a, b = edges.robots.T
+    inside = np.zeros(len(edges), dtype=bool)
+    inside[edge_set.rows] = True
     inside &= np.all(group[a] == group[b], axis=1)
     if not rivals:
-        return reading.which
-    left = [each.which for each in team.readings(inside)]
+        return edge_set.rows
+    left = [each.rows for each in team.consistent_sets(inside)]
     return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *left]))
 
 
-def _bridges(team: Team, kept: np.ndarray, free: np.ndarray) -> np.ndarray:
+def _bridges(team: LoopSearch, kept: np.ndarray, free: np.ndarray) -> np.ndarray:
     """(E,) those that connect what is not connected yet, the surest first."""
-    relations = team.relations
-    component = _components(relations, kept)
+    edges = team.edges
+    component = _components(edges, kept)
     bridge = np.zeros_like(kept)
-    for row in np.argsort(relations.log10_false_alarms, kind="stable"):
-        a, b = component[relations.robots[row]]
+    for row in np.argsort(edges.log10_false_alarms, kind="stable"):
+        a, b = component[edges.robots[row]]
         if free[row] and a != b:
             bridge[row] = True
             component[component == b] = a
     return bridge
 
 
-def _components(relations: Relations, kept: np.ndarray) -> np.ndarray:
+def _components(edges: AlignmentEdges, kept: np.ndarray) -> np.ndarray:
     """(N,) the component of each robot: those of most robots first, then by their first robot."""
-    label = np.arange(relations.n_robots)
-    for a, b in relations.robots[kept]:
+    label = np.arange(edges.n_robots)
+    for a, b in edges.robots[kept]:
         low, high = sorted((label[a], label[b]))
         label[label == high] = low
     first, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
@@ -426,21 +442,21 @@ def _components(relations: Relations, kept: np.ndarray) -> np.ndarray:
 
 
 def _solved(
-    team: Team, component: np.ndarray, kept: np.ndarray, rank: np.ndarray
+    team: LoopSearch, component: np.ndarray, kept: np.ndarray, rank: np.ndarray
 ) -> tuple[Float, Float, np.ndarray]:
     """Poses (N, 3) by the kept alignments, covariances (N, 3, 3), and which (E,) agree."""
-    relations = team.relations
+    edges = team.edges
     T, covariance = np.zeros((len(component), 3)), np.zeros((len(component), 3, 3))
     agrees = kept.copy()
     for name in np.unique(component):
-        inside = kept & (component[relations.robots] == name).all(axis=1)
+        inside = kept & (component[edges.robots] == name).all(axis=1)
         if not inside.any():
             continue
         robots = np.flatnonzero(component == name)
         root = int(robots[np.argmin(rank[robots])])
-        placement = placed(relations, np.flatnonzero(inside), root)
+        placement = optimize_poses(edges, np.flatnonzero(inside), root)
         row = placement.row[robots]
         T[robots] = placement.T_root_robot[row]
         covariance[robots] = placement.covariance[row, row]
-        agrees[team.agreeing(placement, np.ones_like(kept))] = True
+        agrees[team.consistent_rows(placement, np.ones_like(kept))] = True
     return T, covariance, agrees

@@ -21,17 +21,17 @@ from mapfusion.geometry.joint_covariance import RANK, KnownErrors, SharedErrors
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.smoother.cholesky import Envelope, Factor, factor_in_envelope
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
-from mapfusion.smoother.problem import Sightings
+from mapfusion.smoother.problem import OrderedObservations
 from mapfusion.smoother.schur_complement import (
-    Points,
-    Reduced,
-    along_points,
-    along_way,
-    known_points,
-    left_couplings,
-    moved_points,
-    subtract_points,
-    without_offsets,
+    PointCovariances,
+    ReducedEquations,
+    coupling_times_points,
+    coupling_times_poses,
+    eliminate_offsets,
+    point_covariances,
+    reduced_couplings,
+    substitute_points,
+    subtract_point_terms,
 )
 
 
@@ -40,21 +40,23 @@ class ReducedPoses:
     """Equations of T poses. The first pose is known, so its rows are zero.
 
     Attributes:
-        seen: the observations.
+        obs: the observations.
         equations: the equations of poses, landmarks and offsets.
-        left: the equations after the offsets are eliminated.
+        reduced: the equations after the offsets are eliminated.
     """
 
-    seen: Sightings
+    obs: OrderedObservations
     equations: NormalEquations
-    left: Reduced
+    reduced: ReducedEquations
 
     def gradient(self) -> Float:
         """Return the gradient, shape (T, 3)."""
         equations = self.equations
         still = np.zeros_like(equations.points.track_gradient)
-        moved = moved_points(self.seen, equations.points, self.left, still)
-        total = equations.pose_gradient + along_points(self.seen, equations.coupling, *moved)
+        moved = substitute_points(self.obs, equations.points, self.reduced, still)
+        total = equations.pose_gradient + coupling_times_points(
+            self.obs, equations.coupling, *moved
+        )
         total[0] = 0.0
         return total
 
@@ -66,16 +68,16 @@ class ReducedPoses:
         Raises:
             LinAlgError: the matrix is not positive definite.
         """
-        envelope = self.seen.order.envelope
+        envelope = self.obs.order.envelope
         S = envelope.zeros()
-        _put_poses(S, envelope, self.seen.pose_place[1:] - 1, self.equations)
-        subtract_points(self.seen, self.equations, self.left, S)
+        _put_poses(S, envelope, self.obs.pose_place[1:] - 1, self.equations)
+        subtract_point_terms(self.obs, self.equations, self.reduced, S)
         return factor_in_envelope(S, envelope)
 
     def solved(self, factor: Factor, right: Float) -> Float:
         """Solve for x (T, 3) with the matrix of this factor and the right side (T, 3)."""
         ordered = np.empty((len(right) - 1, 3))
-        ordered[self.seen.pose_place[1:] - 1] = right[1:]
+        ordered[self.obs.pose_place[1:] - 1] = right[1:]
         return self.by_frame(factor.solve_transposed(factor.solve(ordered.ravel())))
 
     def by_frame(self, ordered: Float) -> Float:
@@ -83,7 +85,7 @@ class ReducedPoses:
 
         The order is that of the rows of `factor`.
         """
-        place = self.seen.pose_place
+        place = self.obs.pose_place
         found = np.zeros((len(place), 3))
         found[1:] = ordered.reshape(-1, 3)[place[1:] - 1]
         return found
@@ -105,23 +107,23 @@ class PathErrors:
     """Y (R, 3L) for the R coordinates of the unknown poses in their order.
 
     Attributes:
-        seen: the observations.
+        obs: the observations.
         factor: L.
         moved: (N, 3, 3) entries of C A, by observation.
     """
 
-    seen: Sightings
+    obs: OrderedObservations
     factor: Factor
     moved: Float
 
     @classmethod
     def of(
-        cls, seen: Sightings, equations: NormalEquations, own_m2: Float, factor: Factor
+        cls, obs: OrderedObservations, equations: NormalEquations, own_m2: Float, factor: Factor
     ) -> "PathErrors":
         """Return Y for equations whose landmarks are eliminated, with `own_m2` and the factor."""
-        left = without_offsets(seen, equations.points)
-        coupling = left_couplings(seen, equations.coupling, left)
-        return cls(seen, factor, coupling @ own_m2[seen.landmark])
+        reduced = eliminate_offsets(obs, equations.points)
+        coupling = reduced_couplings(obs, equations.coupling, reduced)
+        return cls(obs, factor, coupling @ own_m2[obs.landmark])
 
     def __len__(self) -> int:
         return len(self.factor)
@@ -148,21 +150,21 @@ class PathErrors:
 
     def squares(self) -> Float:
         """Return the diagonal blocks of Y' Y, shape (L, 3, 3)."""
-        total = np.zeros((self.seen.n_landmarks, 3, 3))
+        total = np.zeros((self.obs.n_landmarks, 3, 3))
         covariance, offset = self.factor.inverse, self.factor.envelope.offset
-        place = self.seen.unknown_place
-        _add_squares(self.seen.starts, place, self.moved, offset, covariance, total)
+        place = self.obs.unknown_place
+        _add_squares(self.obs.starts, place, self.moved, offset, covariance, total)
         return total + np.swapaxes(total, 1, 2)
 
     @cached_property
     def _moving(self) -> csr_array:
         """A C' with one block for each observation, shape (3L, R)."""
-        place, each = self.seen.unknown_place, np.arange(3)
+        place, each = self.obs.unknown_place, np.arange(3)
         known = place >= 0
-        rows = 3 * self.seen.landmark[known, None] + each
+        rows = 3 * self.obs.landmark[known, None] + each
         columns = 3 * place[known, None] + each
         rows, columns = np.broadcast_arrays(rows[:, None, :], columns[:, :, None])
-        shape = 3 * self.seen.n_landmarks, len(self)
+        shape = 3 * self.obs.n_landmarks, len(self)
         return csr_array((self.moved[known].ravel(), (rows.ravel(), columns.ravel())), shape)
 
     @cached_property
@@ -261,77 +263,79 @@ class Solution(NamedTuple):
     landmarks_first: bool
 
 
-def solve(seen: Sightings, equations: NormalEquations) -> Solution:
+def solve(obs: OrderedObservations, equations: NormalEquations) -> Solution:
     """Solve the equations of these observations for the next step."""
-    if _is_landmarks_first(seen):
-        return _landmarks_first(seen, equations)
-    return _poses_first(seen, equations)
+    if _is_landmarks_first(obs):
+        return _landmarks_first(obs, equations)
+    return _poses_first(obs, equations)
 
 
 def solve_points(
-    seen: Sightings, at: Estimate, weights: Weights, stray_information: float
-) -> tuple[Estimate, Points]:
+    obs: OrderedObservations, at: Estimate, weights: Weights, offset_prior: float
+) -> tuple[Estimate, PointCovariances]:
     """Return the step of landmarks and offsets for a fixed path, and their covariances."""
-    equations = point_equations(seen, at, weights, stray_information)
-    left = without_offsets(seen, equations)
+    equations = point_equations(obs, at, weights, offset_prior)
+    reduced = eliminate_offsets(obs, equations)
     still = np.zeros_like(equations.track_gradient)
-    moved = moved_points(seen, equations, left, still)
-    return Estimate(np.zeros_like(at.path), *moved), known_points(seen, left)
+    moved = substitute_points(obs, equations, reduced, still)
+    return Estimate(np.zeros_like(at.path), *moved), point_covariances(obs, reduced)
 
 
-def memory_bytes(seen: Sightings) -> float:
+def memory_bytes(obs: OrderedObservations) -> float:
     """Return an upper bound of the memory that smoothing these observations takes, in bytes.
 
     It counts the matrices of `solve` and of the covariances, the blocks of observations and tracks,
     and the map's joint covariance.
     """
-    n_poses, n_landmarks = 3 * seen.order.n_poses, 3 * seen.n_landmarks
-    if _is_landmarks_first(seen):
-        entries, n_shared = _FACTORS * int(seen.order.envelope.offset[-1]), n_poses
+    n_poses, n_landmarks = 3 * obs.order.n_poses, 3 * obs.n_landmarks
+    if _is_landmarks_first(obs):
+        entries, n_shared = _FACTORS * int(obs.order.envelope.offset[-1]), n_poses
     else:
-        n = 3 * _n_points(seen)
+        n = 3 * _n_points(obs)
         entries, n_shared = n * (_WIDE * n_poses + _SQUARE * n), n_landmarks
-    blocks = len(seen) + len(seen.strays) + seen.order.n_poses
+    blocks = len(obs) + len(obs.has_offset) + obs.order.n_poses
     condensed = min(RANK, n_shared) * (n_shared + n_landmarks)
     return _ITEM * (entries + _BLOCK * _BLOCKS * blocks + _CONDENSED * condensed)
 
 
-def require_memory(seen: Sightings, max_memory_gb: float) -> None:
+def require_memory(obs: OrderedObservations, max_memory_gb: float) -> None:
     """Raise MemoryError if smoothing these observations may take more memory."""
-    needed_gb = memory_bytes(seen) / _GB
+    needed_gb = memory_bytes(obs) / _GB
     if needed_gb > max_memory_gb:
         raise MemoryError(f"may take {needed_gb:.2g} GB, more than it is given")
 
 
-def _is_landmarks_first(seen: Sightings) -> bool:
-    return seen.order.is_sparser_than(_n_points(seen))
+def _is_landmarks_first(obs: OrderedObservations) -> bool:
+    return obs.order.is_sparser_than(_n_points(obs))
 
 
-def _n_points(seen: Sightings) -> int:
-    return seen.n_landmarks + int(np.count_nonzero(seen.strays))
+def _n_points(obs: OrderedObservations) -> int:
+    return obs.n_landmarks + int(np.count_nonzero(obs.has_offset))
 
 
-def shared_errors(seen: Sightings, equations: NormalEquations, solution: Solution) -> SharedErrors:
+def shared_errors(
+    obs: OrderedObservations, equations: NormalEquations, solution: Solution
+) -> SharedErrors:
     """Return Y (R, 3L); the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
     if solution.landmarks_first:
-        return PathErrors.of(seen, equations, solution.own_m2, solution.factor)
+        return PathErrors.of(obs, equations, solution.own_m2, solution.factor)
     return KnownErrors(_beside_own(solution.own_m2, solution.factor.dense()))
 
 
 def pose_covariances(
-    seen: Sightings, equations: NormalEquations, solution: Solution, frames: np.ndarray
+    obs: OrderedObservations, equations: NormalEquations, solution: Solution, frames: np.ndarray
 ) -> Float:
     """Return the covariances (n, 3, 3) of the poses of some frames (n,) after the first."""
     n_unknown, n = len(equations.pose_block) - 1, len(frames)
     chosen = np.zeros((n_unknown, 3, n, 3))
-    row = seen.pose_place[frames] if solution.landmarks_first else frames
+    row = obs.pose_place[frames] if solution.landmarks_first else frames
     chosen[row - 1, :, np.arange(n)] = np.eye(3)
     right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
     if (
         not solution.landmarks_first
     ):  # errors of the path for known points, and errors from the points
         solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
-        right, alone = pose_point_blocks(seen, equations)[0].T @ solved, right.T @ solved
+        right, alone = pose_point_blocks(obs, equations)[0].T @ solved, right.T @ solved
     root = solution.factor.solve(right)
     return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
@@ -346,60 +350,62 @@ def _beside_own(own_m2: Float, lower: Float) -> Float:
     return (np.sqrt(np.maximum(variance, 0.0)) * direction).T[::-1]
 
 
-def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
-    left = without_offsets(seen, equations.points)
-    poses = ReducedPoses(seen, equations, left)
+def _landmarks_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
+    reduced = eliminate_offsets(obs, equations.points)
+    poses = ReducedPoses(obs, equations, reduced)
     gradient, factor = poses.gradient(), poses.factor()
-    way = poses.solved(factor, -gradient)
-    along = along_way(seen, equations.coupling, way)
-    step = Estimate(way, *moved_points(seen, equations.points, left, along))
-    moved, known = -float(np.vdot(gradient, way)), known_points(seen, left)
-    own = left.landmark_m2, known.offset_m2, known.track_m2
+    path_step = poses.solved(factor, -gradient)
+    path_term = coupling_times_poses(obs, equations.coupling, path_step)
+    step = Estimate(path_step, *substitute_points(obs, equations.points, reduced, path_term))
+    moved, known = -float(np.vdot(gradient, path_step)), point_covariances(obs, reduced)
+    own = reduced.landmark_m2, known.offset_m2, known.track_m2
     return Solution(step, moved, *own, factor, landmarks_first=True)
 
 
-def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
-    n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(seen.strays)
-    B, K, gradient = pose_point_blocks(seen, equations)
+def _poses_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
+    n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(obs.has_offset)
+    B, K, gradient = pose_point_blocks(obs, equations)
     chain = chain_factor(equations)
     right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
     solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
     whole = Envelope(np.zeros(len(K), dtype=np.int64))
     factor = factor_in_envelope(whole.of(K - B.T @ solved[:, :-1]), whole)
     points = -factor.solve_transposed(factor.solve(gradient - B.T @ solved[:, -1]))
-    way, offsets = np.zeros((n_poses, 3)), np.zeros((len(seen.strays), 3))
-    way[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
-    offsets[seen.strays] = points[:n_offsets].reshape(-1, 3)
-    step = Estimate(way, points[n_offsets:].reshape(-1, 3), offsets)
-    left = without_offsets(seen, equations.points)
-    known = known_points(seen, left)
-    own = left.landmark_m2, known.offset_m2, known.track_m2
+    path_step, offsets = np.zeros((n_poses, 3)), np.zeros((len(obs.has_offset), 3))
+    path_step[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
+    offsets[obs.has_offset] = points[:n_offsets].reshape(-1, 3)
+    step = Estimate(path_step, points[n_offsets:].reshape(-1, 3), offsets)
+    reduced = eliminate_offsets(obs, equations.points)
+    known = point_covariances(obs, reduced)
+    own = reduced.landmark_m2, known.offset_m2, known.track_m2
     last = step.point_m.ravel()
     moved = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
     return Solution(step, moved, *own, factor, landmarks_first=False)
 
 
-def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
+def pose_point_blocks(
+    obs: OrderedObservations, equations: NormalEquations
+) -> tuple[Float, Float, Float]:
     """Return the points' block with the poses, their own block and gradient; offsets come first."""
-    strays, n_poses = seen.strays, len(equations.pose_block)
-    row, stray = strays[seen.track], np.cumsum(strays) - 1
-    n, n_points = np.count_nonzero(strays), np.count_nonzero(strays) + seen.n_landmarks
+    has_offset, n_poses = obs.has_offset, len(equations.pose_block)
+    row, number = has_offset[obs.track], np.cumsum(has_offset) - 1
+    n, n_points = np.count_nonzero(has_offset), np.count_nonzero(has_offset) + obs.n_landmarks
     wide, K = np.zeros((n_poses, n_points, 3, 3)), np.zeros((n_points, n_points, 3, 3))
-    np.add.at(wide, (seen.frame[row], stray[seen.track[row]]), equations.coupling[row])
-    np.add.at(wide, (seen.frame, n + seen.landmark), equations.coupling)
+    np.add.at(wide, (obs.frame[row], number[obs.track[row]]), equations.coupling[row])
+    np.add.at(wide, (obs.frame, n + obs.landmark), equations.coupling)
     S, each, landmark = (
         equations.points.track_block,
         np.arange(n_points),
-        n + seen.landmark_of_track,
+        n + obs.landmark_of_track,
     )
-    own = np.concatenate([S[strays], _regular(seen, seen.sum_tracks(S))])
-    own[:n] += equations.points.offset_information[strays, None, None] * np.eye(3)
+    own = np.concatenate([S[has_offset], _regular(obs, obs.sum_tracks(S))])
+    own[:n] += equations.points.offset_information[has_offset, None, None] * np.eye(3)
     K[each, each] = own
-    K[landmark[strays], each[:n]] = S[strays]
-    K[each[:n], landmark[strays]] = S[strays]
+    K[landmark[has_offset], each[:n]] = S[has_offset]
+    K[each[:n], landmark[has_offset]] = S[has_offset]
     gradient = [
-        (equations.points.track_gradient + equations.points.offset_gradient)[strays],
-        seen.sum_tracks(equations.points.track_gradient),
+        (equations.points.track_gradient + equations.points.offset_gradient)[has_offset],
+        obs.sum_tracks(equations.points.track_gradient),
     ]
     as_matrix = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
     K = K.transpose(0, 2, 1, 3).reshape(3 * n_points, 3 * n_points)
@@ -421,9 +427,9 @@ def chain_factor(equations: NormalEquations) -> Float:
     return scipy.linalg.cholesky_banded(band[:, 3:], lower=True, check_finite=False)
 
 
-def _regular(seen: Sightings, point_block: Float) -> Float:
+def _regular(obs: OrderedObservations, point_block: Float) -> Float:
     """Return the landmarks' blocks; in planar data z, which is not observed, has information 1."""
-    if seen.n_dimensions == 3:
+    if obs.n_dimensions == 3:
         return point_block
     regular = point_block.copy()
     regular[:, 2, 2] = 1.0

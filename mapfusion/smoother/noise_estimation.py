@@ -56,22 +56,28 @@ from mapfusion.smoother.normal_equations import (
     Weights,
     disturbance_jacobians,
     disturbances,
-    information_under,
-    least_levels,
+    expected_point_squares,
+    scaled_information,
+    smallest_scales,
     squared_distances,
-    squares_of_points,
 )
 from mapfusion.smoother.optimizer import (
     CONVERGED,
+    OptimizerState,
     Problem,
-    Settled,
-    finished,
-    followed,
-    solved,
-    stepped,
+    linearize_and_solve,
+    take_final_step,
+    take_step,
+    update_points_and_weights,
 )
-from mapfusion.smoother.problem import Sightings
-from mapfusion.smoother.robust_loss import NO_TAILS, Tails, fitted_dof, student_weights, unweighted
+from mapfusion.smoother.problem import OrderedObservations
+from mapfusion.smoother.robust_loss import (
+    GAUSSIAN_TAILS,
+    Tails,
+    fit_dof,
+    student_weights,
+    unit_weights,
+)
 
 
 class MotionPosterior(NamedTuple):
@@ -92,18 +98,18 @@ class MotionPosterior(NamedTuple):
 
 
 def motion_posterior(
-    end: Settled, odometry: Float, information: Float, by_constants: Float
+    state: OptimizerState, odometry: Float, information: Float, by_constants: Float
 ) -> MotionPosterior:
     """Return the posterior of the disturbances and of constants.
 
     Args:
-        end: the smoothed state.
+        state: the smoothed state.
         odometry: increments that were smoothed, shape (T, 3).
         information: information of the increments after the first, shape (T - 1, 3).
         by_constants: derivatives of these increments by the constants, shape (T - 1, 3, C).
     """
-    path, n = end.estimate.path, len(odometry) - 1
-    factor, spread = _covariance_factors(end)
+    path, n = state.estimate.path, len(odometry) - 1
+    factor, spread = _covariance_factors(state)
     before, after = disturbance_jacobians(path)
     variance = _of_differences(before, after, *_chain_covariances(factor, n))
     variance += np.sum(_difference(before, after, spread) ** 2, axis=2)
@@ -118,30 +124,30 @@ def motion_posterior(
     return MotionPosterior(mean, variance, of_constants, np.einsum("kdc,kd->c", weighted, mean))
 
 
-def _covariance_factors(end: Settled) -> tuple[Float, Float]:
+def _covariance_factors(state: OptimizerState) -> tuple[Float, Float]:
     """Return the factor of C, and columns whose products are X K^-1 X'."""
-    factor = chain_factor(end.equations)
-    B, K, _ = pose_point_blocks(end.seen, end.equations)
+    factor = chain_factor(state.equations)
+    B, K, _ = pose_point_blocks(state.obs, state.equations)
     X = scipy.linalg.cho_solve_banded((factor, True), B, check_finite=False)
     root = scipy.linalg.cholesky(K - B.T @ X, lower=True, check_finite=False)
     return factor, scipy.linalg.solve_triangular(root, X.T, lower=True, check_finite=False).T
 
 
-def disturbance_variances(end: Settled) -> Float:
+def disturbance_variances(state: OptimizerState) -> Float:
     """Return the variances of the disturbances, shape (T - 1, 3)."""
-    before, after = disturbance_jacobians(end.estimate.path)
-    if end.solution.landmarks_first:
-        return _from_poses(end, before, after)
-    factor, spread = _covariance_factors(end)
+    before, after = disturbance_jacobians(state.estimate.path)
+    if state.solution.landmarks_first:
+        return _from_poses(state, before, after)
+    factor, spread = _covariance_factors(state)
     variance = _of_differences(before, after, *_chain_covariances(factor, len(after)))
     return variance + np.sum(_difference(before, after, spread) ** 2, axis=2)
 
 
-def _from_poses(end: Settled, before: Float, after: Float) -> Float:
+def _from_poses(state: OptimizerState, before: Float, after: Float) -> Float:
     """Return the variances from the inverse of the poses' information."""
-    factor = end.solution.factor
+    factor = state.solution.factor
     Z, between = factor.inverse, factor.envelope.between
-    place = end.seen.pose_place[1:] - 1
+    place = state.obs.pose_place[1:] - 1
     own, link = between(Z, place, place), between(Z, place[:-1], place[1:])
     return _of_differences(before, after, own, link)
 
@@ -194,7 +200,11 @@ def _selected_inverse(diagonal: Float, below: Float, own: Float, link: Float) ->
             own[k] += G.T @ own[k + 1] @ G
 
 
-LEVELS = ("translation_m_per_sqrt_m", "rotation_rad_per_sqrt_m", "rotation_rad_per_sqrt_rad")
+NOISE_PARAMETERS = (
+    "translation_m_per_sqrt_m",
+    "rotation_rad_per_sqrt_m",
+    "rotation_rad_per_sqrt_rad",
+)
 # Largest factor on a level's square in one round; the counts are inaccurate far from the solution.
 _MOST_CHANGE = 4.0
 # Smaller levels have no effect in the filter, and their shares cannot be estimated.
@@ -203,7 +213,7 @@ _LEAST_LEVEL = 1e-4
 LEAST_DISTURBANCES = 5.0
 
 
-class Told(NamedTuple):
+class NoiseStatistics(NamedTuple):
     """Statistics of a smoothed log for the levels, in the order of `LEVELS`.
 
     Attributes:
@@ -218,12 +228,14 @@ class Told(NamedTuple):
     information: Float
 
 
-def pooled(of_each: Sequence[Told]) -> Told:
+def sum_statistics(of_each: Sequence[NoiseStatistics]) -> NoiseStatistics:
     """Add the statistics of several logs."""
-    return Told(*(np.sum(np.stack(values), axis=0) for values in zip(*of_each, strict=True)))
+    return NoiseStatistics(
+        *(np.sum(np.stack(values), axis=0) for values in zip(*of_each, strict=True))
+    )
 
 
-def plain(motion: MotionNoise) -> MotionNoise:
+def without_systematic_errors(motion: MotionNoise) -> MotionNoise:
     """Return the noise without systematic errors, with equal levels along and across."""
     across = motion.translation_m_per_sqrt_m
     return replace(
@@ -235,9 +247,9 @@ def plain(motion: MotionNoise) -> MotionNoise:
     )
 
 
-def told(
+def noise_statistics(
     posterior: MotionPosterior, odometry: Float, information: Float, motion: MotionNoise
-) -> Told:
+) -> NoiseStatistics:
     """Return the statistics of a log's disturbances.
 
     Args:
@@ -248,36 +260,38 @@ def told(
     """
     distance, angle = np.hypot(odometry[1:, 0], odometry[1:, 1]), np.abs(odometry[1:, 2])
     amounts = np.stack([distance, distance, angle], axis=1)
-    parts = amounts * np.array([getattr(motion, name) for name in LEVELS]) ** 2
-    squares, tells, information_of = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    parts = amounts * np.array([getattr(motion, name) for name in NOISE_PARAMETERS]) ** 2
+    squares, determined, information_of = np.zeros(3), np.zeros(3), np.zeros((3, 3))
     found = posterior.mean**2 * information
     known = np.clip(1 - posterior.variance * information, 0, 1)
-    for levels, axes in ((slice(0, 1), (0, 1)), (slice(1, 3), (2,))):
+    for scales, axes in ((slice(0, 1), (0, 1)), (slice(1, 3), (2,))):
         for axis in axes:
-            share = parts[:, levels] * information[:, axis, None]
-            squares[levels] += share.T @ found[:, axis]
-            tells[levels] += share.T @ known[:, axis]
+            share = parts[:, scales] * information[:, axis, None]
+            squares[scales] += share.T @ found[:, axis]
+            determined[scales] += share.T @ known[:, axis]
             weighted = known[:, axis, None] * share
-            information_of[levels, levels] += 2 * weighted.T @ weighted
-    return Told(squares, tells, information_of)
+            information_of[scales, scales] += 2 * weighted.T @ weighted
+    return NoiseStatistics(squares, determined, information_of)
 
 
-def updated(motion: MotionNoise, of_all: Told) -> MotionNoise:
+def update_noise(motion: MotionNoise, statistics: NoiseStatistics) -> MotionNoise:
     """Return the levels after a round; levels without information do not change."""
-    levels = {}
-    for name, found, known in zip(LEVELS, of_all.found, of_all.known, strict=True):
+    scales = {}
+    for name, found, known in zip(
+        NOISE_PARAMETERS, statistics.found, statistics.known, strict=True
+    ):
         before, ratio = getattr(motion, name), found / max(known, LEAST_DISTURBANCES)
         factor = np.sqrt(np.clip(ratio, 1 / _MOST_CHANGE, _MOST_CHANGE))
-        levels[name] = (
+        scales[name] = (
             max(float(before * factor), _LEAST_LEVEL) if known >= LEAST_DISTURBANCES else before
         )
-    across = levels["translation_m_per_sqrt_m"]
-    return replace(motion, **levels, lateral_m_per_sqrt_m=across)
+    across = scales["translation_m_per_sqrt_m"]
+    return replace(motion, **scales, lateral_m_per_sqrt_m=across)
 
 
-def relative_errors(of_all: Told) -> Float:
+def relative_errors(statistics: NoiseStatistics) -> Float:
     """Return the relative standard errors of the levels, shape (3,); 1 without information."""
-    return np.sqrt(np.diag(np.linalg.inv(of_all.information + np.eye(3))))
+    return np.sqrt(np.diag(np.linalg.inv(statistics.information + np.eye(3))))
 
 
 # Number of coordinates that a level needs. The relative error of a standard deviation,
@@ -288,80 +302,87 @@ LEAST_COORDINATES = 50.0
 _LEAST_M = 1e-5
 
 
-def told_observation_level(end: Settled, level: float) -> float:
+def observation_scale(state: OptimizerState, scale: float) -> float:
     """Return the level q of observations on tracks with offsets.
 
     Residuals are gross relative to the stated errors, or to the estimated ones if these are larger.
     Tails that are fitted at ever smaller levels would become heavier each time.
 
     Args:
-        end: the current state.
-        level: the current factor on the stated covariances.
+        state: the current state.
+        scale: the current factor on the stated covariances.
 
     Returns:
         q; 1 if it depends on fewer than `LEAST_TOLD` coordinates.
     """
-    return _level(end.seen, end.estimate, end.weights, end.tails, end.solution.track_m2, level)
+    return _level(
+        state.obs, state.estimate, state.weights, state.tails, state.solution.track_m2, scale
+    )
 
 
-def first_observation_level(
+def initial_observation_scale(
     problem: Problem, at: Estimate, weights: Weights, tails: Tails
 ) -> float:
     """Return the level q before the first step from an estimate."""
-    _, known = solve_points(problem.seen, at, weights, problem.stray_information)
-    return _level(problem.seen, at, weights, tails, known.track_m2, 1.0)
+    _, known = solve_points(problem.obs, at, weights, problem.offset_prior)
+    return _level(problem.obs, at, weights, tails, known.track_m2, 1.0)
 
 
 def _level(
-    seen: Sightings, at: Estimate, weights: Weights, tails: Tails, track_m2: Float, level: float
+    obs: OrderedObservations,
+    at: Estimate,
+    weights: Weights,
+    tails: Tails,
+    track_m2: Float,
+    scale: float,
 ) -> float:
-    n, rows = seen.n_dimensions, seen.strays[seen.track]
+    n, rows = obs.n_dimensions, obs.has_offset[obs.track]
     if not rows.any():
         return 1.0
-    square = squared_distances(seen, at)[rows]
-    of_point = squares_of_points(seen, at.path, track_m2)[rows]
+    square = squared_distances(obs, at)[rows]
+    of_point = expected_point_squares(obs, at.path, track_m2)[rows]
     known = np.sum(n - np.minimum(weights.observation[rows] * of_point, n))
     if known < LEAST_COORDINATES:
         return 1.0
-    beside = min(level, 1.0) * (square + of_point)
-    found = student_weights(beside, fitted_dof(beside, n, tails.observation), n)
-    stated = np.median(np.trace(seen.information[rows], axis1=1, axis2=2)) * level / n
+    beside = min(scale, 1.0) * (square + of_point)
+    found = student_weights(beside, fit_dof(beside, n, tails.observation), n)
+    stated = np.median(np.trace(obs.information[rows], axis1=1, axis2=2)) * scale / n
     least = min(_LEAST_M**2 * stated, 1.0)
-    return max(float(level * np.sum(found * square) / known), least)
+    return max(float(scale * np.sum(found * square) / known), least)
 
 
 _NONE_TOLD = 1e-9  # disturbances; fewer are rounding errors
 _LEVEL_TO = 1e-6  # relative tolerance of a level, far below its statistical error
 
 
-class Untold(NamedTuple):
+class PosteriorShares(NamedTuple):
     """Posterior shares of the disturbances' variances.
 
     Attributes:
         share: posterior over prior variance, shape (T - 1, 3); 1 without any observation.
-        levels: levels of the prior variances, shape (3,).
+        scales: levels of the prior variances, shape (3,).
     """
 
     share: Float
-    levels: Float
+    scales: Float
 
     @classmethod
-    def of(cls, problem: Problem, end: Settled, levels: Float) -> "Untold":
+    def of(cls, problem: Problem, state: OptimizerState, scales: Float) -> "PosteriorShares":
         """Return the shares for a state with these levels; `problem` is as stated."""
-        information = information_under(problem.information, levels)
-        share = np.clip(disturbance_variances(end) * information, 0, 1)
+        information = scaled_information(problem.information, scales)
+        share = np.clip(disturbance_variances(state) * information, 0, 1)
         # the motion from one robot's log to the next is unknown
-        return cls(np.where(problem.information > 0, share, 1.0), levels)
+        return cls(np.where(problem.information > 0, share, 1.0), scales)
 
-    def known(self, levels: Float) -> Float:
+    def known(self, scales: Float) -> Float:
         """Return the number of disturbances that observations determine, by axis, shape (3,)."""
-        return np.array([self._known(axis, level) for axis, level in enumerate(levels)])
+        return np.array([self._known(axis, scale) for axis, scale in enumerate(scales)])
 
-    def _known(self, axis: int, level: float) -> float:
-        share, more = self.share[:, axis], level / self.levels[axis]
+    def _known(self, axis: int, scale: float) -> float:
+        share, more = self.share[:, axis], scale / self.scales[axis]
         return float(np.sum(1 - share / (share + (1 - share) * more)))
 
-    def told_levels(self, problem: Problem, path: Float, levels: Float) -> Float:
+    def estimate_scales(self, problem: Problem, path: Float, scales: Float) -> Float:
         """Return the levels (3,) of the variances along, across and in the heading.
 
         If fewer than `LEAST_TOLD` disturbances are determined, the missing ones count with the
@@ -371,12 +392,12 @@ class Untold(NamedTuple):
         Args:
             problem: problem with the stated information of the odometry.
             path: current path, shape (T, 3).
-            levels: current levels, shape (3,).
+            scales: current levels, shape (3,).
         """
         found = np.sum(disturbances(path, problem.odometry) ** 2 * problem.information, axis=0)
-        told = found / np.maximum(self.known(levels), _NONE_TOLD)
-        told = np.maximum(told, least_levels(problem.information))
-        return np.array([self._with_missing(axis, level) for axis, level in enumerate(told)])
+        told = found / np.maximum(self.known(scales), _NONE_TOLD)
+        told = np.maximum(told, smallest_scales(problem.information))
+        return np.array([self._with_missing(axis, scale) for axis, scale in enumerate(told)])
 
     def _with_missing(self, axis: int, told: float) -> float:
         """Return the level q of an axis with the estimate `told` and the missing disturbances.
@@ -385,10 +406,10 @@ class Untold(NamedTuple):
         A root finder solves it, because the iteration q = f(q) may oscillate.
         """
 
-        def excess(level: float) -> float:
-            known = self._known(axis, level)
+        def excess(scale: float) -> float:
+            known = self._known(axis, scale)
             missing = max(LEAST_DISTURBANCES - known, 0.0)
-            return (told - level) * known + (1 - level) * missing
+            return (told - scale) * known + (1 - scale) * missing
 
         at_told = excess(told)
         if at_told == 0 or told == 1:
@@ -409,7 +430,7 @@ _FOLLOWED = 2e-3
 _MOST_STEPS = 100
 
 
-class Levels(NamedTuple):
+class NoiseScales(NamedTuple):
     """Factors on the stated variances; 1 if the log has too little information.
 
     Attributes:
@@ -421,16 +442,16 @@ class Levels(NamedTuple):
     observation: float
 
 
-AS_STATED = Levels(np.ones(3), 1.0)
+UNIT_SCALES = NoiseScales(np.ones(3), 1.0)
 
 
-def settled_with_levels(
+def optimize_with_noise(
     problem: Problem,
     at: Estimate,
     weights: Weights | None = None,
-    tails: Tails = NO_TAILS,
-    odometry: Float = AS_STATED.odometry,
-) -> tuple[Settled, Levels]:
+    tails: Tails = GAUSSIAN_TAILS,
+    odometry: Float = UNIT_SCALES.odometry,
+) -> tuple[OptimizerState, NoiseScales]:
     """Take steps until the estimate and the noise levels converge (see `settled`).
 
     The observations' level is cheap and is updated after each step, as the tails are. The
@@ -448,43 +469,43 @@ def settled_with_levels(
     Returns:
         the state after the last step, and the levels.
     """
-    weights = unweighted(problem.seen) if weights is None else weights
-    levels = Levels(odometry, first_observation_level(problem, at, weights, tails))
+    weights = unit_weights(problem.obs) if weights is None else weights
+    scales = NoiseScales(odometry, initial_observation_scale(problem, at, weights, tails))
     told, untold, known, n_steps = [odometry], None, False, 0
-    under = _under(problem, levels, problem.seen.on_level(levels.observation))
-    at, weights, tails = followed(under, at, weights, tails)
+    under = _under(problem, scales, problem.obs.with_covariance_scale(scales.observation))
+    at, weights, tails = update_points_and_weights(under, at, weights, tails)
     while True:
-        end = solved(under, at, weights, tails, n_steps)
-        observation, odometry = told_observation_level(end, levels.observation), levels.odometry
-        follows = _differ(observation, levels.observation) < _FOLLOWED
-        at_end = follows and end.is_within(CONVERGED)
+        state = linearize_and_solve(under, at, weights, tails, n_steps)
+        observation, odometry = observation_scale(state, scales.observation), scales.odometry
+        follows = _differ(observation, scales.observation) < _FOLLOWED
+        at_end = follows and state.is_converged(CONVERGED)
         if n_steps == _MOST_STEPS or (known and at_end):
-            return finished(under, end), levels
-        if at_end or (untold is None and end.is_within(_NEAR)):
-            untold = Untold.of(problem, end, odometry)
-            anew = untold.told_levels(problem, at.path, odometry)
+            return take_final_step(under, state), scales
+        if at_end or (untold is None and state.is_converged(_NEAR)):
+            untold = PosteriorShares.of(problem, state, odometry)
+            anew = untold.estimate_scales(problem, at.path, odometry)
             if at_end and _are_alike(anew, odometry):
-                return finished(under, end), levels
+                return take_final_step(under, state), scales
             known = at_end and any(_are_alike(anew, each) for each in told)
             told.append(anew)
-        seen = problem.seen.on_level(observation)
-        at, weights, tails = stepped(under, end, seen)
+        obs = problem.obs.with_covariance_scale(observation)
+        at, weights, tails = take_step(under, state, obs)
         if untold is not None:
-            odometry = untold.told_levels(problem, at.path, odometry)
-        levels = Levels(odometry, observation)
-        under, n_steps = _under(problem, levels, seen), n_steps + 1
+            odometry = untold.estimate_scales(problem, at.path, odometry)
+        scales = NoiseScales(odometry, observation)
+        under, n_steps = _under(problem, scales, obs), n_steps + 1
 
 
-def _are_alike(levels: Float, others: Float) -> bool:
-    return _differ(levels, others) < 2 * _SETTLED
+def _are_alike(scales: Float, others: Float) -> bool:
+    return _differ(scales, others) < 2 * _SETTLED
 
 
-def _differ(levels: Float | float, others: Float | float) -> float:
+def _differ(scales: Float | float, others: Float | float) -> float:
     """Return the largest absolute difference of the logarithms."""
-    return float(np.max(np.abs(np.log(levels / others))))
+    return float(np.max(np.abs(np.log(scales / others))))
 
 
-def _under(problem: Problem, levels: Levels, seen: Sightings) -> Problem:
-    """Return the problem with scaled odometry and the scaled observations `seen`."""
-    information = information_under(problem.information, levels.odometry)
-    return problem._replace(seen=seen, information=information)
+def _under(problem: Problem, scales: NoiseScales, obs: OrderedObservations) -> Problem:
+    """Return the problem with scaled odometry and the scaled observations `obs`."""
+    information = scaled_information(problem.information, scales.odometry)
+    return problem._replace(obs=obs, information=information)

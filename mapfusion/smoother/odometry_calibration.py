@@ -30,25 +30,25 @@ from mapfusion.geometry.se2 import IDENTITY, compose, wrap
 from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import RobotLog, first_frames
 from mapfusion.smoother.noise_estimation import (
-    LEVELS,
-    Told,
+    NOISE_PARAMETERS,
+    NoiseStatistics,
     motion_posterior,
-    plain,
-    pooled,
+    noise_statistics,
     relative_errors,
-    told,
-    updated,
+    sum_statistics,
+    update_noise,
+    without_systematic_errors,
 )
 from mapfusion.smoother.normal_equations import (
     Estimate,
     disturbances,
-    first_points,
+    initial_landmarks,
     odometry_information,
     squared_distances,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, settled
-from mapfusion.smoother.problem import Sightings, sightings_of
-from mapfusion.smoother.robust_loss import fitted_dof, student_deviance
+from mapfusion.smoother.optimizer import OptimizerState, Problem, optimize
+from mapfusion.smoother.problem import OrderedObservations, order_observations
+from mapfusion.smoother.robust_loss import fit_dof, student_deviance
 from mapfusion.smoother.smooth import SmootherParameters
 
 # r: half the track of a small robot (0.13 m of an iRobot Create, 0.2 m of a P3-AT).
@@ -87,7 +87,7 @@ class OdometryError:
 
     def corrected(self, odometry: Float) -> Float:
         """Return the increments (T, 3) without these errors."""
-        moved = odometry + np.einsum("kdc,c->kd", sensitivity(odometry), self.constants)
+        moved = odometry + np.einsum("kdc,c->kd", increment_jacobians(odometry), self.constants)
         moved[:, 2] = wrap(moved[:, 2])
         return moved
 
@@ -99,7 +99,7 @@ class OdometryError:
 N_CONSTANTS = len(fields(OdometryError))
 
 
-def sensitivity(odometry: Float) -> Float:
+def increment_jacobians(odometry: Float) -> Float:
     """Return the derivatives (T, 3, 5) of the increments (T, 3) by the constants."""
     by = np.zeros((len(odometry), 3, N_CONSTANTS))
     way, turn = np.hypot(odometry[:, 0], odometry[:, 1]), odometry[:, 2]
@@ -167,7 +167,7 @@ class Calibration:
     motion: MotionNoise
     relative_errors: Float
     n_rounds: int
-    settled: bool
+    optimize: bool
 
 
 @dataclass
@@ -175,8 +175,8 @@ class _Robot:
     """State of a log during the calibration."""
 
     log: RobotLog
-    seen: Sightings
-    stray_information: float
+    obs: OrderedObservations
+    offset_prior: float
     path: Float
     constants: Float
     covariance: Float
@@ -185,29 +185,33 @@ class _Robot:
     deviance: float = np.inf  # twice the negative log likelihood that the last round began with
 
     @classmethod
-    def of(cls, log: RobotLog, seen: Sightings, stray_information: float, path: Float) -> "_Robot":
+    def of(
+        cls, log: RobotLog, obs: OrderedObservations, offset_prior: float, path: Float
+    ) -> "_Robot":
         """Return the initial state with the prior of any odometry."""
         nothing = np.zeros(N_CONSTANTS)
         covariance = np.diag(_PRIOR**2)
-        return cls(log, seen, stray_information, path, nothing, covariance, nothing, _PRIOR)
+        return cls(log, obs, offset_prior, path, nothing, covariance, nothing, _PRIOR)
 
-    def round(self, motion: MotionNoise) -> tuple[Told, float]:
+    def round(self, motion: MotionNoise) -> tuple[NoiseStatistics, float]:
         """Smooth and step the constants; return noise statistics and the step in sigmas."""
         odometry = OdometryError.of(self.constants).corrected(self.log.odometry)
         information = odometry_information(odometry, motion)
-        problem = Problem(self.seen, odometry, information, self.stray_information)
-        points = first_points(self.seen, self.path)
-        start = Estimate(self.path, points, np.zeros((len(self.seen.strays), 3)))
-        end = settled(problem, start, _CLOSE)
-        self.path, self.deviance = end.estimate.path, _deviance(problem, end)
-        by_constants = sensitivity(self.log.odometry)[1:]
-        posterior = motion_posterior(end, odometry, information, by_constants)
+        problem = Problem(self.obs, odometry, information, self.offset_prior)
+        points = initial_landmarks(self.obs, self.path)
+        start = Estimate(self.path, points, np.zeros((len(self.obs.has_offset), 3)))
+        state = optimize(problem, start, _CLOSE)
+        self.path, self.deviance = state.estimate.path, _deviance(problem, state)
+        by_constants = increment_jacobians(self.log.odometry)[1:]
+        posterior = motion_posterior(state, odometry, information, by_constants)
         known = posterior.constants_information + np.diag(self.prior**-2)
         self.covariance = np.asarray(np.linalg.inv(known), np.float64)
         expected = (self.likeliest - self.constants) / self.prior**2
         step = self.covariance @ (posterior.constants_gradient + expected)
         self.constants = self.constants + step
-        return told(posterior, odometry, information, motion), float(np.sqrt(step @ known @ step))
+        return noise_statistics(posterior, odometry, information, motion), float(
+            np.sqrt(step @ known @ step)
+        )
 
 
 def calibrate(
@@ -231,7 +235,7 @@ def calibrate(
         InputError: a log has too little motion or too few observations.
         ValueError: an array has a wrong shape.
     """
-    motion = plain(_FIRST)
+    motion = without_systematic_errors(_FIRST)
     robots = [
         _begun(log, landmark, path, parameters, motion)
         for log, landmark, path in zip(logs, landmarks, paths, strict=True)
@@ -240,8 +244,8 @@ def calibrate(
     while True:
         n_rounds += 1
         rounds = [robot.round(motion) for robot in robots]
-        all_told = pooled([each for each, _ in rounds])
-        before, motion = motion, updated(motion, all_told)
+        all_told = sum_statistics([each for each, _ in rounds])
+        before, motion = motion, update_noise(motion, all_told)
         moved = max(0.0, *(step for _, step in rounds), _change(before, motion))
         on_round(n_rounds, _MOST_ROUNDS)
         if moved < _SETTLED or n_rounds == _MOST_ROUNDS:
@@ -260,15 +264,15 @@ def calibrate(
 
 def _change(before: MotionNoise, after: MotionNoise) -> float:
     """Return the largest relative change of a level."""
-    return max(abs(getattr(after, name) / getattr(before, name) - 1) for name in LEVELS)
+    return max(abs(getattr(after, name) / getattr(before, name) - 1) for name in NOISE_PARAMETERS)
 
 
-def _deviance(problem: Problem, end: Settled) -> float:
+def _deviance(problem: Problem, state: OptimizerState) -> float:
     """Return the deviance of odometry and observations with fitted tails."""
-    walked = disturbances(end.estimate.path, problem.odometry)
-    squares, n = squared_distances(problem.seen, end.estimate), problem.seen.n_dimensions
-    seen = student_deviance(squares, fitted_dof(squares, n), n)
-    return seen + float(np.sum(problem.information * walked**2))
+    walked = disturbances(state.estimate.path, problem.odometry)
+    squares, n = squared_distances(problem.obs, state.estimate), problem.obs.n_dimensions
+    obs = student_deviance(squares, fit_dof(squares, n), n)
+    return obs + float(np.sum(problem.information * walked**2))
 
 
 def _begun(
@@ -279,11 +283,11 @@ def _begun(
     motion: MotionNoise,
 ) -> _Robot:
     require_shape("landmark", landmark, (len(log.observations),))
-    stray = parameters.stray_information
+    with_offsets = parameters.offset_prior
     if path is not None:
         require_shape("path", path, (len(log), 3))
-        seen = sightings_of(log, landmark, parameters.min_count, stray=stray > 0)
-        return _checked(_Robot.of(log, seen, stray, path))
+        obs = order_observations(log, landmark, parameters.min_count, with_offsets=with_offsets > 0)
+        return _checked(_Robot.of(log, obs, with_offsets, path))
     found = [_grown(log, landmark, parameters, motion, in_place) for in_place in _IN_PLACE_STARTS]
     likeliest = min(found, key=lambda robot: robot.deviance)
     likeliest.likeliest, likeliest.prior = np.zeros(N_CONSTANTS), _PRIOR
@@ -298,8 +302,10 @@ def _grown(
     in_place: float,
 ) -> _Robot:
     """Return the state after smoothing increasing parts of the log."""
-    observed, stray = np.unique(log.iteration), parameters.stray_information
-    grown = _Robot.of(log, sightings_of(log, landmark, 1, stray=False), stray, IDENTITY[None])
+    observed, with_offsets = np.unique(log.iteration), parameters.offset_prior
+    grown = _Robot.of(
+        log, order_observations(log, landmark, 1, with_offsets=False), with_offsets, IDENTITY[None]
+    )
     grown.likeliest = OdometryError(in_place=in_place).constants
     grown.prior = OdometryError(*_PRIOR[:-1], in_place=_IN_PLACE_SIGMA).constants
     grown.constants = grown.likeliest
@@ -309,9 +315,11 @@ def _grown(
         n_frames = len(log) if whole else int(observed[n_seen]) + 1
         part = log if whole else first_frames(log, n_frames)
         least = parameters.min_count if whole else 1
-        grown.log, grown.seen = (
+        grown.log, grown.obs = (
             part,
-            sightings_of(part, landmark[: len(part.observations)], least, stray=stray > 0),
+            order_observations(
+                part, landmark[: len(part.observations)], least, with_offsets=with_offsets > 0
+            ),
         )
         odometry = OdometryError.of(grown.constants).corrected(part.odometry)
         grown.path = _extended(grown.path, odometry)
@@ -331,7 +339,7 @@ def _extended(path: Float, odometry: Float) -> Float:
 
 
 def _checked(robot: _Robot) -> _Robot:
-    if not len(robot.seen):
+    if not len(robot.obs):
         raise InputError(
             f"log {robot.log.robot}: no landmark was seen often enough to tell how the robot moved"
         )

@@ -21,15 +21,15 @@ from scipy.special import fdtri, gammaln, psi
 from mapfusion.geometry.numerics import Float
 from mapfusion.smoother.normal_equations import (
     Estimate,
-    Shares,
+    InformationShares,
     Weights,
-    known_dimensions,
+    determined_dimensions,
+    expected_point_squares,
     offset_squares,
     squared_distances,
-    squares_of_points,
 )
-from mapfusion.smoother.problem import Sightings
-from mapfusion.smoother.schur_complement import Points
+from mapfusion.smoother.problem import OrderedObservations
+from mapfusion.smoother.schur_complement import PointCovariances
 
 # Limits of the degrees of freedom. A Cauchy distribution has 1; no sensor has heavier tails than
 # the lower limit. Above the upper limit the distribution is Gaussian for all purposes.
@@ -99,7 +99,7 @@ def _sum_of_logs(values: Float) -> float:
     return float(np.sum(np.log(products)) + np.sum(np.log(values[n:])))
 
 
-def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
+def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
     """Return the maximum likelihood degrees of freedom of squared distances.
 
     Args:
@@ -156,26 +156,26 @@ class Tails(NamedTuple):
     offset: float
 
 
-NO_TAILS = Tails(MOST_DOF, MOST_DOF)
+GAUSSIAN_TAILS = Tails(MOST_DOF, MOST_DOF)
 
 
-def informative(tails: Tails, n_dimensions: int) -> Shares:
+def information_shares(tails: Tails, n_dimensions: int) -> InformationShares:
     """Return the shares of the weighted information that are expected (`information_share`)."""
-    return Shares(*(float(information_share(dof, n_dimensions)) for dof in tails))
+    return InformationShares(*(float(information_share(dof, n_dimensions)) for dof in tails))
 
 
-def unweighted(seen: Sightings) -> Weights:
+def unit_weights(obs: OrderedObservations) -> Weights:
     """Return weights of one; tracks without an offset have the offset weight zero."""
-    return Weights(np.ones(len(seen)), seen.strays.astype(np.float64))
+    return Weights(np.ones(len(obs)), obs.has_offset.astype(np.float64))
 
 
-def reweighted(
-    seen: Sightings,
+def update_weights(
+    obs: OrderedObservations,
     at: Estimate,
     weights: Weights,
     tails: Tails,
-    known: Points,
-    stray_information: float,
+    known: PointCovariances,
+    offset_prior: float,
 ) -> tuple[Weights, Tails]:
     """Compute new weights and tails from the current estimate.
 
@@ -185,22 +185,22 @@ def reweighted(
     tails of the other tracks.
 
     Args:
-        seen: the observations.
+        obs: the observations.
         at: the estimate.
         weights: the current weights.
         tails: the current tails.
         known: covariances of the points under the current weights.
-        stray_information: information of an offset along each axis, in 1/m^2.
+        offset_prior: information of an offset along each axis, in 1/m^2.
     """
-    n, new = seen.n_dimensions, unweighted(seen)
-    squares = squared_distances(seen, at)
-    squares += squares_of_points(seen, at.path, known.track_m2)
-    of_offset = offset_squares(seen, at, stray_information)
-    dimensions = known_dimensions(seen, known.offset_m2, weights.offset * stray_information)
+    n, new = obs.n_dimensions, unit_weights(obs)
+    squares = squared_distances(obs, at)
+    squares += expected_point_squares(obs, at.path, known.track_m2)
+    of_offset = offset_squares(obs, at, offset_prior)
+    dimensions = determined_dimensions(obs, known.offset_m2, weights.offset * offset_prior)
     tails = Tails(
-        fitted_dof(squares, n, tails.observation),
-        fitted_dof(of_offset, dimensions, tails.offset),
+        fit_dof(squares, n, tails.observation),
+        fit_dof(of_offset, dimensions, tails.offset),
     )
     new.observation[:] = student_weights(squares, tails.observation, n)
-    new.offset[seen.strays] = student_weights(of_offset, tails.offset, dimensions)
+    new.offset[obs.has_offset] = student_weights(of_offset, tails.offset, dimensions)
     return new, tails

@@ -30,9 +30,13 @@ from mapfusion.smoother.normal_equations import (
     disturbances,
     normal_equations,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, solved
-from mapfusion.smoother.robust_loss import informative
-from mapfusion.smoother.schur_complement import along_way, moved_points, without_offsets
+from mapfusion.smoother.optimizer import OptimizerState, Problem, linearize_and_solve
+from mapfusion.smoother.robust_loss import information_shares
+from mapfusion.smoother.schur_complement import (
+    coupling_times_poses,
+    eliminate_offsets,
+    substitute_points,
+)
 
 # Number of draws. The relative error of the mean square is a third in the worst case, the square of
 # one normal variable. Usually several directions contribute and it is smaller.
@@ -60,7 +64,7 @@ class SecondOrder(NamedTuple):
         return np.einsum("sni,snj->nij", chosen, chosen)
 
 
-def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
+def second_order_errors(problem: Problem, state: OptimizerState) -> SecondOrder | None:
     """Return the second-order errors of an estimate; None if they are negligible.
 
     If the poses are eliminated first (`elimination.py`), all poses see the same few landmarks,
@@ -68,28 +72,28 @@ def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
 
     Args:
         problem: the problem with the final noise levels.
-        end: the smoothed state.
+        state: the smoothed state.
     """
-    if not end.solution.landmarks_first or len(end.estimate.path) < 2:
+    if not state.solution.landmarks_first or len(state.estimate.path) < 2:
         return None
-    problem = problem._replace(seen=end.seen)
-    covariance = _pose_covariances(end)
-    if np.max(_bound(end.estimate.path, covariance)) < _NEGLIGIBLE:
+    problem = problem._replace(obs=state.obs)
+    covariance = _pose_covariances(state)
+    if np.max(_bound(state.estimate.path, covariance)) < _NEGLIGIBLE:
         return None
-    path, _ = _Drawing.of(problem, end).errors(np.random.default_rng(_SEED), _FIRST_DRAWS)
+    path, _ = _Drawing.of(problem, state).errors(np.random.default_rng(_SEED), _FIRST_DRAWS)
     if np.max(_squared_sigmas(path, covariance)) < _NEGLIGIBLE:
         return None
     # Equations of the step before differ little, but a little of what stiff directions hold moves
     # weak ones far: matrix and gradient are of the same estimate.
-    end = solved(problem, end.estimate, end.weights, end.tails)
-    path, point_m = _Drawing.of(problem, end).errors(np.random.default_rng(_SEED), _DRAWS)
+    state = linearize_and_solve(problem, state.estimate, state.weights, state.tails)
+    path, point_m = _Drawing.of(problem, state).errors(np.random.default_rng(_SEED), _DRAWS)
     share = 1 / np.sqrt(_DRAWS)
     return SecondOrder(share * path, share * point_m)
 
 
-def _pose_covariances(end: Settled) -> Float:
+def _pose_covariances(state: OptimizerState) -> Float:
     """Return the linearised covariances (T - 1, 3, 3) of the poses after the first."""
-    factor, place = end.solution.factor, end.seen.pose_place[1:] - 1
+    factor, place = state.solution.factor, state.obs.pose_place[1:] - 1
     return factor.envelope.between(factor.inverse, place, place)
 
 
@@ -118,7 +122,7 @@ class _Drawing(NamedTuple):
 
     Attributes:
         problem: what is explained.
-        end: where steps ended.
+        state: where steps ended.
         at: the estimate there.
         weights: that the matrix of the equations is of.
         poses: the equations of the poses.
@@ -127,7 +131,7 @@ class _Drawing(NamedTuple):
     """
 
     problem: Problem
-    end: Settled
+    state: OptimizerState
     at: Estimate
     weights: Weights
     poses: ReducedPoses
@@ -135,17 +139,17 @@ class _Drawing(NamedTuple):
     seen_m: Float
 
     @classmethod
-    def of(cls, problem: Problem, end: Settled) -> "_Drawing":
+    def of(cls, problem: Problem, state: OptimizerState) -> "_Drawing":
         """Return it for where steps ended."""
-        seen, at = end.seen, end.estimate
-        shares = informative(end.tails, seen.n_dimensions)
+        obs, at = state.obs, state.estimate
+        shares = information_shares(state.tails, obs.n_dimensions)
         weights = Weights(
-            shares.observation * end.weights.observation, shares.offset * end.weights.offset
+            shares.observation * state.weights.observation, shares.offset * state.weights.offset
         )
-        poses = ReducedPoses(seen, end.equations, without_offsets(seen, end.equations.points))
-        to_robot = np.swapaxes(rotation(at.path[seen.frame, 2]), 1, 2)
-        seen_m = _from_poses(end, at)
-        return cls(problem, end, at, weights, poses, to_robot, seen_m)
+        poses = ReducedPoses(obs, state.equations, eliminate_offsets(obs, state.equations.points))
+        to_robot = np.swapaxes(rotation(at.path[obs.frame, 2]), 1, 2)
+        seen_m = _from_poses(state, at)
+        return cls(problem, state, at, weights, poses, to_robot, seen_m)
 
     def errors(self, rng: np.random.Generator, n: int) -> tuple[Float, Float]:
         """Return the further errors q (n, T, 3) of the path and (n, L, 3) of the landmarks."""
@@ -160,61 +164,62 @@ class _Drawing(NamedTuple):
 
         The points' own errors if the path were known turn no lever and are left out.
         """
-        factor, left = self.end.solution.factor, self.poses.left
+        factor, reduced = self.state.solution.factor, self.poses.reduced
         normal = rng.standard_normal(len(factor))
-        way = self.poses.by_frame(factor.solve_transposed(normal))
-        still = left._replace(
-            pull=np.zeros_like(left.pull), point_gradient=np.zeros_like(left.point_gradient)
+        path_step = self.poses.by_frame(factor.solve_transposed(normal))
+        still = reduced._replace(
+            offset_gradient=np.zeros_like(reduced.offset_gradient),
+            point_gradient=np.zeros_like(reduced.point_gradient),
         )
-        equations = self.end.equations
-        along = along_way(self.end.seen, equations.coupling, way)
-        return Estimate(way, *moved_points(self.end.seen, equations.points, still, along))
+        equations = self.state.equations
+        path_term = coupling_times_poses(self.state.obs, equations.coupling, path_step)
+        return Estimate(
+            path_step, *substitute_points(self.state.obs, equations.points, still, path_term)
+        )
 
     def _further(self, error: Estimate) -> tuple[Float, Float]:
         """Return q of path and landmarks for an error d."""
-        equations, seen, factor = self._equations(error), self.end.seen, self.end.solution.factor
-        left = without_offsets(seen, equations.points)
-        gradient = ReducedPoses(seen, equations, left).gradient()
-        way = self.poses.solved(factor, -gradient)
-        along = along_way(seen, equations.coupling, way)
-        return way, moved_points(seen, equations.points, left, along)[0]
+        equations, obs, factor = self._equations(error), self.state.obs, self.state.solution.factor
+        reduced = eliminate_offsets(obs, equations.points)
+        gradient = ReducedPoses(obs, equations, reduced).gradient()
+        path_step = self.poses.solved(factor, -gradient)
+        path_term = coupling_times_poses(obs, equations.coupling, path_step)
+        return path_step, substitute_points(obs, equations.points, reduced, path_term)[0]
 
     def _equations(self, error: Estimate) -> NormalEquations:
         """Return the equations whose residuals are rho(d): the data are what leaves no others.
 
         Offsets are residuals themselves and have none of second order.
         """
-        seen, at, way = self.end.seen, self.at, error.path
+        obs, at, path_step = self.state.obs, self.at, error.path
         moved = Estimate(*(old + off for old, off in zip(at, error, strict=True)))
         before, after = disturbance_jacobians(at.path)
         found = disturbances(at.path, self.problem.odometry)
-        linear = np.einsum("kij,kj->ki", before, way[:-1])
-        linear += np.einsum("kij,kj->ki", after, way[1:])
+        linear = np.einsum("kij,kj->ki", before, path_step[:-1])
+        linear += np.einsum("kij,kj->ki", after, path_step[1:])
         of_motion = disturbances(moved.path, self.problem.odometry) - found - linear
         of_motion[:, 2] = wrap(of_motion[:, 2])
         odometry = self.problem.odometry.copy()
         odometry[1:] += found - of_motion
 
-        off = error.point_m[seen.landmark] + error.offset_m[seen.track]
-        off[:, :2] -= way[seen.frame, :2]
+        off = error.point_m[obs.landmark] + error.offset_m[obs.track]
+        off[:, :2] -= path_step[obs.frame, :2]
         off[:, :2] = np.einsum("nij,nj->ni", self.to_robot, off[:, :2])
-        turned = way[seen.frame, 2]
+        turned = path_step[obs.frame, 2]
         off[:, 0] += turned * self.seen_m[:, 1]
         off[:, 1] -= turned * self.seen_m[:, 0]
-        of_points = _from_poses(self.end, moved) - self.seen_m - off
-        explained = replace(seen, position_m=self.seen_m - of_points)
-        stray_information, information = self.problem.stray_information, self.problem.information
-        made = normal_equations(
-            explained, at, self.weights, stray_information, odometry, information
-        )
+        of_points = _from_poses(self.state, moved) - self.seen_m - off
+        explained = replace(obs, position_m=self.seen_m - of_points)
+        offset_prior, information = self.problem.offset_prior, self.problem.information
+        made = normal_equations(explained, at, self.weights, offset_prior, odometry, information)
         made.points.offset_gradient[:] = 0
         return made
 
 
-def _from_poses(end: Settled, at: Estimate) -> Float:
+def _from_poses(state: OptimizerState, at: Estimate) -> Float:
     """Return (N, 3) where the point of each observation is, in the robot's frame."""
-    seen = end.seen
-    point, pose = at.point_m[seen.landmark] + at.offset_m[seen.track], at.path[seen.frame]
+    obs = state.obs
+    point, pose = at.point_m[obs.landmark] + at.offset_m[obs.track], at.path[obs.frame]
     offset = point[:, :2] - pose[:, :2]
     point[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), offset)
     return point
