@@ -188,7 +188,7 @@ def team_edge_rows(team: FusedTeam) -> pd.DataFrame:
         return pd.DataFrame()
     pairs = list(dict.fromkeys((each.a.name, each.b.name) for each in team.met))
     rows = pd.DataFrame(pairs, columns=["robot_a", "robot_b"])
-    return rows.assign(place=[str(place) for place in team.fusion.place])
+    return rows.assign(place=[str(place) for place in team.fusion.edge_status])
 
 
 def map_fit_rows(team: FusedTeam) -> pd.DataFrame:

@@ -122,9 +122,9 @@ class Merged(NamedTuple):
     """Maps of the user's own made one.
 
     Attributes:
-        fusion: what became of them.
-        pairs: the alignments of each two of them, in the order of `fusion.place`; of ambiguous ones
-            the alternatives, too.
+        fusion: result of the merge.
+        pairs: alignments of every pair of maps in the order of `fusion.edge_status`, including the
+            alternatives of ambiguous ones.
     """
 
     fusion: Fusion
@@ -138,9 +138,9 @@ class Merged(NamedTuple):
     def reasons(self) -> dict[tuple[int, int], str]:
         """Return why each two maps were not merged by their own alignment; empty if they were."""
         found: dict[tuple[int, int], str] = {}
-        for pair, place in zip(self.pairs, self.fusion.place, strict=True):
-            reason = pair.alignment.reason or _OF_THE_TEAM.get(place, "")
-            if place in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
+        for pair, status in zip(self.pairs, self.fusion.edge_status, strict=True):
+            reason = pair.alignment.reason or _OF_THE_TEAM.get(status, "")
+            if status in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
                 found[pair.a, pair.b] = ""
             else:
                 found.setdefault((pair.a, pair.b), reason)

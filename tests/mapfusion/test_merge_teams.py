@@ -38,7 +38,7 @@ def test_maps_are_reached_through_others():
     team = Team()
     fusion = fused_by_kalman(team.maps, team.pairs)
     (fused,) = fusion.fused
-    assert fusion.place == (EdgeStatus.BRIDGE,) * 4
+    assert fusion.edge_status == (EdgeStatus.BRIDGE,) * 4
     assert fused.left_out == ()
     points = team.point_of(fused)
     assert len(np.unique(points)) == len(points) == 180
@@ -81,7 +81,7 @@ def test_a_false_alignment_that_a_loop_speaks_against_moves_nothing():
     pairs = [*team.pairs[:2], team.pair(0, 2), team.pair(1, 3), *team.pairs[2:]]
     pairs.append(team.pair(0, 3, false=True))
     fusion = fused_by_kalman(team.maps, pairs)
-    assert fusion.place == (EdgeStatus.CONFIRMED,) * 5 + (
+    assert fusion.edge_status == (EdgeStatus.CONFIRMED,) * 5 + (
         EdgeStatus.BRIDGE,
         EdgeStatus.CONTRADICTED,
     )

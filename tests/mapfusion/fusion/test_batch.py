@@ -60,7 +60,7 @@ class Twin:
         scaled = (level / self.weights.observation)[:, None, None] * covariance
         self.root = np.linalg.inv(np.linalg.cholesky(scaled[:, : self.d, : self.d]))
         self.ends = np.cumsum([len(log) for log in logs])
-        self.odometry, self.levels = [log.odometry for log in logs], smoothed.odometry_level
+        self.odometry, self.levels = [log.odometry for log in logs], smoothed.odometry_scales
         at = smoothed.estimate
         self.n = 3 * (len(at.path) - 1), self.d * len(at.point_m)
         parts = at.path[1:], at.point_m[:, : self.d], at.offset_m[self.has_offset, : self.d]
@@ -196,11 +196,11 @@ def test_what_hinders_it_is_said_and_joint_fusion_takes_its_place() -> None:
     team = LoggedTeam(5)
     component = team.component(0, 1)
     one, other = team.recordings
-    has_offset = replace(other, parameters=replace(other.parameters, stray_m=0.1))
+    other_offset = replace(other, parameters=replace(other.parameters, stray_m=0.1))
     for fuser, recordings, said in (
-        (Batch(), (), "the log that R1's map was smoothed from is not known"),
-        (Batch(), (one, None), "the log that R1's map was smoothed from is not known"),
-        (Batch(), (one, has_offset), "the logs' tracks stray by different amounts"),
+        (Batch(), (), "the log of R1's smoothed map is not known"),
+        (Batch(), (one, None), "the log of R1's smoothed map is not known"),
+        (Batch(), (one, other_offset), "the logs have different values of stray_m"),
         (Batch(1e-6), (one, other), "smoothing all logs at once: may take "),
     ):
         given = replace(component, recordings=recordings)

@@ -275,7 +275,7 @@ def test_maps_that_no_landmarks_tie_are_fused_by_what_stands_in(n_left: int) -> 
     pairs = [replace(pair, alignment=few)]
     found, instead = _fused(team, pairs), _fused(team, pairs, KalmanDrift())
     np.testing.assert_array_equal(found.landmarks.position_m, instead.landmarks.position_m)
-    assert "tie some map to the others" in found.fallback
+    assert "landmarks in common with the others" in found.fallback
 
 
 def test_covariances_that_cannot_be_computed_with_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,7 +286,7 @@ def test_covariances_that_cannot_be_computed_with_are_told(monkeypatch: pytest.M
     team = DrawnTeam([slice(0, 40), slice(20, 60)], 4)
     found, instead = _fused(team), _fused(team, team.pairs, KalmanDrift())
     np.testing.assert_array_equal(found.landmarks.position_m, instead.landmarks.position_m)
-    assert "sizes too different" in found.fallback
+    assert "differ too much in size" in found.fallback
 
 
 def test_a_wrong_alignment_whose_pairs_pass_no_gate_breaks_nothing() -> None:

@@ -47,7 +47,7 @@ def as_printed(L_i, S_i, L_j, S_j):
 
 
 @pytest.mark.parametrize(("form", "holds"), [(fuse, True), (as_printed, False)])
-def test_round_landmarks_meet_between_their_parents(form, contains):
+def test_round_landmarks_meet_between_their_parents(form, holds):
     L_i, _, L_j, _ = pairs_to_fuse(3)
     rng = np.random.default_rng(3)
     s_i, s_j = rng.uniform(0.01, 1, (2, len(L_i), 1, 1))
@@ -55,7 +55,7 @@ def test_round_landmarks_meet_between_their_parents(form, contains):
     along = np.einsum("ni,ni->n", position - L_i, L_j - L_i) / np.sum((L_j - L_i) ** 2, axis=1)
     between = np.all((along > 0) & (along < 1))
     on_line = np.allclose(L_i + along[:, None] * (L_j - L_i), position, atol=1e-9)
-    assert (between and on_line) == contains
+    assert (between and on_line) == holds
 
 
 @given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e3))

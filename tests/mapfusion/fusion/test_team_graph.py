@@ -51,7 +51,7 @@ def test_the_right_one_among_rivals_is_chosen(parameters: TeamParameters, seed: 
     accepted = true_of([(0, 1), (1, 2)], true, rng)
     alternatives = wrong([(2, 0)] * 2, 3, rng).concatenated(true_of([(0, 2)], true, rng))
     found = team_graph(accepted, parameters, None, alternatives)
-    assert found.place.tolist() == [EdgeStatus.CONFIRMED] * 2 + [EdgeStatus.REFUSED] * 2 + [
+    assert found.edge_status.tolist() == [EdgeStatus.CONFIRMED] * 2 + [EdgeStatus.REFUSED] * 2 + [
         EdgeStatus.CONFIRMED
     ]
     assert found.component.tolist() == [0, 0, 0]
@@ -73,10 +73,10 @@ def test_without_a_loop_of_accepted_ones_none_is_chosen(parameters: TeamParamete
     true = poses(3, rng)
     accepted, alternatives = true_of([(0, 1)], true, rng), true_of([(1, 2), (0, 2)], true, rng)
     found = team_graph(accepted, parameters, None, alternatives)
-    assert found.place[1:].tolist() == [EdgeStatus.REFUSED] * 2
+    assert found.edge_status[1:].tolist() == [EdgeStatus.REFUSED] * 2
     assert found.component[2] != found.component[0]
     nothing = team_graph(accepted[np.arange(0)], parameters, None, alternatives)
-    assert nothing.place.tolist() == [EdgeStatus.REFUSED] * 2
+    assert nothing.edge_status.tolist() == [EdgeStatus.REFUSED] * 2
 
 
 def test_of_two_that_close_the_loop_alike_none_is_chosen() -> None:
@@ -84,7 +84,7 @@ def test_of_two_that_close_the_loop_alike_none_is_chosen() -> None:
     true = poses(3, rng)
     accepted, alternatives = (true_of(e, true, rng) for e in ([(0, 1), (1, 2)], [(0, 2)] * 2))
     found = team_graph(accepted, KEEP, None, alternatives)
-    assert found.place[2:].tolist() == [EdgeStatus.REFUSED] * 2
+    assert found.edge_status[2:].tolist() == [EdgeStatus.REFUSED] * 2
 
 
 def test_no_false_merge_in_many_teams() -> None:
@@ -103,11 +103,11 @@ def test_no_false_merge_in_many_teams() -> None:
         right = true_of(pairs[~met][::2].tolist(), true, rng)
         found = team_graph(accepted, KEEP, None, alternatives.concatenated(right))
         n_wrong = len(accepted) + len(alternatives)
-        assert not np.any(found.place[len(accepted) : n_wrong] == EdgeStatus.CONFIRMED), seed
+        assert not np.any(found.edge_status[len(accepted) : n_wrong] == EdgeStatus.CONFIRMED), seed
         assert len(falsely_placed(found, true)) == 0, seed
         linked = found.component[right.robots[:, 0]] == found.component[right.robots[:, 1]]
         n_right += np.count_nonzero(linked)
-        n_found += np.count_nonzero(found.place[n_wrong:] == EdgeStatus.CONFIRMED)
+        n_found += np.count_nonzero(found.edge_status[n_wrong:] == EdgeStatus.CONFIRMED)
         dropped = team_graph(accepted, DROP, None, alternatives.concatenated(right))
         assert len(falsely_placed(dropped, true)) == 0, seed
     assert n_found > 0.9 * n_right > 15
@@ -200,11 +200,11 @@ def test_half_of_the_alignments_are_false(kind: str, seed: int) -> None:
     met = team(seed, kind, 8 if kind == "shifts" else 10)
     found = team_graph(met.relations, TEAM_GRAPH_DROP)
     assert len(falsely_placed(found, met.T_world_robot)) == 0
-    assert not np.any(met.false & (found.place == EdgeStatus.CONFIRMED))
+    assert not np.any(met.false & (found.edge_status == EdgeStatus.CONFIRMED))
     if kind == "independent":
         placed = np.bincount(met.relations.robots[~met.false].ravel(), minlength=10) > 1
         np.testing.assert_array_equal(found.component[placed], 0)
-        assert np.all(found.place[met.false] == EdgeStatus.CONTRADICTED)
+        assert np.all(found.edge_status[met.false] == EdgeStatus.CONTRADICTED)
 
 
 @pytest.mark.parametrize("parameters", [TEAM_GRAPH_DROP, TEAM_GRAPH_KEEP])
@@ -221,7 +221,7 @@ def test_the_order_changes_nothing_but_the_frame(kind: str, parameters: TeamPara
         relations.log10_false_alarms[order],
     )
     one, two = team_graph(relations, parameters), team_graph(other, parameters)
-    np.testing.assert_array_equal(one.place[order], two.place)
+    np.testing.assert_array_equal(one.edge_status[order], two.place)
     together = one.component[:, None] == one.component
     np.testing.assert_array_equal(together, (two.component[:, None] == two.component)[new][:, new])
     i, j = np.nonzero(together)
@@ -237,8 +237,8 @@ def test_an_alignment_that_no_loop_confirms() -> None:
     true, robots = poses(4, rng), np.array([[0, 1], [1, 2], [0, 2], [2, 3]])
     relations = measured(robots, between(true[robots[:, 0]], true[robots[:, 1]]), 4, rng)
     kept, dropped = team_graph(relations, TEAM_GRAPH_KEEP), team_graph(relations, TEAM_GRAPH_DROP)
-    assert kept.place.tolist() == [EdgeStatus.CONFIRMED] * 3 + [EdgeStatus.BRIDGE]
-    assert dropped.place.tolist() == [EdgeStatus.CONFIRMED] * 3 + [EdgeStatus.UNCONFIRMED]
+    assert kept.edge_status.tolist() == [EdgeStatus.CONFIRMED] * 3 + [EdgeStatus.BRIDGE]
+    assert dropped.edge_status.tolist() == [EdgeStatus.CONFIRMED] * 3 + [EdgeStatus.UNCONFIRMED]
     np.testing.assert_array_equal(kept.component, 0)
     np.testing.assert_array_equal(dropped.component, [0, 0, 0, 1])
     assert len(falsely_placed(kept, true)) == 0
@@ -251,7 +251,11 @@ def test_of_bridges_that_contradict_each_other_the_surest() -> None:
     relations = measured(all_pairs(3), poses(3, rng), 3, rng)  # a triangle that does not close
     sure = replace(relations, log10_false_alarms=np.array([-20.0, -6.0, -9.0]))
     found = team_graph(sure, TEAM_GRAPH_KEEP)
-    assert found.place.tolist() == [EdgeStatus.BRIDGE, EdgeStatus.CONTRADICTED, EdgeStatus.BRIDGE]
+    assert found.edge_status.tolist() == [
+        EdgeStatus.BRIDGE,
+        EdgeStatus.CONTRADICTED,
+        EdgeStatus.BRIDGE,
+    ]
     np.testing.assert_array_equal(team_graph(sure, TEAM_GRAPH_DROP).component, [0, 1, 2])
 
 
@@ -267,9 +271,9 @@ def test_two_readings_of_one_cut_leave_both_sides_whole() -> None:
     relations = measured(robots, T, 8, rng)
     kept, dropped = team_graph(relations, TEAM_GRAPH_KEEP), team_graph(relations, TEAM_GRAPH_DROP)
     np.testing.assert_array_equal(kept.component, [0, 0, 0, 0, 1, 1, 1, 1])
-    assert np.all(kept.place[across] == EdgeStatus.AMBIGUOUS)
-    assert np.all(kept.place[~across] == EdgeStatus.CONFIRMED)
-    assert not np.any(dropped.place[across] == EdgeStatus.CONFIRMED)
+    assert np.all(kept.edge_status[across] == EdgeStatus.AMBIGUOUS)
+    assert np.all(kept.edge_status[~across] == EdgeStatus.CONFIRMED)
+    assert not np.any(dropped.edge_status[across] == EdgeStatus.CONFIRMED)
     assert len(falsely_placed(dropped, true)) == 0
 
 
@@ -283,7 +287,7 @@ def test_a_small_reading_loses_or_warns() -> None:
     relations = measured(robots, T, 7, rng)
     kept, dropped = team_graph(relations, TEAM_GRAPH_KEEP), team_graph(relations, TEAM_GRAPH_DROP)
     np.testing.assert_array_equal(kept.component, 0)
-    assert np.all(kept.place[false] == EdgeStatus.CONTRADICTED)
+    assert np.all(kept.edge_status[false] == EdgeStatus.CONTRADICTED)
     assert len(falsely_placed(kept, true)) == 0
     np.testing.assert_array_equal(dropped.component, [1, 2, 3, 0, 0, 0, 0])
 
