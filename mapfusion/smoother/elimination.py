@@ -53,9 +53,9 @@ class ReducedPoses:
         """Return the gradient, shape (T, 3)."""
         equations = self.equations
         still = np.zeros_like(equations.points.track_gradient)
-        moved = substitute_points(self.obs, equations.points, self.reduced, still)
+        steps = substitute_points(self.obs, equations.points, self.reduced, still)
         total = equations.pose_gradient + coupling_times_points(
-            self.obs, equations.coupling, *moved
+            self.obs, equations.coupling, *steps
         )
         total[0] = 0.0
         return total
@@ -70,11 +70,16 @@ class ReducedPoses:
         """
         envelope = self.obs.order.envelope
         S = envelope.zeros()
-        _put_poses(S, envelope, self.obs.pose_place[1:] - 1, self.equations)
+        # blocks of odometry and of each pose's own observations
+        place = self.obs.pose_place[1:] - 1
+        S[envelope.where(place, place)] = self.equations.pose_block[1:]
+        after, before, link = place[1:], place[:-1], self.equations.link[1:]
+        link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
+        S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link
         subtract_point_terms(self.obs, self.equations, self.reduced, S)
         return factor_in_envelope(S, envelope)
 
-    def solved(self, factor: Factor, right: Float) -> Float:
+    def solve(self, factor: Factor, right: Float) -> Float:
         """Solve for x (T, 3) with the matrix of this factor and the right side (T, 3)."""
         ordered = np.empty((len(right) - 1, 3))
         ordered[self.obs.pose_place[1:] - 1] = right[1:]
@@ -91,17 +96,6 @@ class ReducedPoses:
         return found
 
 
-def _put_poses(S: Float, envelope: Envelope, place: np.ndarray, equations: NormalEquations) -> None:
-    """Write the blocks of odometry and of each pose's own observations into S.
-
-    `place` (T - 1,) is the row of each unknown pose.
-    """
-    S[envelope.where(place, place)] = equations.pose_block[1:]
-    after, before, link = place[1:], place[:-1], equations.link[1:]
-    link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
-    S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link
-
-
 @dataclass(frozen=True)
 class PathErrors:
     """Y (R, 3L) for the R coordinates of the unknown poses in their order.
@@ -109,12 +103,12 @@ class PathErrors:
     Attributes:
         obs: the observations.
         factor: L.
-        moved: (N, 3, 3) entries of C A, by observation.
+        pose_landmark: block of C A of each observation, shape (N, 3, 3).
     """
 
     obs: OrderedObservations
     factor: Factor
-    moved: Float
+    pose_landmark: Float
 
     @classmethod
     def of(
@@ -136,28 +130,28 @@ class PathErrors:
 
     def gram(self, columns: Float) -> Float:
         """Return Y Y' times columns (R, c), computed in single precision."""
-        moving = self._moving_roughly
-        by_landmark = moving @ self.factor.solve_transposed(columns.astype(np.float32))
-        return self.factor.solve(moving.T @ by_landmark).astype(np.float64)
+        AC = self._landmark_pose_single
+        by_landmark = AC @ self.factor.solve_transposed(columns.astype(np.float32))
+        return self.factor.solve(AC.T @ by_landmark).astype(np.float64)
 
     def spread(self, columns: Float) -> Float:
         """Return Y' times columns (R, c), shape (3L, c)."""
-        return self._moving @ self.factor.solve_transposed(columns)
+        return self._landmark_pose @ self.factor.solve_transposed(columns)
 
     def gathered(self, by_landmark: Float) -> Float:
         """Return Y times columns (3L, c), shape (R, c)."""
-        return self.factor.solve(self._moving.T @ by_landmark)
+        return self.factor.solve(self._landmark_pose.T @ by_landmark)
 
     def squares(self) -> Float:
         """Return the diagonal blocks of Y' Y, shape (L, 3, 3)."""
         total = np.zeros((self.obs.n_landmarks, 3, 3))
         covariance, offset = self.factor.inverse, self.factor.envelope.offset
         place = self.obs.unknown_place
-        _add_squares(self.obs.starts, place, self.moved, offset, covariance, total)
+        _add_squares(self.obs.starts, place, self.pose_landmark, offset, covariance, total)
         return total + np.swapaxes(total, 1, 2)
 
     @cached_property
-    def _moving(self) -> csr_array:
+    def _landmark_pose(self) -> csr_array:
         """A C' with one block for each observation, shape (3L, R)."""
         place, each = self.obs.unknown_place, np.arange(3)
         known = place >= 0
@@ -165,12 +159,14 @@ class PathErrors:
         columns = 3 * place[known, None] + each
         rows, columns = np.broadcast_arrays(rows[:, None, :], columns[:, :, None])
         shape = 3 * self.obs.n_landmarks, len(self)
-        return csr_array((self.moved[known].ravel(), (rows.ravel(), columns.ravel())), shape)
+        return csr_array(
+            (self.pose_landmark[known].ravel(), (rows.ravel(), columns.ravel())), shape
+        )
 
     @cached_property
-    def _moving_roughly(self) -> csr_array:
+    def _landmark_pose_single(self) -> csr_array:
         """A C' in single precision."""
-        known = self._moving
+        known = self._landmark_pose
         entries = known.data.astype(np.float32), known.indices, known.indptr
         return csr_array(entries, known.shape)
 
@@ -179,12 +175,12 @@ class PathErrors:
 def _add_squares(
     starts: np.ndarray,
     place: np.ndarray,
-    moved: Float,
+    pose_landmark: Float,
     offset: np.ndarray,
     Z: Float,
     total: Float,
 ) -> None:
-    """Write matrices whose sum with their transposes is moved' Z moved of each landmark."""
+    """Write half of Y' Y of each landmark: the sum with its transpose is the diagonal block."""
     of_pose = np.empty((3, 3))
     for j in range(len(starts) - 1):
         for i in range(starts[j], starts[j + 1]):
@@ -196,11 +192,10 @@ def _add_squares(
             for k in range(starts[j], i + 1):
                 if place[k] >= 0:
                     share = 0.5 if k == i else 1.0
-                    # Add a share of the poses' covariance times what moves observation k's
-                    # landmark.
+                    # add a share of the poses' covariance times the block of observation k
                     row = 3 * place[i]
                     column = 3 * place[k]
-                    above = row < column  # its mirror image is stored
+                    above = row < column  # the transpose is stored
                     down, across = (column, row) if above else (row, column)
                     at0, at1, at2 = (
                         offset[down] + across,
@@ -209,9 +204,9 @@ def _add_squares(
                     )
                     for q in range(3):
                         x, y, z = (
-                            share * moved[k, 0, q],
-                            share * moved[k, 1, q],
-                            share * moved[k, 2, q],
+                            share * pose_landmark[k, 0, q],
+                            share * pose_landmark[k, 1, q],
+                            share * pose_landmark[k, 2, q],
                         )
                         if above:
                             for r in range(3):
@@ -223,19 +218,19 @@ def _add_squares(
             for r in range(3):
                 for q in range(3):
                     total[j, r, q] += (
-                        moved[i, 0, r] * of_pose[0, q]
-                        + moved[i, 1, r] * of_pose[1, q]
-                        + moved[i, 2, r] * of_pose[2, q]
+                        pose_landmark[i, 0, r] * of_pose[0, q]
+                        + pose_landmark[i, 1, r] * of_pose[1, q]
+                        + pose_landmark[i, 2, r] * of_pose[2, q]
                     )
 
 
 _GB = 1e9
 _ITEM = np.dtype(np.float64).itemsize
 # Number of arrays in memory at the same time. In the envelope: factor and inverse of two successive
-# steps. Of the points: their blocks with the poses as built, in rows, solved and as LAPACK copies
-# them; and the points' own blocks.
+# steps. Blocks of points with poses: as built, by rows, solved, and copies of LAPACK. Blocks of
+# points.
 _FACTORS, _WIDE, _SQUARE = 4.0, 5.0, 6.0
-_BLOCK, _BLOCKS = 9, 12  # entries of a block of three by three; blocks of a pose, sighting, track
+_BLOCK, _BLOCKS = 9, 12  # entries of a 3 by 3 block; blocks per pose, observation and track
 _CONDENSED = 6.0  # arrays of the map's shared directions
 _BAND = 5  # below the diagonal of a chain of poses of three coordinates
 
@@ -245,7 +240,7 @@ class Solution(NamedTuple):
 
     Attributes:
         step: step of the poses (zero for the first), landmarks and offsets.
-        moved: squared length of the step of the reduced system, in sigmas.
+        squared_step: squared length of the step of the reduced system, in sigmas.
         own_m2: covariance of each landmark for a known path, shape (L, 3, 3).
         offset_m2: covariance of each track's offset for a known path, shape (B, 3, 3).
         track_m2: covariance of each track's point for a known path, shape (B, 3, 3).
@@ -255,7 +250,7 @@ class Solution(NamedTuple):
     """
 
     step: Estimate
-    moved: float
+    squared_step: float
     own_m2: Float
     offset_m2: Float
     track_m2: Float
@@ -266,8 +261,8 @@ class Solution(NamedTuple):
 def solve(obs: OrderedObservations, equations: NormalEquations) -> Solution:
     """Solve the equations of these observations for the next step."""
     if _is_landmarks_first(obs):
-        return _landmarks_first(obs, equations)
-    return _poses_first(obs, equations)
+        return _eliminate_landmarks_first(obs, equations)
+    return _eliminate_poses_first(obs, equations)
 
 
 def solve_points(
@@ -277,8 +272,8 @@ def solve_points(
     equations = point_equations(obs, at, weights, offset_prior)
     reduced = eliminate_offsets(obs, equations)
     still = np.zeros_like(equations.track_gradient)
-    moved = substitute_points(obs, equations, reduced, still)
-    return Estimate(np.zeros_like(at.path), *moved), point_covariances(obs, reduced)
+    steps = substitute_points(obs, equations, reduced, still)
+    return Estimate(np.zeros_like(at.path), *steps), point_covariances(obs, reduced)
 
 
 def memory_bytes(obs: OrderedObservations) -> float:
@@ -319,7 +314,14 @@ def shared_errors(
     """Return Y (R, 3L); the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
     if solution.landmarks_first:
         return PathErrors.of(obs, equations, solution.own_m2, solution.factor)
-    return KnownErrors(_beside_own(solution.own_m2, solution.factor.dense()))
+    # the joint covariance without the diagonal blocks `own_m2`, from the landmarks' information
+    own_m2 = solution.own_m2
+    n, each = len(own_m2), np.arange(len(own_m2))
+    lower = solution.factor.dense()[-3 * n :, -3 * n :]  # landmarks are last
+    joint = scipy.linalg.cho_solve((lower, True), np.eye(3 * n), check_finite=False)
+    joint.reshape(n, 3, n, 3)[each, :, each, :] -= own_m2
+    variance, direction = np.linalg.eigh(joint)
+    return KnownErrors((np.sqrt(np.maximum(variance, 0.0)) * direction).T[::-1])
 
 
 def pose_covariances(
@@ -331,38 +333,27 @@ def pose_covariances(
     row = obs.pose_place[frames] if solution.landmarks_first else frames
     chosen[row - 1, :, np.arange(n)] = np.eye(3)
     right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
-    if (
-        not solution.landmarks_first
-    ):  # errors of the path for known points, and errors from the points
+    if not solution.landmarks_first:
+        # errors of the path for known points, and errors from the points
         solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
         right, alone = pose_point_blocks(obs, equations)[0].T @ solved, right.T @ solved
     root = solution.factor.solve(right)
     return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
 
-def _beside_own(own_m2: Float, lower: Float) -> Float:
-    """Return Y (3L, 3L) from the factor of the landmarks' information."""
-    n, each = len(own_m2), np.arange(len(own_m2))
-    lower = lower[-3 * n :, -3 * n :]  # landmarks are last
-    joint = scipy.linalg.cho_solve((lower, True), np.eye(3 * n), check_finite=False)
-    joint.reshape(n, 3, n, 3)[each, :, each, :] -= own_m2
-    variance, direction = np.linalg.eigh(joint)
-    return (np.sqrt(np.maximum(variance, 0.0)) * direction).T[::-1]
-
-
-def _landmarks_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
+def _eliminate_landmarks_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
     reduced = eliminate_offsets(obs, equations.points)
     poses = ReducedPoses(obs, equations, reduced)
     gradient, factor = poses.gradient(), poses.factor()
-    path_step = poses.solved(factor, -gradient)
+    path_step = poses.solve(factor, -gradient)
     path_term = coupling_times_poses(obs, equations.coupling, path_step)
     step = Estimate(path_step, *substitute_points(obs, equations.points, reduced, path_term))
-    moved, known = -float(np.vdot(gradient, path_step)), point_covariances(obs, reduced)
+    squared_step, known = -float(np.vdot(gradient, path_step)), point_covariances(obs, reduced)
     own = reduced.landmark_m2, known.offset_m2, known.track_m2
-    return Solution(step, moved, *own, factor, landmarks_first=True)
+    return Solution(step, squared_step, *own, factor, landmarks_first=True)
 
 
-def _poses_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
+def _eliminate_poses_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
     n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(obs.has_offset)
     B, K, gradient = pose_point_blocks(obs, equations)
     chain = chain_factor(equations)
@@ -379,8 +370,8 @@ def _poses_first(obs: OrderedObservations, equations: NormalEquations) -> Soluti
     known = point_covariances(obs, reduced)
     own = reduced.landmark_m2, known.offset_m2, known.track_m2
     last = step.point_m.ravel()
-    moved = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
-    return Solution(step, moved, *own, factor, landmarks_first=False)
+    squared_step = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
+    return Solution(step, squared_step, *own, factor, landmarks_first=False)
 
 
 def pose_point_blocks(
@@ -398,7 +389,10 @@ def pose_point_blocks(
         np.arange(n_points),
         n + obs.landmark_of_track,
     )
-    own = np.concatenate([S[has_offset], _regular(obs, obs.sum_tracks(S))])
+    landmark_block = obs.sum_tracks(S)
+    if obs.n_dimensions == 2:  # z is not observed
+        landmark_block[:, 2, 2] = 1.0
+    own = np.concatenate([S[has_offset], landmark_block])
     own[:n] += equations.points.offset_information[has_offset, None, None] * np.eye(3)
     K[each, each] = own
     K[landmark[has_offset], each[:n]] = S[has_offset]
@@ -413,9 +407,9 @@ def pose_point_blocks(
 
 
 def chain_factor(equations: NormalEquations) -> Float:
-    """Cholesky factor of the poses, which are a chain, but for the first.
+    """Return the Cholesky factor of the chain of poses after the first.
 
-    As LAPACK takes a band: row d is the d-th diagonal below the main.
+    It is a band matrix of LAPACK: row d is the d-th diagonal below the main diagonal.
     """
     n = 3 * len(equations.pose_block)
     band = np.zeros((_BAND + 1, n))
@@ -425,12 +419,3 @@ def chain_factor(equations: NormalEquations) -> Float:
                 band[r - q, q::3] = equations.pose_block[:, r, q]
             band[3 + r - q, q : n - 3 : 3] = equations.link[:, r, q]
     return scipy.linalg.cholesky_banded(band[:, 3:], lower=True, check_finite=False)
-
-
-def _regular(obs: OrderedObservations, point_block: Float) -> Float:
-    """Return the landmarks' blocks; in planar data z, which is not observed, has information 1."""
-    if obs.n_dimensions == 3:
-        return point_block
-    regular = point_block.copy()
-    regular[:, 2, 2] = 1.0
-    return regular

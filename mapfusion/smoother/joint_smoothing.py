@@ -45,7 +45,7 @@ class AssociatedLog:
         require_shape("path", self.path, (len(self.log), 3))
 
 
-_NOTHING = np.zeros((1, 3))  # information of the motion between two logs
+_UNKNOWN = np.zeros((1, 3))  # information of the motion between two logs
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def smooth_jointly(
         LinAlgError: the pose of a robot is not determined.
         MemoryError: it may take more than `max_memory_gb`.
     """
-    log, point = _one_log([each.log for each in recordings]), np.concatenate(points)
+    log, point = _concatenate([each.log for each in recordings]), np.concatenate(points)
     offset_prior = recordings[0].parameters.offset_prior
     obs = order_observations(log, point, min_count=1, with_offsets=offset_prior > 0)
     require_memory(obs, max_memory_gb)
@@ -99,13 +99,12 @@ def smooth_jointly(
     )
     path[0] = IDENTITY  # removes rounding errors
     information = [
-        np.concatenate([each.parameters.odometry_information(each.log), _NOTHING])
+        np.concatenate([each.parameters.odometry_information(each.log), _UNKNOWN])
         for each in recordings
     ]
     problem = Problem(obs, log.odometry, np.concatenate(information)[:-1], offset_prior)
     start = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
-    own_odometry = all(each.parameters.has_own_odometry for each in recordings)
-    if own_odometry:
+    if all(each.parameters.has_own_odometry for each in recordings):
         state, scales = optimize_with_noise(problem, start)
     else:
         state, scales = optimize(problem, start), UNIT_SCALES
@@ -119,7 +118,7 @@ def smooth_jointly(
     return JointlySmoothed(smoothed, names, state.estimate.path[starts], covariance, paths)
 
 
-def _one_log(logs: Sequence[RobotLog]) -> RobotLog:
+def _concatenate(logs: Sequence[RobotLog]) -> RobotLog:
     """Concatenate the logs; they have no common tracks."""
     n_before = np.cumsum([0, *(len(log) for log in logs[:-1])])
     tracks, first_free = [], 0

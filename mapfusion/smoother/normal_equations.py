@@ -105,15 +105,15 @@ def bounded_information(sigma: Float) -> Float:
 def scaled_information(information: Float, scales: Float) -> Float:
     """Return the information (N, 3) of motions whose variances are multiplied by `scales` (3,).
 
-    It has the bound of `information_of`, which levels do not scale.
+    It has the bound of `bounded_information`, which is not scaled.
     """
     return np.minimum(information / scales, _STILL**-2)
 
 
 def smallest_scales(information: Float) -> Float:
-    """Return the levels (3,) below which no motion's information (N, 3) grows any more.
+    """Return the noise scales (3,) below which the information (N, 3) is at its bound.
 
-    They are 1 where no motion has any information.
+    They are 1 without any information.
     """
     least = np.min(np.where(information > 0, information, np.inf), axis=0, initial=np.inf)
     return np.where(np.isfinite(least), least * _STILL**2, 1.0)
@@ -135,11 +135,13 @@ def disturbance_jacobians(path: Float) -> tuple[Float, Float]:
     """Return the Jacobians (T - 1, 3, 3) of each disturbance by the pose before and after it."""
     n = len(path) - 1
     to_robot = np.swapaxes(rotation(path[:-1, 2]), 1, 2)
-    way = path[1:, :2] - path[:-1, :2]
+    translation = path[1:, :2] - path[:-1, :2]
     before, after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
     after[:, :2, :2], after[:, 2, 2] = to_robot, 1.0
     before[:, :2, :2], before[:, 2, 2] = -to_robot, -1.0
-    before[:, :2, 2] = np.einsum("nij,nj->ni", to_robot, np.stack([way[:, 1], -way[:, 0]], 1))
+    before[:, :2, 2] = np.einsum(
+        "nij,nj->ni", to_robot, np.stack([translation[:, 1], -translation[:, 0]], 1)
+    )
     return before, after
 
 
@@ -174,7 +176,7 @@ def normal_equations(
     share, frame = shares.observation, obs.frame
     W, e, point = _in_map_frame(obs, at, weights.observation)
     _put_points(obs, W, e, share, made.points)
-    # the lever: of de/dx the last column
+    # (a, b) is the lever arm, the last column of de/dx
     a, b = point[:, 1] - at.path[frame, 1], at.path[frame, 0] - point[:, 0]
     coupling = made.coupling
     coupling[:, :2] = -share * W[:, :2]
@@ -183,7 +185,14 @@ def normal_equations(
     made.pose_block[:, :, :2] = -sums_by(frame, coupling[:, :, :2], n_poses)
     turned = coupling[:, :, 0] * a[:, None] + coupling[:, :, 1] * b[:, None]
     made.pose_block[:, :, 2] = sums_by(frame, turned, n_poses)
-    _add_odometry(at.path, odometry, information, made)
+    # odometry
+    d = disturbances(at.path, odometry)
+    before, after = disturbance_jacobians(at.path)
+    for J, poses in ((before, slice(0, n_poses - 1)), (after, slice(1, n_poses))):
+        weighted = np.swapaxes(J, 1, 2) * information[:, None, :]
+        made.pose_block[poses] += weighted @ J
+        made.pose_gradient[poses] += np.einsum("nij,nj->ni", weighted, d)
+    made.link[:] = (np.swapaxes(after, 1, 2) * information[:, None, :]) @ before
     return made
 
 
@@ -205,25 +214,13 @@ def _no_observations(
     return PointEquations(*nothing, shares.offset * of_offset, of_offset[:, None] * at.offset_m)
 
 
-def _add_odometry(path: Float, odometry: Float, information: Float, made: NormalEquations) -> None:
-    n = len(path) - 1
-    d = disturbances(path, odometry)
-    before, after = disturbance_jacobians(path)
-    for J, at in ((before, slice(0, n)), (after, slice(1, n + 1))):
-        weighted = np.swapaxes(J, 1, 2) * information[:, None, :]
-        made.pose_block[at] += weighted @ J
-        made.pose_gradient[at] += np.einsum("nij,nj->ni", weighted, d)
-    made.link[:] = (np.swapaxes(after, 1, 2) * information[:, None, :]) @ before
-
-
 def _in_map_frame(
     obs: OrderedObservations, at: Estimate, weight: Float
 ) -> tuple[Float, Float, Float]:
-    """Return what the N observations say in the map frame.
+    """Transform the observations into the map frame.
 
     Returns:
-        Their weighted information R W R' (N, 3, 3), their residuals (N, 3), and the points (N, 3)
-        that they are of.
+        weighted information R W R' (N, 3, 3), residuals (N, 3) and observed points (N, 3).
     """
     point = (at.point_m[obs.landmark_of_track] + at.offset_m)[obs.track]
     pose, z, (c, s) = at.path[obs.frame], obs.position_m, heading_cos_sin(at.path)[obs.frame].T
@@ -246,7 +243,7 @@ def _in_map_frame(
 def _put_points(
     obs: OrderedObservations, W: Float, e: Float, share: float, made: PointEquations
 ) -> None:
-    """Put the sums of W, of which a share counts, and of W e of each track."""
+    """Write the sums of `share` W and of W e over each track."""
     n = len(obs.has_offset)
     made.track_gradient[:] = sums_by(obs.track, times_vectors(W, e), n)
     made.track_block[:] = sums_by(obs.track, share * W, n)
@@ -261,9 +258,9 @@ def initial_landmarks(obs: OrderedObservations, path: Float) -> Float:
 
 
 def squared_distances(obs: OrderedObservations, at: Estimate) -> Float:
-    """(N,) squared Mahalanobis distances of the observations from where they should be.
+    """Return the squared Mahalanobis distances of the observations, shape (N,).
 
-    In the robot's frame, where the information is: r' W r with r = R'(l + b - p) - z.
+    They are r' W r with the residuals r = R'(l + b - p) - z in the robot frame.
     """
     point = (at.point_m[obs.landmark_of_track] + at.offset_m)[obs.track]
     pose, W, (c, s) = at.path[obs.frame], obs.information, heading_cos_sin(at.path)[obs.frame].T
@@ -279,15 +276,15 @@ def squared_distances(obs: OrderedObservations, at: Estimate) -> Float:
 
 
 def expected_point_squares(obs: OrderedObservations, path: Float, covariance_m2: Float) -> Float:
-    """(N,) what squared distances are expected to be more by: the trace of W R' C R.
+    """Return the expected increase of squared distances by errors of the points, shape (N,).
 
-    About the tracks' true points, that is; those about points that were fitted to the same
-    observations are smaller.
+    It is the trace of W R' C R, if the points are independent of the observations. Distances from
+    points that are fitted to the same observations are smaller.
 
     Args:
         obs: the observations.
-        path: (T, 3).
-        covariance_m2: (B, 3, 3) C of the tracks' points.
+        path: path, shape (T, 3).
+        covariance_m2: covariances C of the tracks' points, shape (B, 3, 3).
     """
     C, W, (c, s) = covariance_m2[obs.track], obs.information, heading_cos_sin(path)[obs.frame].T
     xx, xy, xz = C[:, 0, 0], C[:, 0, 1], C[:, 0, 2]

@@ -50,10 +50,10 @@ class Problem(NamedTuple):
 
     def cost(self, at: Estimate, weights: Weights) -> float:
         """Return the weighted sum of squares."""
-        walked = np.sum(self.information * disturbances(at.path, self.odometry) ** 2)
+        odometry = np.sum(self.information * disturbances(at.path, self.odometry) ** 2)
         obs = np.sum(weights.observation * squared_distances(self.obs, at))
         offsets = np.sum(weights.offset[:, None] * at.offset_m**2)
-        return float(walked + obs + self.offset_prior * offsets)
+        return float(odometry + obs + self.offset_prior * offsets)
 
 
 class OptimizerState(NamedTuple):
@@ -79,7 +79,7 @@ class OptimizerState(NamedTuple):
 
     def is_converged(self, tolerance: float) -> bool:
         """Return True if the next step is below a tolerance, in squared sigmas a coordinate."""
-        return self.solution.moved < tolerance * self.estimate.path.size
+        return self.solution.squared_step < tolerance * self.estimate.path.size
 
 
 def optimize(
@@ -107,7 +107,7 @@ def optimize(
 
 def take_final_step(problem: Problem, state: OptimizerState) -> OptimizerState:
     """Take the last step, which is small, without new weights."""
-    return state._replace(estimate=_further(problem, state), n_steps=state.n_steps + 1)
+    return state._replace(estimate=_line_search(problem, state), n_steps=state.n_steps + 1)
 
 
 def linearize_and_solve(
@@ -139,13 +139,15 @@ def take_step(
     These are of the observations `obs` if given.
     """
     after = problem if obs is None else problem._replace(obs=obs)
-    return update_points_and_weights(after, _further(problem, state), state.weights, state.tails)
+    return update_points_and_weights(
+        after, _line_search(problem, state), state.weights, state.tails
+    )
 
 
 def update_points_and_weights(
     problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = GAUSSIAN_TAILS
 ) -> tuple[Estimate, Weights, Tails]:
-    """Update points and robust weights by turns for a fixed path.
+    """Update points and robust weights alternately for a fixed path.
 
     They converge slowly for inconsistent tracks, and these updates are cheap. Initial weights are
     ones by default.
@@ -159,26 +161,19 @@ def update_points_and_weights(
     return at, weights, tails
 
 
-def _further(problem: Problem, state: OptimizerState) -> Estimate:
+def _line_search(problem: Problem, state: OptimizerState) -> Estimate:
     """Take the step, or the half, quarter, ... of it that does not increase the cost.
 
     The cost has the weights of the step (a generalised M step: Dempster, Laird and Rubin 1977).
     The likelihood of the Student-t distributions about the fitted points has another minimum: it
     would reject steps under weights from expected squares.
     """
-    at, weights = state.estimate, state.weights
+    at, weights, step = state.estimate, state.weights, state.solution.step
     before, share = problem.cost(at, weights), 1.0
     for _ in range(_MOST_HALVINGS):
-        further = _moved(state, share)
-        if problem.cost(further, weights) <= before:
-            return further
+        after = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
+        after.path[:, 2] = wrap(after.path[:, 2])
+        if problem.cost(after, weights) <= before:
+            return after
         share /= 2
     return at
-
-
-def _moved(state: OptimizerState, share: float) -> Estimate:
-    """Return the estimate after a share of the step."""
-    at, step = state.estimate, state.solution.step
-    further = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
-    further.path[:, 2] = wrap(further.path[:, 2])
-    return further

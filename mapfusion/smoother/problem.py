@@ -27,7 +27,7 @@ class PoseOrder:
 
     @cached_property
     def place(self) -> np.ndarray:
-        """Return the place of each pose in the order, shape (T,); the known first pose is first."""
+        """Place of each pose in the order, shape (T,); the known first pose is first."""
         place, later = np.zeros(self.n_poses, dtype=np.int64), self.frame > 0
         unknown = self.frame[later] - 1
         place[1:] = 1 + envelope_order(self.landmark[later], unknown, self.n_poses - 1)
@@ -35,7 +35,7 @@ class PoseOrder:
 
     @cached_property
     def envelope(self) -> Envelope:
-        """Return the envelope of the unknown poses' matrix, with three rows per pose."""
+        """Envelope of the unknown poses' matrix, with three rows per pose."""
         later = self.frame > 0
         chosen = (self.landmark[later], self.frame[later] - 1, self.place[1:] - 1)
         return Envelope(np.repeat(3 * first_entries(*chosen), 3))
@@ -52,19 +52,19 @@ class PoseOrder:
 
     @cached_property
     def _products(self) -> float:
-        """Return the number of multiplications of the poses' Cholesky factor."""
+        """Number of multiplications of the poses' Cholesky factor."""
         lengths = np.arange(len(self.envelope)) - self.envelope.first
         return float(np.sum(lengths.astype(np.float64) ** 2) / 2)
 
     @cached_property
     def _least_products(self) -> float:
-        """Return a lower bound of `_products` for any order.
+        """Lower bound of `_products` for any order.
 
-        All poses of a landmark are related. If the bound is too large no order has to be found.
+        All poses of a landmark are related. If the bound is too large no order has to be computed.
         """
         pairs = np.unique(self.landmark * np.int64(self.n_poses) + self.frame)
-        most = np.bincount(pairs // self.n_poses).max(initial=0)
-        return (3.0 * most) ** 3 / 6
+        most_poses = np.bincount(pairs // self.n_poses).max(initial=0)
+        return (3.0 * most_poses) ** 3 / 6
 
 
 @dataclass(frozen=True)
@@ -189,10 +189,10 @@ def order_observations(
     track = log.observations.track
     track = track if with_offsets and track is not None else np.full(len(landmark), NO_TRACK)
     row = taken[np.lexsort((track[taken], inverse[taken]))]
-    another = np.diff(inverse[row], prepend=-1) != 0
-    starts = np.append(np.flatnonzero(another), len(row))
-    another |= np.diff(track[row], prepend=NO_TRACK) != 0
-    first = np.flatnonzero(another)
+    begins = np.diff(inverse[row], prepend=-1) != 0
+    starts = np.append(np.flatnonzero(begins), len(row))
+    begins |= np.diff(track[row], prepend=NO_TRACK) != 0
+    first = np.flatnonzero(begins)
     has_offset, track_starts = track[row[first]] != NO_TRACK, np.append(first, len(row))
     n = 2 if log.planar else 3
     information = np.zeros((len(row), 3, 3))

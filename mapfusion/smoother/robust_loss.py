@@ -84,19 +84,16 @@ def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> floa
     n, dims = len(squares), np.asarray(n_dimensions, dtype=np.float64)
     beside = squares * (1 / dof)
     beside += 1
-    of_tails = dof * _sum_of_logs(beside)
+    # sum of logarithms by logarithms of products, which is faster; values are from 1 to 10^38
+    n_multiplied = n // _MULTIPLIED * _MULTIPLIED
+    products = np.multiply.reduce(beside[:n_multiplied].reshape(_MULTIPLIED, -1), axis=0)
+    sum_of_logs = float(np.sum(np.log(products)) + np.sum(np.log(beside[n_multiplied:])))
+    of_tails = dof * sum_of_logs
     np.reciprocal(beside, out=beside)
     of_weights = np.sum((dof + dims) * (1 - beside))
     of_normal = dof * (psi((dof + dims) / 2) - psi(dof / 2)) - dims
     share = 1 if of_normal.ndim else n  # equal terms if all dimensions are equal
     return float(of_tails - of_weights - share * np.sum(of_normal))
-
-
-def _sum_of_logs(values: Float) -> float:
-    """Sum the logarithms of values from 1 to 10^38, by logarithms of products, which is faster."""
-    n = len(values) // _MULTIPLIED * _MULTIPLIED
-    products = np.multiply.reduce(values[:n].reshape(_MULTIPLIED, -1), axis=0)
-    return float(np.sum(np.log(products)) + np.sum(np.log(values[n:])))
 
 
 def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
@@ -114,7 +111,7 @@ def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -
 
     low, high = float(np.log(LEAST_DOF)), float(np.log(MOST_DOF))
     if near < MOST_DOF:
-        found = _root_nearby(slope, float(np.log(near)), low, high)
+        found = _secant_root(slope, float(np.log(near)), low, high)
         if found is not None:
             return float(np.exp(found))
     if slope(high) <= 0:
@@ -125,12 +122,12 @@ def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -
     return float(np.exp(found.root))
 
 
-def _root_nearby(
+def _secant_root(
     slope: Callable[[float], float], start: float, low: float, high: float
 ) -> float | None:
-    """Where a slope rises through zero, by secants from `start`; None where they do not lead there.
+    """Find a root of an increasing slope by the secant method; None if it does not converge.
 
-    A secant's end is off by about the product of how far off the two places were that it is of.
+    The error of a secant step is about the product of the errors of its two points.
     """
     before, slope_before = start, slope(start)
     at, off_before = before + np.copysign(_ASIDE, -slope_before), 1.0
@@ -160,7 +157,7 @@ GAUSSIAN_TAILS = Tails(MOST_DOF, MOST_DOF)
 
 
 def information_shares(tails: Tails, n_dimensions: int) -> InformationShares:
-    """Return the shares of the weighted information that are expected (`information_share`)."""
+    """Return the expected shares of the weighted information (`information_share`)."""
     return InformationShares(*(float(information_share(dof, n_dimensions)) for dof in tails))
 
 

@@ -39,7 +39,8 @@ class ReducedEquations(NamedTuple):
     Attributes:
         own_m2: G of each track, shape (B, 3, 3).
         offset_gradient: gradient of each offset, shape (B, 3).
-        point_by_landmark: 1 - G S, the derivative of the track's point by the landmark, shape (B, 3, 3).
+        point_by_landmark: 1 - G S, derivative of the track's point by the landmark, shape
+            (B, 3, 3).
         point_gradient: shape (L, 3).
         landmark_m2: covariance of each landmark for a known path, shape (L, 3, 3); in planar data z
             is not observed and has variance 1.
@@ -58,11 +59,8 @@ def eliminate_offsets(obs: OrderedObservations, equations: PointEquations) -> Re
     Raises:
         LinAlgError: the information of a point is singular.
     """
-    S, has_offset, P = (
-        equations.track_block,
-        obs.has_offset,
-        equations.offset_information[obs.has_offset],
-    )
+    S, has_offset = equations.track_block, obs.has_offset
+    P = equations.offset_information[has_offset]
     own_m2, point_by_landmark = np.zeros(S.shape), np.tile(np.eye(3), (len(S), 1, 1))
     own_m2[has_offset] = inverses(S[has_offset] + P[:, None, None] * np.eye(3))
     point_by_landmark[has_offset] = P[:, None, None] * own_m2[has_offset]
@@ -86,18 +84,18 @@ def substitute_points(
         obs: the observations.
         equations: the equations of the points.
         reduced: the equations after the offsets are eliminated.
-        path_term: sum of coupling' dx for each track, where dx is the step of the path, shape (B, 3).
+        path_term: sum of coupling' dx over each track, with the step dx of the path, shape
+            (B, 3).
     """
     owner, n = obs.landmark_of_track, obs.n_landmarks
-    asked = np.concatenate(
+    right = np.concatenate(
         [reduced.point_gradient, times_vectors(reduced.point_by_landmark, path_term)]
     )
-    asked = sums_by(np.concatenate([np.arange(n), owner]), asked, n)
-    points = -times_vectors(reduced.landmark_m2, asked)
-    asked = (
-        reduced.offset_gradient + path_term + times_vectors(equations.track_block, points[owner])
-    )
-    return points, -times_vectors(reduced.own_m2, asked)
+    right = sums_by(np.concatenate([np.arange(n), owner]), right, n)
+    points = -times_vectors(reduced.landmark_m2, right)
+    right = reduced.offset_gradient + path_term
+    right = right + times_vectors(equations.track_block, points[owner])
+    return points, -times_vectors(reduced.own_m2, right)
 
 
 class PointCovariances(NamedTuple):
@@ -113,16 +111,13 @@ class PointCovariances(NamedTuple):
 
 
 def point_covariances(obs: OrderedObservations, reduced: ReducedEquations) -> PointCovariances:
-    """What is known of offsets and tracks' points, their landmark's own covariance in it."""
+    """Return the covariances of offsets and tracks' points for a known path."""
     of_landmark = reduced.landmark_m2[obs.landmark_of_track]
-    made = [
-        reduced.own_m2 + times_blocks(times_blocks(follows, of_landmark), follows)
-        for follows in (
-            np.eye(3) - reduced.point_by_landmark,
-            reduced.point_by_landmark,
-        )  # -db / dl, and that of the point
-    ]
-    return PointCovariances(*made)
+    # derivatives of the (negative) offset and of the point by the landmark
+    jacobians = np.eye(3) - reduced.point_by_landmark, reduced.point_by_landmark
+    return PointCovariances(
+        *(reduced.own_m2 + times_blocks(times_blocks(J, of_landmark), J) for J in jacobians)
+    )
 
 
 def subtract_point_terms(
@@ -150,6 +145,7 @@ def _subtract(
     offset: np.ndarray,
     S: Float,
 ) -> None:
+    """Subtract the terms of each pair of observations; see `subtract_point_terms`."""
     (starts, first_track, track_starts), (coupling, coupling_left) = rows, couplings
     by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
     for j in range(len(starts) - 1):
@@ -196,7 +192,7 @@ def _subtract_rows(
     S: Float,
 ) -> None:
     """Subtract X coupling' from the blocks of observation i with rows `begin` to `end`."""
-    x00, x01, x02 = X[0, 0], X[0, 1], X[0, 2]  # `S` may not be where `X` is, no compiler knows
+    x00, x01, x02 = X[0, 0], X[0, 1], X[0, 2]  # local, because X and S may overlap for the compiler
     x10, x11, x12 = X[1, 0], X[1, 1], X[1, 2]
     x20, x21, x22 = X[2, 0], X[2, 1], X[2, 2]
     row = 3 * place[i]
@@ -214,7 +210,7 @@ def _subtract_rows(
                 S[at0 + column + q] -= v0
                 S[at1 + column + q] -= v1
                 S[at2 + column + q] -= v2
-            if column >= row:  # rows are not in the order of places, and one pose may have several
+            if column >= row:  # one pose may have several observations, in any order
                 at = offset[column + q] + row
                 S[at] -= v0
                 S[at + 1] -= v1
@@ -224,12 +220,18 @@ def _subtract_rows(
 def reduced_couplings(
     obs: OrderedObservations, coupling: Float, reduced: ReducedEquations
 ) -> Float:
-    """(N, 3, 3) a pose's block with a landmark once offsets are eliminated, by observation."""
+    """Return the blocks of pose and landmark (N, 3, 3) after the offsets are eliminated."""
     return times_blocks(coupling, reduced.point_by_landmark[obs.track])
 
 
 def coupling_times_poses(obs: OrderedObservations, coupling: Float, path_step: Float) -> Float:
-    """(B, 3) sum of coupling' way over the observations of each track; `path_step` (T, 3) by frame."""
+    """Sum coupling' path_step over the observations of each track, shape (B, 3).
+
+    Args:
+        obs: the observations.
+        coupling: blocks of pose and landmark, shape (N, 3, 3).
+        path_step: step of each pose, shape (T, 3).
+    """
     moved, turned = path_step[obs.frame, :2, None], path_step[obs.frame, 2, None]
     parts = coupling[:, 0] * moved[:, 0] + coupling[:, 1] * moved[:, 1], coupling[:, 2] * turned
     both = np.stack(parts, axis=1).reshape(-1, 3)
@@ -248,14 +250,14 @@ def coupling_times_points(
         offset: step of each track's offset, shape (B, 3).
     """
     total = np.zeros((obs.order.n_poses, 3))
-    _add_along_points(
+    _add_coupling_times_points(
         obs.track_starts, obs.landmark_of_track, obs.frame, coupling, point, offset, total
     )
     return total
 
 
 @kernel
-def _add_along_points(
+def _add_coupling_times_points(
     track_starts: np.ndarray,
     owner: np.ndarray,
     frame: np.ndarray,
@@ -264,6 +266,7 @@ def _add_along_points(
     offset: Float,
     total: Float,
 ) -> None:
+    """Add coupling (point + offset) of each observation to the total of its frame."""
     for t in range(len(owner)):
         j = owner[t]
         x, y, z = point[j, 0] + offset[t, 0], point[j, 1] + offset[t, 1], point[j, 2] + offset[t, 2]

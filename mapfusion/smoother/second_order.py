@@ -24,7 +24,6 @@ from mapfusion.geometry.se2 import rotation, wrap
 from mapfusion.smoother.elimination import ReducedPoses
 from mapfusion.smoother.normal_equations import (
     Estimate,
-    NormalEquations,
     Weights,
     disturbance_jacobians,
     disturbances,
@@ -77,57 +76,45 @@ def second_order_errors(problem: Problem, state: OptimizerState) -> SecondOrder 
     if not state.solution.landmarks_first or len(state.estimate.path) < 2:
         return None
     problem = problem._replace(obs=state.obs)
-    covariance = _pose_covariances(state)
-    if np.max(_bound(state.estimate.path, covariance)) < _NEGLIGIBLE:
+    factor, place = state.solution.factor, state.obs.pose_place[1:] - 1
+    covariance = factor.envelope.between(factor.inverse, place, place)
+
+    # Bound: suppose that every error of the heading shortens its part of the path, and that no
+    # observation corrects it. The error b of a pose is then the sum of length * variance / 2. Its
+    # mean square is at most 3 b^2, as for the square of one normal variable.
+    estimate = state.estimate.path
+    length_m = np.linalg.norm(np.diff(estimate[:, :2], axis=0), axis=1)
+    error_m = np.cumsum(length_m * covariance[:, 2, 2]) / 2
+    xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
+    largest_m2 = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+    # the squared error over the smallest variance in any direction
+    if np.max(error_m**2 * largest_m2 / (xx * yy - xy**2)) < _NEGLIGIBLE:
         return None
     path, _ = _Drawing.of(problem, state).errors(np.random.default_rng(_SEED), _FIRST_DRAWS)
-    if np.max(_squared_sigmas(path, covariance)) < _NEGLIGIBLE:
+    squares = np.einsum("ski,skj->kij", path[:, 1:], path[:, 1:]) / len(path)
+    squared_sigmas = np.trace(np.linalg.solve(covariance, squares), axis1=1, axis2=2) / 3
+    if np.max(squared_sigmas) < _NEGLIGIBLE:
         return None
-    # Equations of the step before differ little, but a little of what stiff directions hold moves
-    # weak ones far: matrix and gradient are of the same estimate.
+    # Matrix and gradient have to be of the same estimate, because small differences in stiff
+    # directions cause large errors in weak ones.
     state = linearize_and_solve(problem, state.estimate, state.weights, state.tails)
     path, point_m = _Drawing.of(problem, state).errors(np.random.default_rng(_SEED), _DRAWS)
     share = 1 / np.sqrt(_DRAWS)
     return SecondOrder(share * path, share * point_m)
 
 
-def _pose_covariances(state: OptimizerState) -> Float:
-    """Return the linearised covariances (T - 1, 3, 3) of the poses after the first."""
-    factor, place = state.solution.factor, state.obs.pose_place[1:] - 1
-    return factor.envelope.between(factor.inverse, place, place)
-
-
-def _bound(path: Float, covariance: Float) -> Float:
-    """Return an upper bound of `_squared_sigmas`, shape (T - 1,).
-
-    If every error of the heading shortened its part of the way, and none of it were mended by
-    observations, a pose would be off by b, the sum of length * variance / 2. The mean square of
-    that is at most 3 b^2, as of the square of one normal variable.
-    """
-    length_m = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
-    off_m = np.cumsum(length_m * covariance[:, 2, 2]) / 2
-    xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
-    most_m2 = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
-    return off_m**2 * most_m2 / (xx * yy - xy**2)  # over the least variance in any direction
-
-
-def _squared_sigmas(path: Float, covariance: Float) -> Float:
-    """Return the mean square of errors (S, T, 3) in sigmas a coordinate, shape (T - 1,)."""
-    squares = np.einsum("ski,skj->kij", path[:, 1:], path[:, 1:]) / len(path)
-    return np.trace(np.linalg.solve(covariance, squares), axis1=1, axis2=2) / 3
-
-
 class _Drawing(NamedTuple):
-    """Quantities that all draws share.
+    """Random errors of an estimate; the attributes are common to all draws.
 
     Attributes:
-        problem: what is explained.
-        state: where steps ended.
-        at: the estimate there.
-        weights: that the matrix of the equations is of.
+        problem: the least-squares problem.
+        state: the smoothed state.
+        at: its estimate.
+        weights: weights of the matrix of the equations.
         poses: the equations of the poses.
-        to_robot: (N, 2, 2) from the map's frame to that of each observation's pose.
-        seen_m: (N, 3) where each observation should be, in the robot's frame.
+        to_robot: rotations from the map frame to the robot frame of each observation, shape
+            (N, 2, 2).
+        predicted_m: predicted observations in the robot frame, shape (N, 3).
     """
 
     problem: Problem
@@ -136,11 +123,11 @@ class _Drawing(NamedTuple):
     weights: Weights
     poses: ReducedPoses
     to_robot: Float
-    seen_m: Float
+    predicted_m: Float
 
     @classmethod
     def of(cls, problem: Problem, state: OptimizerState) -> "_Drawing":
-        """Return it for where steps ended."""
+        """Return the common quantities of a smoothed state."""
         obs, at = state.obs, state.estimate
         shares = information_shares(state.tails, obs.n_dimensions)
         weights = Weights(
@@ -148,21 +135,21 @@ class _Drawing(NamedTuple):
         )
         poses = ReducedPoses(obs, state.equations, eliminate_offsets(obs, state.equations.points))
         to_robot = np.swapaxes(rotation(at.path[obs.frame, 2]), 1, 2)
-        seen_m = _from_poses(state, at)
-        return cls(problem, state, at, weights, poses, to_robot, seen_m)
+        predicted_m = _predicted_observations(state, at)
+        return cls(problem, state, at, weights, poses, to_robot, predicted_m)
 
     def errors(self, rng: np.random.Generator, n: int) -> tuple[Float, Float]:
-        """Return the further errors q (n, T, 3) of the path and (n, L, 3) of the landmarks."""
+        """Return n draws of q: errors (n, T, 3) of the path and (n, L, 3) of the landmarks."""
         path = np.empty((n, *self.at.path.shape))
         point_m = np.empty((n, *self.at.point_m.shape))
         for k in range(n):
-            path[k], point_m[k] = self._further(self._drawn(rng))
+            path[k], point_m[k] = self._second_order(self._draw(rng))
         return path, point_m
 
-    def _drawn(self, rng: np.random.Generator) -> Estimate:
-        """Return an error d: of the path, and of the points that follow it.
+    def _draw(self, rng: np.random.Generator) -> Estimate:
+        """Draw an error d of the path and of the points, given the path.
 
-        The points' own errors if the path were known turn no lever and are left out.
+        The points' errors for a known path have no second-order effect and are left out.
         """
         factor, reduced = self.state.solution.factor, self.poses.reduced
         normal = rng.standard_normal(len(factor))
@@ -177,19 +164,11 @@ class _Drawing(NamedTuple):
             path_step, *substitute_points(self.state.obs, equations.points, still, path_term)
         )
 
-    def _further(self, error: Estimate) -> tuple[Float, Float]:
-        """Return q of path and landmarks for an error d."""
-        equations, obs, factor = self._equations(error), self.state.obs, self.state.solution.factor
-        reduced = eliminate_offsets(obs, equations.points)
-        gradient = ReducedPoses(obs, equations, reduced).gradient()
-        path_step = self.poses.solved(factor, -gradient)
-        path_term = coupling_times_poses(obs, equations.coupling, path_step)
-        return path_step, substitute_points(obs, equations.points, reduced, path_term)[0]
+    def _second_order(self, error: Estimate) -> tuple[Float, Float]:
+        """Return q of path and landmarks for an error d.
 
-    def _equations(self, error: Estimate) -> NormalEquations:
-        """Return the equations whose residuals are rho(d): the data are what leaves no others.
-
-        Offsets are residuals themselves and have none of second order.
+        The equations get data whose residuals are rho(d). Offsets are residuals themselves and have
+        no second-order part.
         """
         obs, at, path_step = self.state.obs, self.at, error.path
         moved = Estimate(*(old + off for old, off in zip(at, error, strict=True)))
@@ -206,18 +185,24 @@ class _Drawing(NamedTuple):
         off[:, :2] -= path_step[obs.frame, :2]
         off[:, :2] = np.einsum("nij,nj->ni", self.to_robot, off[:, :2])
         turned = path_step[obs.frame, 2]
-        off[:, 0] += turned * self.seen_m[:, 1]
-        off[:, 1] -= turned * self.seen_m[:, 0]
-        of_points = _from_poses(self.state, moved) - self.seen_m - off
-        explained = replace(obs, position_m=self.seen_m - of_points)
+        off[:, 0] += turned * self.predicted_m[:, 1]
+        off[:, 1] -= turned * self.predicted_m[:, 0]
+        of_points = _predicted_observations(self.state, moved) - self.predicted_m - off
+        explained = replace(obs, position_m=self.predicted_m - of_points)
         offset_prior, information = self.problem.offset_prior, self.problem.information
-        made = normal_equations(explained, at, self.weights, offset_prior, odometry, information)
-        made.points.offset_gradient[:] = 0
-        return made
+        equations = normal_equations(
+            explained, at, self.weights, offset_prior, odometry, information
+        )
+        equations.points.offset_gradient[:] = 0
+        reduced = eliminate_offsets(obs, equations.points)
+        gradient = ReducedPoses(obs, equations, reduced).gradient()
+        path_q = self.poses.solve(self.state.solution.factor, -gradient)
+        path_term = coupling_times_poses(obs, equations.coupling, path_q)
+        return path_q, substitute_points(obs, equations.points, reduced, path_term)[0]
 
 
-def _from_poses(state: OptimizerState, at: Estimate) -> Float:
-    """Return (N, 3) where the point of each observation is, in the robot's frame."""
+def _predicted_observations(state: OptimizerState, at: Estimate) -> Float:
+    """Return the point of each observation in the robot frame, shape (N, 3)."""
     obs = state.obs
     point, pose = at.point_m[obs.landmark] + at.offset_m[obs.track], at.path[obs.frame]
     offset = point[:, :2] - pose[:, :2]

@@ -1,8 +1,9 @@
 """Batch smoother: most probable path and landmarks of a whole log.
 
 The filter associates observations while its path is uncertain, and neighbouring corners of a
-textured wall are often closer than that. On the smoothed path two tracks i, j of one corner, with
-points p and covariances W from their own observations, have the squared distance
+textured wall are often closer than that uncertainty. So landmarks are split on the smoothed path.
+Two tracks i, j of the same corner, with points p and covariances W from their own observations,
+have the squared distance
 
     (p_i - p_j)' (W_i + W_j + 2 s^2)^-1 (p_i - p_j),
 
@@ -53,7 +54,7 @@ from mapfusion.smoother.second_order import SecondOrder, second_order_errors
 from mapfusion.viewing import viewing_of
 
 # Probability that two tracks of one corner are not split.
-_TOGETHER = 0.999
+_SAME_CORNER = 0.999
 _SINGULAR = 1e-12  # pivot over diagonal element that is a rounding error
 # Number of pairs of tracks that are compared at the same time, to limit the memory: a landmark may
 # have thousands of tracks.
@@ -78,12 +79,22 @@ def split_landmarks(
     made = landmark.copy()
     if not obs.has_offset.any():
         return made
-    point, covariance = _track_points(obs, path)
+    # points of the tracks from their own observations, and covariances
+    pose, R = path[obs.frame], np.zeros((len(obs), 3, 3))
+    R[:, :2, :2], R[:, 2, 2] = rotation(pose[:, 2]), 1.0
+    point = np.einsum("nij,nj->ni", R, obs.position_m)
+    point[:, :2] += pose[:, :2]
+    W = R @ obs.information @ np.swapaxes(R, 1, 2)
+    total, n = obs.sum_by_track(W), obs.n_dimensions
+    covariance = np.zeros_like(total)
+    covariance[:, :n, :n] = np.linalg.inv(total[:, :n, :n])
+    point = np.einsum("tij,tj->ti", covariance, obs.sum_by_track(np.einsum("nij,nj->ni", W, point)))
     covariance[obs.has_offset] += stray_m**2 * np.eye(3)
+
     first = np.searchsorted(obs.track_starts, obs.starts)
-    counts, n = np.diff(obs.track_starts), obs.n_dimensions
-    bound = chi_square_bound(_TOGETHER, n)
-    corner = _corners(first, counts, point[:, :n], covariance[:, :n, :n], bound)
+    counts, bound = np.diff(obs.track_starts), chi_square_bound(_SAME_CORNER, n)
+    pairs = _inconsistent_pairs(first, point[:, :n], covariance[:, :n, :n], bound)
+    corner = _corners(first, counts, pairs)
     names = set(landmark.tolist())
     for own in np.flatnonzero(np.maximum.reduceat(corner, first[:-1])):
         track = np.repeat(corner[first[own] : first[own + 1]], counts[first[own] : first[own + 1]])
@@ -97,34 +108,22 @@ def split_landmarks(
     return made
 
 
-def _track_points(obs: OrderedObservations, path: Float) -> tuple[Float, Float]:
-    """Return the points (B, 3) of the tracks from their own observations, and covariances."""
-    pose, R = path[obs.frame], np.zeros((len(obs), 3, 3))
-    R[:, :2, :2], R[:, 2, 2] = rotation(pose[:, 2]), 1.0
-    point = np.einsum("nij,nj->ni", R, obs.position_m)
-    point[:, :2] += pose[:, :2]
-    W = R @ obs.information @ np.swapaxes(R, 1, 2)
-    total, n = obs.sum_by_track(W), obs.n_dimensions
-    covariance = np.zeros_like(total)
-    covariance[:, :n, :n] = np.linalg.inv(total[:, :n, :n])
-    weighted = obs.sum_by_track(np.einsum("nij,nj->ni", W, point))
-    return np.einsum("tij,tj->ti", covariance, weighted), covariance
-
-
-def _corners(
-    first: np.ndarray, counts: np.ndarray, point: Float, covariance: Float, bound: float
-) -> np.ndarray:
+def _corners(first: np.ndarray, counts: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Return the corner of each track within its landmark, from 0, shape (B,).
 
-    Repeatedly the track with the most agreeing observations forms a corner with the tracks that
-    agree with it.
+    Repeatedly the track with the most consistent observations forms a corner with the tracks that
+    are consistent with it.
+
+    Args:
+        first: first track of each landmark, shape (L + 1,).
+        counts: number of observations of each track, shape (B,).
+        pairs: inconsistent tracks of one landmark, shape (2, A).
     """
-    corner, of = np.zeros(len(point), dtype=np.int64), _landmarks(first)
-    i, j = _apart(first, point, covariance, bound)
-    of_apart = of[i]
-    for own in np.unique(of_apart):
+    corner, (i, j) = np.zeros(len(counts), dtype=np.int64), pairs
+    of_pair = _landmark_of_tracks(first)[i]
+    for own in np.unique(of_pair):
         begin, size = first[own], first[own + 1] - first[own]
-        here = slice(*np.searchsorted(of_apart, [own, own + 1]))
+        here = slice(*np.searchsorted(of_pair, [own, own + 1]))
         near, one, other = np.ones((size, size), dtype=bool), i[here] - begin, j[here] - begin
         near[one, other] = near[other, one] = False
         left, k = np.ones(size, dtype=bool), 0
@@ -136,14 +135,16 @@ def _corners(
     return corner
 
 
-def _landmarks(first: np.ndarray) -> np.ndarray:
+def _landmark_of_tracks(first: np.ndarray) -> np.ndarray:
     """Return the landmark of each track (B,); `first` (L + 1,) are the landmarks' first tracks."""
     return np.repeat(np.arange(len(first) - 1), np.diff(first))
 
 
-def _apart(first: np.ndarray, point: Float, covariance: Float, bound: float) -> np.ndarray:
-    """Return pairs (2, A) of tracks of one landmark that disagree, ordered by the first track."""
-    begin = first[_landmarks(first)]
+def _inconsistent_pairs(
+    first: np.ndarray, point: Float, covariance: Float, bound: float
+) -> np.ndarray:
+    """Return inconsistent pairs (2, A) of tracks of one landmark, ordered by the first track."""
+    begin = first[_landmark_of_tracks(first)]
     before = np.arange(len(point)) - begin  # tracks of the same landmark before each
     part = np.cumsum(before) // _PAIRS_AT_ONCE
     S, off = (np.ascontiguousarray(values.T) for values in (covariance, point))
@@ -152,12 +153,12 @@ def _apart(first: np.ndarray, point: Float, covariance: Float, bound: float) -> 
         n = before[own]
         i = np.repeat(own, n)
         j = np.arange(len(i)) - np.repeat(np.cumsum(n) - n - begin[own], n)
-        away = _squares(S[..., i] + S[..., j], off[..., i] - off[..., j]) > bound
-        found.append(np.stack([i[away], j[away]]))
+        apart = _squared_distances(S[..., i] + S[..., j], off[..., i] - off[..., j]) > bound
+        found.append(np.stack([i[apart], j[apart]]))
     return np.concatenate(found, axis=1)
 
 
-def _squares(S: Float, off: Float) -> Float:
+def _squared_distances(S: Float, off: Float) -> Float:
     """Return squared Mahalanobis distances (P,) of `off` (n, P); 0 for singular S (n, n, P).
 
     Uses S = L D L' and overwrites both arguments.
@@ -175,15 +176,15 @@ def _squares(S: Float, off: Float) -> Float:
 
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity). With a
-# poor initial path most observations look gross and would lose their weights. The second value is
-# the tolerance of this round, in squared sigmas a coordinate.
-_THOUGHT_WORSE, _CLOSE = 4.0, 3e-2
-# If the odometry's variances exceed the stated ones by this factor, good observations look gross
-# until the level is known. The weights are then computed again with the level.
-_FAR_WORSE = 4.0
+# poor initial path most observations look like outliers and would lose their weights.
+_INFLATION = 4.0
+_FIRST_TOLERANCE = 3e-2  # tolerance of this round, in squared sigmas a coordinate
+# If the odometry's variances exceed the stated ones by this factor, good observations look like
+# outliers until the noise scale is known. The weights are then computed again with the scale.
+_LARGE_SCALE = 4.0
 # Standard deviations of an unknown motion between two frames.
-_UNTOLD_M, _UNTOLD_RAD = 10.0, 1.0
-_LEAST_SEEN = 3  # two observations determine a pose; one is redundant
+_UNKNOWN_M, _UNKNOWN_RAD = 10.0, 1.0
+_LEAST_OBSERVATIONS = 3  # two observations determine a pose; one is redundant
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ class SmootherParameters:
     """Settings of the smoother.
 
     Attributes:
-        motion: stated noise of the odometry; the smoother estimates its level.
+        motion: stated noise of the odometry; the smoother estimates its scale.
         stray_m: standard deviation, along each axis, of the offset between a track's point and its
             landmark; 0: no offset.
         min_count: number of observations that a landmark needs.
@@ -224,12 +225,12 @@ class SmootherParameters:
         """Return the inverse variances of the increments after the first, shape (T - 1, 3)."""
         if self.odometry_covariance is None:
             return odometry_information(log.odometry, self.motion)
-        blind = np.diff(log.frame_starts()) < _LEAST_SEEN
+        blind = np.diff(log.frame_starts()) < _LEAST_OBSERVATIONS
         needed = blind[:-1] | blind[1:]
-        told = self.odometry_covariance[1 : len(log)]
-        sigma = np.array([self.motion.with_floor(own) for own in told]).reshape(-1, 3)
-        sigma[~needed] = [_UNTOLD_M, _UNTOLD_M, _UNTOLD_RAD]
-        own = np.isnan(told).any(axis=(1, 2))
+        stated = self.odometry_covariance[1 : len(log)]
+        sigma = np.array([self.motion.with_floor(own) for own in stated]).reshape(-1, 3)
+        sigma[~needed] = [_UNKNOWN_M, _UNKNOWN_M, _UNKNOWN_RAD]
+        own = np.isnan(stated).any(axis=(1, 2))
         information = bounded_information(sigma)
         information[own] = odometry_information(log.odometry, self.motion)[own]
         return information
@@ -242,7 +243,7 @@ class Smoothed:
     Attributes:
         landmark: landmark of each observation of the log, shape (N,); negative for none.
         estimate: path, landmarks and tracks' offsets.
-        obs: the observations, with information scaled by the level.
+        obs: the observations, with information divided by `observation_scale`.
         weights: weights of observations and offsets.
         tails: tails of their Student-t distributions.
         observation_scale: estimated factor on the stated covariances of observations on tracks.
@@ -281,7 +282,7 @@ class Smoothed:
             problem: the problem with the stated odometry.
             state: the final state.
             landmark: landmark of each observation of the log, shape (N,).
-            scales: the estimated levels.
+            scales: the estimated noise scales.
             steps_before: number of steps in earlier rounds.
         """
         common = shared_errors(state.obs, state.equations, state.solution)
@@ -290,8 +291,8 @@ class Smoothed:
         if further is not None:
             rows = further.point_m.reshape(len(further.point_m), -1)
             common = StackedErrors(common, KnownErrors(rows))
-        of_levels = scales.observation, scales.odometry
-        found = (state.estimate, state.obs, state.weights, state.tails, *of_levels)
+        of_noise = scales.observation, scales.odometry
+        found = (state.estimate, state.obs, state.weights, state.tails, *of_noise)
         n_steps, own_m2 = steps_before + state.n_steps, state.solution.own_m2
         return cls(landmark, *found, n_steps, own_m2, common, further)
 
@@ -314,7 +315,7 @@ def smooth(
 ) -> Smoothed:
     """Compute the most probable path and landmarks.
 
-    Landmarks whose tracks are of several corners are split (`one_corner.py`).
+    Landmarks with tracks of several corners are split (`split_landmarks`).
 
     Args:
         log: the log.
@@ -332,7 +333,7 @@ def smooth(
     information, path = parameters.odometry_information(log), between(path[0], path)
     known = _problem(log, landmark, parameters, information)
     require_memory(known.obs, max_memory_gb)
-    start, n_steps = _without_gross(known, path)
+    start, n_steps = _robust_start(known, path)
     path = start[0].path
     parts = split_landmarks(known.obs, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
@@ -340,25 +341,27 @@ def smooth(
         start = update_points_and_weights(known, _start(known, path))
     if parameters.has_own_odometry:
         state, scales = optimize_with_noise(known, *start)
-        if scales.odometry.max() > _FAR_WORSE and state.tails.observation < MOST_DOF:
+        if scales.odometry.max() > _LARGE_SCALE and state.tails.observation < MOST_DOF:
             path, n_steps = state.estimate.path, n_steps + state.n_steps
             del state  # frees the memory of its factors
             under = scaled_information(information, scales.odometry)
-            start, n_again = _without_gross(known._replace(information=under), path)
+            start, n_again = _robust_start(known._replace(information=under), path)
             n_steps += n_again
             state, scales = optimize_with_noise(known, *start, scales.odometry)
-    else:  # visual odometry has no level of its own
+    else:  # the noise of visual odometry is not estimated
         at, weights, tails = start
         state, scales = optimize(known, at, weights=weights, tails=tails), UNIT_SCALES
     return Smoothed.of(known, state, parts, scales, n_steps)
 
 
-def _without_gross(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:
-    """Return the start of the next round after a round with larger errors, and its steps."""
+def _robust_start(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:
+    """Return the result of a round with inflated covariances, and its number of steps."""
     obs = problem.obs
-    worse = replace(obs, information=obs.information / _THOUGHT_WORSE**2)
-    blurred = problem._replace(obs=worse)
-    state = take_final_step(blurred, optimize(blurred, _start(problem, path), _CLOSE))
+    inflated = replace(obs, information=obs.information / _INFLATION**2)
+    first_problem = problem._replace(obs=inflated)
+    state = take_final_step(
+        first_problem, optimize(first_problem, _start(problem, path), _FIRST_TOLERANCE)
+    )
     return (state.estimate, state.weights, state.tails), state.n_steps
 
 
@@ -388,16 +391,30 @@ def smoothed_map(
         log: the smoothed log.
         smoothed: the result of the smoother, with landmarks numbered by rows of the log.
         rank: number of shared variables of the joint covariance.
-        attitude: attitude that the observations were levelled with; None for a level body.
+        attitude: attitude that the observations were corrected with; None for a level body.
     """
     obs, landmark = smoothed.obs, smoothed.landmark
     if attitude is not None and obs.n_dimensions > 2:
-        smoothed = _with_attitude(smoothed, attitude)
+        # add the errors of the attitude to the landmarks' shared errors
+        estimate, common = smoothed.estimate, smoothed.common
+        heights = shared_heights(attitude, estimate.path, obs.frame, obs.landmark, estimate.point_m)
+        by_attitude = np.zeros((*heights.shape, 3))
+        by_attitude[..., 2] = heights
+        by_path = common.spread(np.eye(len(common))).T
+        both = np.vstack([by_path, by_attitude.reshape(len(by_attitude), -1)])
+        smoothed = replace(smoothed, common=KnownErrors(both))
     point, joint = condensed_points(smoothed, rank)
     source = landmark[obs.row[obs.starts[:-1]]].astype(np.int64)
-    look = log.observations[source]
+    source_observation = log.observations[source]
     count = np.diff(obs.starts).astype(np.int32)
-    about = (count, source, look.descriptor, look.label, log.planar, log.robot)
+    about = (
+        count,
+        source,
+        source_observation.descriptor,
+        source_observation.label,
+        log.planar,
+        log.robot,
+    )
     viewing = viewing_of(log, landmark, smoothed.estimate.path, source)
     return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
 
@@ -411,14 +428,3 @@ def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, Joint
         point[:, 2] = 0.0
         joint.own_m2[:, 2, :] = joint.own_m2[:, :, 2] = joint.common_m[:, :, 2] = 0.0
     return point, joint
-
-
-def _with_attitude(smoothed: Smoothed, attitude: Attitude) -> Smoothed:
-    """Add the errors of the attitude to the landmarks' shared errors."""
-    obs, estimate = smoothed.obs, smoothed.estimate
-    lifted = shared_heights(attitude, estimate.path, obs.frame, obs.landmark, estimate.point_m)
-    moved = np.zeros((*lifted.shape, 3))
-    moved[..., 2] = lifted
-    by_path = smoothed.common.spread(np.eye(len(smoothed.common))).T
-    both = np.vstack([by_path, moved.reshape(len(moved), -1)])
-    return replace(smoothed, common=KnownErrors(both))

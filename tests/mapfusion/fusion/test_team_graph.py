@@ -221,7 +221,7 @@ def test_the_order_changes_nothing_but_the_frame(kind: str, parameters: TeamPara
         relations.log10_false_alarms[order],
     )
     one, two = team_graph(relations, parameters), team_graph(other, parameters)
-    np.testing.assert_array_equal(one.edge_status[order], two.place)
+    np.testing.assert_array_equal(one.edge_status[order], two.edge_status)
     together = one.component[:, None] == one.component
     np.testing.assert_array_equal(together, (two.component[:, None] == two.component)[new][:, new])
     i, j = np.nonzero(together)

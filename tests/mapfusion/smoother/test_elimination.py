@@ -147,7 +147,7 @@ def test_equals_the_dense_twin(eliminate: Eliminate, planar: bool, tracks: bool)
         solution = eliminate(obs, equations)
         at = Estimate(*(old + new for old, new in zip(at, solution.step, strict=True)))
     np.testing.assert_allclose(dense_unknowns(obs, at), unknowns, atol=1e-6)
-    assert solution.moved < 1e-12
+    assert solution.squared_step < 1e-12
     joint = dense_covariance(common_part(obs, equations, solution), solution.own_m2, d)
     own = covariance[n:, n:][: len(joint), : len(joint)]
     np.testing.assert_allclose(joint, own, rtol=1e-3, atol=1e-4 * joint.max())

@@ -233,13 +233,13 @@ def test_what_is_told_of_levels_is_the_curvature_of_their_likelihood() -> None:
     obs = MotionPosterior(np.zeros((29, 3)), np.zeros((29, 3)), np.zeros((0, 0)), np.zeros(0))
     found = noise_statistics(obs, odometry, 1 / true, NOISE)
     np.testing.assert_allclose(found.information, expected, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose([found.known[0], found.known[1:].sum()], [58, 29])
+    np.testing.assert_allclose([found.determined[0], found.determined[1:].sum()], [58, 29])
 
 
 def test_a_round_multiplies_the_squares_of_levels_by_what_was_found_over_what_is_told() -> None:
     """The lateral level follows the one along the way; a level that nothing tells stays."""
-    of_all = NoiseStatistics(np.array([20.0, 2.5, 9.0]), np.array([10.0, 10.0, 1.0]), np.eye(3))
-    made = update_noise(NOISE, of_all)
+    statistics = NoiseStatistics(np.array([20.0, 2.5, 9.0]), np.array([10.0, 10.0, 1.0]), np.eye(3))
+    made = update_noise(NOISE, statistics)
     found = [getattr(made, name) for name in (*NOISE_PARAMETERS, "lateral_m_per_sqrt_m")]
     way = NOISE.translation_m_per_sqrt_m * np.sqrt(2)
     expected = [way, NOISE.rotation_rad_per_sqrt_m / 2, NOISE.rotation_rad_per_sqrt_rad, way]
@@ -249,5 +249,5 @@ def test_a_round_multiplies_the_squares_of_levels_by_what_was_found_over_what_is
 def test_two_logs_tell_what_both_tell() -> None:
     each = [NoiseStatistics(np.full(3, n), np.full(3, 2 * n), n * np.eye(3)) for n in (3.0, 5.0)]
     both = sum_statistics(each)
-    assert (both.found.tolist(), both.known.tolist()) == ([8.0] * 3, [16.0] * 3)
+    assert (both.squares.tolist(), both.determined.tolist()) == ([8.0] * 3, [16.0] * 3)
     assert relative_errors(both) == pytest.approx(np.full(3, 1 / 3))  # and 1 was known before

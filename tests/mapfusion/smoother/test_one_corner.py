@@ -165,5 +165,5 @@ def test_pairs_of_tracks_that_are_apart_are_those_of_looking_at_each(
                 known = np.linalg.matrix_rank(S) == 3
                 apart += [(i, j)] if known and off @ np.linalg.solve(S, off) > 0.5 else []
     assert 20 < len(apart) < 180
-    found = smooth._apart(first, point, covariance, 0.5)
+    found = smooth._inconsistent_pairs(first, point, covariance, 0.5)
     np.testing.assert_array_equal(found.T, apart)

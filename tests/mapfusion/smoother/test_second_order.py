@@ -86,8 +86,8 @@ def test_is_off_by_what_fits_the_same_data() -> None:
     problem = Problem(found.obs, driven.log.odometry, information, 0.0)
     end = linearize_and_solve(problem, found.estimate, found.weights, found.tails)
     drawing, at, small = second_order._Drawing.of(problem, end), end.estimate, 1e-3
-    error = drawing._drawn(np.random.default_rng(0))
-    path, point_m = drawing._further(error)
+    error = drawing._draw(np.random.default_rng(0))
+    path, point_m = drawing._second_order(error)
 
     here, ahead, behind = (_data(found, _moved(at, error, k)) for k in (0, small, -small))
     odometry, position_m = (
@@ -137,7 +137,7 @@ def test_a_path_that_is_too_short_is_in_the_covariances() -> None:
 def test_is_that_of_the_estimate_whatever_equations_led_to_it() -> None:
     """The last step goes on from the equations whose factor is known; the path may bend by it."""
     problem, end = solved_chain()
-    error = second_order._Drawing.of(problem, end)._drawn(np.random.default_rng(0))
+    error = second_order._Drawing.of(problem, end)._draw(np.random.default_rng(0))
     at = _moved(end.estimate, error, 0.1)
     fresh = linearize_and_solve(problem, at, end.weights, end.tails)
     found = second_order_errors(problem, end._replace(estimate=at))
