@@ -15,8 +15,8 @@ from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.robot_log import RobotLog
 from mapfusion.smoother.elimination import (
     Solution,
-    _landmarks_first,
-    _poses_first,
+    _eliminate_landmarks_first,
+    _eliminate_poses_first,
     shared_errors,
     solve_points,
 )
@@ -133,7 +133,7 @@ def solved_densely(planar: bool, tracks: bool) -> Problem:
     return Problem(log, obs, weights, twin.x, np.linalg.inv(twin.jac.T @ twin.jac))
 
 
-@pytest.mark.parametrize("eliminate", [_landmarks_first, _poses_first])
+@pytest.mark.parametrize("eliminate", [_eliminate_landmarks_first, _eliminate_poses_first])
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("tracks", [False, True])
 def test_equals_the_dense_twin(eliminate: Eliminate, planar: bool, tracks: bool) -> None:
@@ -170,7 +170,7 @@ def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks
     path = dead_reckoned(log)
     at = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
     equations = normal_equations(obs, at, weights, STRAY_M**-2, log.odometry, information)
-    solution = _landmarks_first(obs, equations)
+    solution = _eliminate_landmarks_first(obs, equations)
     errors = shared_errors(obs, equations, solution)
     Y = common_part(obs, equations, solution)
     n = 3 * (len(log) - 1)
