@@ -49,7 +49,7 @@ _NAMES_OF = {
     "fusion.fusers": ("make_fuser",),
     "fusion.merge": ("merge_maps",),
     "fusion.team_graph": (
-        "Place",
+        "EdgeStatus",
         "TeamParameters",
         "Unconfirmed",
     ),
@@ -69,7 +69,7 @@ _NAMES_OF = {
         "read_log",
         "write_log",
     ),
-    "smoother.joint_smoothing": ("Recording",),
+    "smoother.joint_smoothing": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),
     "verification.regions": ("EvidenceParameters",),
     "verification.verdict": ("Judge",),

@@ -22,7 +22,7 @@ from mapfusion.fusion.fused_map import Fusion as Fusion
 from mapfusion.fusion.fused_map import MergeParameters as MergeParameters
 from mapfusion.fusion.fusers import make_fuser as make_fuser
 from mapfusion.fusion.merge import merge as _merge
-from mapfusion.fusion.team_graph import Place as Place
+from mapfusion.fusion.team_graph import EdgeStatus as EdgeStatus
 from mapfusion.fusion.team_graph import TeamParameters as TeamParameters
 from mapfusion.fusion.team_graph import Unconfirmed as Unconfirmed
 from mapfusion.landmark_map import LandmarkMap as LandmarkMap
@@ -35,7 +35,7 @@ from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log
 from mapfusion.robot_log import write_log as write_log
-from mapfusion.smoother.joint_smoothing import Recording as Recording
+from mapfusion.smoother.joint_smoothing import AssociatedLog as AssociatedLog
 from mapfusion.verification.false_alarms import Acceptance as Acceptance
 from mapfusion.verification.regions import EvidenceParameters as EvidenceParameters
 from mapfusion.verification.verdict import Judge as Judge

@@ -23,7 +23,7 @@ from mapfusion.files import named_columns, point_columns
 from mapfusion.fusion.aligned_landmarks import ABSENT, AlignedLandmarks
 from mapfusion.fusion.fused_map import FusedMap, Fusion, MergeParameters
 from mapfusion.fusion.fusers import Fuser
-from mapfusion.fusion.kalman import Kalman, KalmanDrift, kalman_fused, landmarks_in_turn
+from mapfusion.fusion.kalman import Kalman, KalmanDrift, fuse_landmarks_sequentially, kalman_update
 from mapfusion.fusion.merge import connect, merge
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, chi_square_bound
@@ -188,7 +188,7 @@ def team_edge_rows(team: FusedTeam) -> pd.DataFrame:
         return pd.DataFrame()
     pairs = list(dict.fromkeys((each.a.name, each.b.name) for each in team.met))
     rows = pd.DataFrame(pairs, columns=["robot_a", "robot_b"])
-    return rows.assign(place=[str(place) for place in team.fusion.place])
+    return rows.assign(place=[str(place) for place in team.fusion.edge_status])
 
 
 def map_fit_rows(team: FusedTeam) -> pd.DataFrame:
@@ -324,7 +324,7 @@ def _joined(met: MetMaps, settings: MergeSettings) -> dict[str, np.ndarray]:
             correspondences=Correspondences(each, each, pairs.distance),
         )
         both = connect([fused, map_b[pairs.index_b]], [alone], settings.parameters.team)
-        fused = landmarks_in_turn(
-            both.components[0], settings.parameters, kalman_fused, use_drift=True
+        fused = fuse_landmarks_sequentially(
+            both.components[0], settings.parameters, kalman_update, use_drift=True
         )
     return {"landmark_a": pairs.index_a, "landmark_b": pairs.index_b} | _points(fused)

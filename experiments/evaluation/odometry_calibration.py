@@ -16,7 +16,7 @@ from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import TRUTH_FILES, RobotLog, read_log, write_log
-from mapfusion.smoother.noise_estimation import LEVELS
+from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
 from mapfusion.smoother.odometry_calibration import Calibration, calibrate
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.tables import NO_LABEL
@@ -59,7 +59,7 @@ def filter_settings(calibration: Calibration) -> dict[str, Any]:
     """The scenario's section for corrected logs: `slam.filter.motion`."""
     motion = {name: float(f"{value:.3g}") for name, value in asdict(calibration.motion).items()}
     wanted = {
-        *LEVELS,
+        *NOISE_PARAMETERS,
         "scale_error",
         "track_error",
         "lateral_m_per_sqrt_m",

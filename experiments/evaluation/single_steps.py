@@ -22,7 +22,7 @@ from mapfusion.files import Write, write_together
 from mapfusion.fusion.fused_map import AlignedPair, Fusion, name_order
 from mapfusion.fusion.fusers import make_fuser
 from mapfusion.fusion.merge import merge as merge_maps
-from mapfusion.fusion.team_graph import Place
+from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.registration import Registration
 from mapfusion.robot_log import read_log, read_odometry_covariance, read_true_poses
@@ -112,9 +112,9 @@ def _save(path: Path, writes: Mapping[Path, Write]) -> None:
 
 # Why an alignment that is accepted by itself is not used.
 _OF_THE_TEAM = {
-    Place.UNCONFIRMED: "no other alignment confirms this one",
-    Place.CONTRADICTED: "other alignments contradict this one",
-    Place.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
+    EdgeStatus.UNCONFIRMED: "no other alignment confirms this one",
+    EdgeStatus.CONTRADICTED: "other alignments contradict this one",
+    EdgeStatus.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
 }
 
 
@@ -122,9 +122,9 @@ class Merged(NamedTuple):
     """Maps of the user's own made one.
 
     Attributes:
-        fusion: what became of them.
-        pairs: the alignments of each two of them, in the order of `fusion.place`; of ambiguous ones
-            the alternatives, too.
+        fusion: result of the merge.
+        pairs: alignments of every pair of maps in the order of `fusion.edge_status`, including the
+            alternatives of ambiguous ones.
     """
 
     fusion: Fusion
@@ -138,9 +138,9 @@ class Merged(NamedTuple):
     def reasons(self) -> dict[tuple[int, int], str]:
         """Return why each two maps were not merged by their own alignment; empty if they were."""
         found: dict[tuple[int, int], str] = {}
-        for pair, place in zip(self.pairs, self.fusion.place, strict=True):
-            reason = pair.alignment.reason or _OF_THE_TEAM.get(place, "")
-            if place in (Place.CONFIRMED, Place.BRIDGE):
+        for pair, status in zip(self.pairs, self.fusion.edge_status, strict=True):
+            reason = pair.alignment.reason or _OF_THE_TEAM.get(status, "")
+            if status in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
                 found[pair.a, pair.b] = ""
             else:
                 found.setdefault((pair.a, pair.b), reason)

@@ -16,7 +16,7 @@ from experiments.evaluation import criteria
 from experiments.evaluation.fused_landmarks import FusedTeam, team_edge_rows
 from experiments.evaluation.path_errors import SMOOTHED, SOURCES, ate_m, seven_statistics
 from mapfusion.files import POSE_FIELDS
-from mapfusion.fusion.team_graph import Place
+from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 
@@ -144,7 +144,7 @@ def _placed_errors(team: FusedTeam, pairs: np.ndarray) -> Float:
 
 def believed(pairs: pd.DataFrame) -> pd.Series:
     """Bool per row of `team_pairs`: whether the team's map was placed by this alignment."""
-    return pairs["place"].isin([Place.CONFIRMED, Place.BRIDGE])
+    return pairs["place"].isin([EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE])
 
 
 def edge_precision(pairs: pd.DataFrame) -> float:

@@ -7,7 +7,7 @@ import pandas as pd
 from experiments.evaluation.criteria import has_common_ground, merged_robots, right_refined
 from experiments.evaluation.team_errors import believed
 from experiments.reports.formatting import listed, two_digits
-from mapfusion.fusion.team_graph import Place
+from mapfusion.fusion.team_graph import EdgeStatus
 
 
 def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -> Iterator[str]:
@@ -39,7 +39,7 @@ def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -
 def edge_lines(edges: pd.DataFrame) -> Iterator[str]:
     """Describe by `team_edges` how alignments agree; a single alignment gives no lines."""
     if len(edges) > 1:
-        told = edges[edges["place"] != Place.REFUSED]
+        told = edges[edges["place"] != EdgeStatus.REFUSED]
         for place, rows in told.groupby("place", sort=True):
             names = (rows["robot_a"] + "-" + rows["robot_b"]).tolist()
             yield f"alignments {place}: {listed(names)}"

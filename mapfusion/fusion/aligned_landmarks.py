@@ -1,4 +1,4 @@
-"""Landmarks of several maps in one frame, and which of them are the same point."""
+"""Landmarks of several maps in a common frame, and their association."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from mapfusion.tables import DESCRIPTOR_LENGTH, NO_LABEL
 ABSENT = -1
 
 
-# Two landmarks made one: positions (N, D) and covariances (N, D, D) of the one and of the other.
+# Fuses pairs of landmarks: positions (N, D) and covariances (N, D, D) of both landmarks.
 FusePairs = Callable[[Float, Float, Float, Float], tuple[Float, Float]]
 
 
@@ -28,13 +28,15 @@ class AlignedLandmarks:
     """N landmarks in the frame of the fused map.
 
     Attributes:
-        position_m: (N, 3).
-        covariance_m2: (N, 3, 3).
-        drift_m2: (N,) variance per axis of the drift that covariance_m2 leaves out.
-        count: (N,) observations.
-        descriptor: (N, 64), NaN where absent.
-        label: (N,), NO_LABEL where absent.
-        parents: (N, M) row of each map, ABSENT where it has no part.
+        position_m: positions, shape (N, 3).
+        covariance_m2: covariances, shape (N, 3, 3).
+        drift_m2: variance per axis of the map drift that is not part of `covariance_m2`, shape
+            (N,).
+        count: numbers of observations, shape (N,).
+        descriptor: descriptors, shape (N, 64); NaN if absent.
+        label: labels, shape (N,); NO_LABEL if absent.
+        parents: row of the landmark in each map, shape (N, M); ABSENT if the map lacks the
+            landmark.
     """
 
     position_m: Float
@@ -55,10 +57,16 @@ class AlignedLandmarks:
         drift_sigma_m: float,
         use_drift: bool,
     ) -> "AlignedLandmarks":
-        """Map k of `maps` in the fused frame.
+        """Transform map k of `maps` into the fused frame.
 
-        The covariance of the motion (3, 3) is added to the landmarks' unless it is None, the map's
-        share in s_drift if `use_drift` is set.
+        Args:
+            maps: all maps.
+            k: index of the map.
+            T_first_map: pose of the map in the fused frame, shape (3,).
+            covariance_T: covariance of this pose, shape (3, 3), which is added to the landmark
+                covariances; None: not added.
+            drift_sigma_m: standard deviation of the map's drift per axis.
+            use_drift: true if the drift is added to the landmark covariances.
         """
         source = maps[k]
         n = len(source)
@@ -67,7 +75,7 @@ class AlignedLandmarks:
             jacobian = motion_jacobian(T_first_map, source.position_m)
             covariance[:, :2, :2] += jacobian @ covariance_T @ np.swapaxes(jacobian, 1, 2)
         drift_m2 = np.full(n, drift_sigma_m**2)
-        if use_drift:  # heights do not drift
+        if use_drift:  # drift affects x and y only
             covariance[:, [0, 1], [0, 1]] += drift_m2[:, None]
             drift_m2 = np.zeros(n)
         parents = np.full((n, len(maps)), ABSENT, dtype=np.int64)
@@ -87,7 +95,7 @@ class AlignedLandmarks:
     def __getitem__(self, rows: np.ndarray) -> "AlignedLandmarks":
         return with_rows(self, rows)
 
-    def joined(
+    def fuse_with(
         self,
         other: "AlignedLandmarks",
         rows: np.ndarray,
@@ -95,9 +103,17 @@ class AlignedLandmarks:
         dimensions: int,
         fuse_pairs: FusePairs,
     ) -> "AlignedLandmarks":
-        """These, with `rows` fused with the other's `others`, and the other's rest at the end."""
+        """Fuse landmarks with those of another map and append the remaining ones.
+
+        Args:
+            other: landmarks of the other map.
+            rows: rows of these landmarks that have a partner, shape (n,).
+            others: rows of the partners in `other`, shape (n,).
+            dimensions: 2 or 3, number of coordinates that are fused.
+            fuse_pairs: function that fuses two landmarks.
+        """
         a, b = self[rows], other[others]
-        seen_more = b.count > a.count
+        b_observed_more = b.count > a.count
         position, covariance = a.position_m.copy(), a.covariance_m2.copy()
         position[:, :dimensions], covariance[:, :dimensions, :dimensions] = fuse_pairs(
             a.position_m[:, :dimensions],
@@ -105,25 +121,25 @@ class AlignedLandmarks:
             b.position_m[:, :dimensions],
             b.covariance_m2[:, :dimensions, :dimensions],
         )
-        new = AlignedLandmarks(
+        fused = AlignedLandmarks(
             position,
             covariance,
             np.minimum(a.drift_m2, b.drift_m2),
             a.count + b.count,
-            np.where(seen_more[:, None] | np.isnan(a.descriptor), b.descriptor, a.descriptor),
+            np.where(b_observed_more[:, None] | np.isnan(a.descriptor), b.descriptor, a.descriptor),
             np.where(a.label == NO_LABEL, b.label, a.label),
             np.maximum(a.parents, b.parents),
         )
-        rest = other[np.setdiff1d(np.arange(len(other)), others)]
+        unmatched = other[np.setdiff1d(np.arange(len(other)), others)]
         columns = []
         for name in AlignedLandmarks.__dataclass_fields__:
             values = getattr(self, name).copy()
-            values[rows] = getattr(new, name)
-            columns.append(np.concatenate([values, getattr(rest, name)]))
+            values[rows] = getattr(fused, name)
+            columns.append(np.concatenate([values, getattr(unmatched, name)]))
         return AlignedLandmarks(*columns)
 
     def landmark_map(self, planar: bool, name: str) -> LandmarkMap:
-        """The same as a map; its landmarks come from no single observation."""
+        """Return the landmarks as a map without source observations."""
         return LandmarkMap(
             self.position_m,
             self.covariance_m2,
@@ -137,15 +153,16 @@ class AlignedLandmarks:
 
 
 @dataclass(frozen=True)
-class SamePoint:
-    """The test by which two landmarks in one frame can be one point of the world.
+class AssociationTest:
+    """Test if two landmarks in a common frame can be the same point.
 
     Attributes:
-        max_descriptor_distance: where not both carry labels; these decide by themselves.
-        gate_probability: of keeping landmarks of one point (chi-square, 2 degrees of freedom,
-            drift included); not for labels.
-        height: which landmarks can have one height.
-        planar: heights carry no information.
+        max_descriptor_distance: largest descriptor distance; not used if both landmarks have
+            labels.
+        gate_probability: probability that landmarks of the same point pass the gate (chi-square, 2
+            degrees of freedom, drift included); not used for labels.
+        height: test of the heights.
+        planar: true if heights carry no information.
     """
 
     max_descriptor_distance: float
@@ -156,51 +173,45 @@ class SamePoint:
     def candidates(
         self, a: AlignedLandmarks, b: AlignedLandmarks
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows of a and of b that pass, and their descriptors' distance (0 by label).
+        """Return rows of a and b that pass the test, and their descriptor distances.
 
-        A known identity needs no gate: where the maps are distorted, two landmarks of one label
-        stay one point, and leaving them apart would leave a duplicate for certain.
+        Landmarks with equal labels pass without a gate, and their distance is 0: in distorted maps
+        they may be far apart, and a duplicate would remain.
         """
-        known_i, known_j = _of_one_label(a.label, b.label)
-        i, j = self._neighbours(a, b)
-        inside = self._inside(a, b, i, j)
-        i, j = i[inside], j[inside]
-        labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
-        unlike = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
-        passes = ~labelled & (unlike <= self.max_descriptor_distance)  # False for NaN
+        labelled_a = np.flatnonzero(a.label != NO_LABEL)
+        labelled_b = np.flatnonzero(b.label != NO_LABEL)
+        same_a, same_b = np.nonzero(a.label[labelled_a][:, None] == b.label[labelled_b])
+        i, j = self._gated(a, b)
+        both_labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
+        distance = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
+        passes = ~both_labelled & (distance <= self.max_descriptor_distance)  # False for NaN
         return (
-            np.concatenate([known_i, i[passes]]),
-            np.concatenate([known_j, j[passes]]),
-            np.concatenate([np.zeros(len(known_i)), unlike[passes]]),
+            np.concatenate([labelled_a[same_a], i[passes]]),
+            np.concatenate([labelled_b[same_b], j[passes]]),
+            np.concatenate([np.zeros(len(same_a)), distance[passes]]),
         )
 
     def duplicate_share(self, landmarks: AlignedLandmarks) -> float:
-        """Share of the landmarks that another one still passes for."""
+        """Return the share of landmarks that pass the test with another landmark."""
         first, second, _ = self.candidates(landmarks, landmarks)
         return len(np.unique(first[first != second])) / max(len(landmarks), 1)
 
-    def _bound(self) -> float:
-        return chi_square_bound(self.gate_probability, 2)
-
-    def _neighbours(
-        self, a: AlignedLandmarks, b: AlignedLandmarks
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """All pairs that the gate could hold, and some more."""
+    def _gated(self, a: AlignedLandmarks, b: AlignedLandmarks) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows of all pairs within the gate of positions and heights."""
         if not len(a) or not len(b):
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        widest_a, widest_b = (
+        bound = chi_square_bound(self.gate_probability, 2)
+        # a search radius that contains the gate of every pair
+        variance_a, variance_b = (
             np.trace(x.covariance_m2[:, :2, :2], axis1=1, axis2=2) + x.drift_m2 for x in (a, b)
         )
-        radius = np.sqrt(self._bound() * (widest_a + widest_b.max()))
-        tree, places = KDTree(b.position_m[:, :2]), a.position_m[:, :2]
-        found = tree.query_ball_point(places, radius, return_sorted=True)
+        radius = np.sqrt(bound * (variance_a + variance_b.max()))
+        tree = KDTree(b.position_m[:, :2])
+        found = tree.query_ball_point(a.position_m[:, :2], radius, return_sorted=True)
         lengths = [len(rows) for rows in found]
-        rows = np.fromiter(itertools.chain.from_iterable(found), np.int64, sum(lengths))
-        return np.repeat(np.arange(len(a)), lengths), rows
+        i = np.repeat(np.arange(len(a)), lengths)
+        j = np.fromiter(itertools.chain.from_iterable(found), np.int64, sum(lengths))
 
-    def _inside(
-        self, a: AlignedLandmarks, b: AlignedLandmarks, i: np.ndarray, j: np.ndarray
-    ) -> np.ndarray:
         drift_m2 = a.drift_m2[i] + b.drift_m2[j]
         (x_a, y_a), (x_b, y_b) = a.position_m[:, :2].T, b.position_m[:, :2].T
         x, y = x_a[i] - x_b[j], y_a[i] - y_b[j]
@@ -209,31 +220,26 @@ class SamePoint:
             for r, q in ((0, 0), (0, 1), (1, 1))
         )
         xx, yy = xx + drift_m2, yy + drift_m2
-        # (x, y) S^-1 (x, y)' by the inverse of two by two, both sides times the determinant
-        inside = yy * x**2 - 2 * xy * x * y + xx * y**2 <= self._bound() * (xx * yy - xy**2)
-        if self.planar:
-            return inside
-        return inside & self.height.agrees(
-            a.position_m[i, 2],
-            a.covariance_m2[i, 2, 2],
-            b.position_m[j, 2],
-            b.covariance_m2[j, 2, 2],
-        )
+        # (x, y) S^-1 (x, y)' <= bound, both sides multiplied by the determinant of S
+        inside = yy * x**2 - 2 * xy * x * y + xx * y**2 <= bound * (xx * yy - xy**2)
+        if not self.planar:
+            inside &= self.height.agrees(
+                a.position_m[i, 2],
+                a.covariance_m2[i, 2, 2],
+                b.position_m[j, 2],
+                b.covariance_m2[j, 2, 2],
+            )
+        return i[inside], j[inside]
 
 
-def _of_one_label(label_a: np.ndarray, label_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of rows that carry the same label."""
-    rows_a, rows_b = np.flatnonzero(label_a != NO_LABEL), np.flatnonzero(label_b != NO_LABEL)
-    i, j = np.nonzero(label_a[rows_a][:, None] == label_b[rows_b])
-    return rows_a[i], rows_b[j]
-
-
-def one_to_one(i: np.ndarray, j: np.ndarray, unlike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The most alike first, each landmark once."""
+def one_to_one(
+    i: np.ndarray, j: np.ndarray, dissimilarity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Select pairs in the order of their dissimilarity so that each landmark occurs once."""
     taken_i: set[int] = set()
     taken_j: set[int] = set()
     kept = []
-    rows = np.argsort(unlike, kind="stable")
+    rows = np.argsort(dissimilarity, kind="stable")
     for row, at_i, at_j in zip(rows, i[rows].tolist(), j[rows].tolist(), strict=True):
         if at_i not in taken_i and at_j not in taken_j:
             taken_i.add(at_i)
@@ -242,43 +248,47 @@ def one_to_one(i: np.ndarray, j: np.ndarray, unlike: np.ndarray) -> tuple[np.nda
     return i[kept], j[kept]
 
 
-class Pair(NamedTuple):
-    """Landmarks of two maps that may be one point: n of them.
+class CandidatePairs(NamedTuple):
+    """Pairs of landmarks of two maps that may be the same point.
 
     Attributes:
-        a: place of the one map.
-        b: place of the other.
-        row_a: (n,) landmarks of the one.
-        row_b: (n,) landmarks of the other.
-        unlike: (n,) how little they look alike.
+        a: index of the first map.
+        b: index of the second map.
+        row_a: landmarks of the first map, shape (n,).
+        row_b: landmarks of the second map, shape (n,).
+        dissimilarity: descriptor distances, shape (n,); 0 for equal labels.
     """
 
     a: int
     b: int
     row_a: np.ndarray
     row_b: np.ndarray
-    unlike: np.ndarray
+    dissimilarity: np.ndarray
 
 
-def joined(pairs: list[Pair], sizes: list[int]) -> np.ndarray:
-    """Points (C, M): the row of each of M maps, ABSENT for none; those of one map come last.
+def cluster_landmarks(pairs: list[CandidatePairs], sizes: list[int]) -> np.ndarray:
+    """Cluster landmarks of M maps so that a cluster has at most one landmark of each map.
 
-    What is most alike is joined first, unless the point would then have two landmarks of one map.
-    The order of maps and of pairs makes no difference but for the order of the points.
+    Single-linkage clustering in the order of the dissimilarity. A pair is skipped if the merged
+    cluster would have two landmarks of one map. The order of maps and pairs changes only the order
+    of the clusters.
 
     Args:
-        pairs: what may be one.
-        sizes: landmarks of each map.
+        pairs: candidate pairs.
+        sizes: number of landmarks of each map.
+
+    Returns:
+        row of each cluster in each map, shape (C, M), ABSENT for none; single landmarks are last.
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
     of_map = np.repeat(np.arange(len(sizes)), sizes)
     members = {int(i): {int(of_map[i]): int(i)} for i in range(first[-1])}
     root = np.arange(first[-1])
-    nothing = [np.empty(0, np.int64)]
-    one = np.concatenate([first[pair.a] + pair.row_a for pair in pairs] or nothing)
-    other = np.concatenate([first[pair.b] + pair.row_b for pair in pairs] or nothing)
-    unlike = np.concatenate([pair.unlike for pair in pairs] or nothing)
-    for row in np.argsort(unlike, kind="stable"):
+    empty = [np.empty(0, np.int64)]
+    one = np.concatenate([first[pair.a] + pair.row_a for pair in pairs] or empty)
+    other = np.concatenate([first[pair.b] + pair.row_b for pair in pairs] or empty)
+    dissimilarity = np.concatenate([pair.dissimilarity for pair in pairs] or empty)
+    for row in np.argsort(dissimilarity, kind="stable"):
         i, j = int(root[one[row]]), int(root[other[row]])
         if i == j or members[i].keys() & members[j].keys():
             continue

@@ -1,42 +1,50 @@
-"""Covariance intersection: landmarks whose errors may be correlated in any way.
+"""Covariance intersection: fusion of landmarks whose errors have an unknown correlation.
 
 Julier and Uhlmann (1997), "A non-divergent estimation algorithm in the presence of unknown
-correlations": of w A^-1 + (1 - w) B^-1 that of the smallest determinant of the covariance.
+correlations". The fused information is w A^-1 + (1 - w) B^-1, with the w of least determinant of
+the covariance.
 """
 
 import numpy as np
 
 from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
-from mapfusion.fusion.kalman import fused_in_turn
+from mapfusion.fusion.kalman import fuse_sequentially
 from mapfusion.geometry.numerics import Float
 
-_HALVINGS = 40  # of the unit interval: what is left of it is far below any use
+_HALVINGS = 40  # bisections of the unit interval; the error of w is then 1e-12
 
 
 class CovarianceIntersection:
-    """Never surer than correlations allow; the drift of the maps counts as it does elsewhere."""
+    """Covariance intersection of the landmarks, with drift added to their covariances."""
 
     smoothed = False
 
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
-        """Fuse the component's members."""
-        return fused_in_turn(component, parameters, intersected, use_drift=True)
+        """Fuse the maps of a component."""
+        return fuse_sequentially(component, parameters, intersect_covariances, use_drift=True)
 
 
-def intersected(
+def intersect_covariances(
     position_i: Float, covariance_i: Float, position_j: Float, covariance_j: Float
 ) -> tuple[Float, Float]:
-    """Pairs of landmarks in one frame.
+    """Fuse N pairs of landmarks in a common frame.
 
-    Positions are (N, D), covariances (N, D, D), those returned as well.
+    Args:
+        position_i: positions of the first landmarks, shape (N, D).
+        covariance_i: covariances of the first landmarks, shape (N, D, D).
+        position_j: positions of the second landmarks, shape (N, D).
+        covariance_j: covariances of the second landmarks, shape (N, D, D).
+
+    Returns:
+        fused positions (N, D) and covariances (N, D, D).
     """
     A, B = np.linalg.inv(covariance_i), np.linalg.inv(covariance_j)
-    # det(w A + (1 - w) B) is that of B times the product of 1 + w m, one for each axis along which
-    # the two are both uncorrelated: there A is 1 + m times as much as B
+    # det(w A + (1 - w) B) = det B prod(1 + w m), where 1 + m are the generalised eigenvalues of
+    # (A, B)
     root = np.linalg.cholesky(covariance_j)
     more = np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ A @ root).T - 1
     low, high = np.zeros(len(A)), np.ones(len(A))
-    for _ in range(_HALVINGS):  # its logarithm is concave in w: the slope falls
+    for _ in range(_HALVINGS):  # log det is concave in w, so its slope decreases
         w = (low + high) / 2
         rises = np.sum(more / (1 + w * more), axis=0) > 0
         low, high = np.where(rises, w, low), np.where(rises, high, w)

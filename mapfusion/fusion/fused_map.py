@@ -10,25 +10,25 @@ import numpy as np
 
 from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.fusion.aligned_landmarks import SamePoint
-from mapfusion.fusion.team_graph import Place, TeamParameters
+from mapfusion.fusion.aligned_landmarks import ABSENT, AssociationTest
+from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Probability, Range, require_in_range
-from mapfusion.smoother.joint_smoothing import Recording
+from mapfusion.smoother.joint_smoothing import AssociatedLog
 
 
 @dataclass(frozen=True)
 class AlignedPair:
-    """Two of the maps that are merged, and how the one lies in the other.
+    """Alignment of two of the maps that are merged.
 
     Attributes:
-        a: place of the map in whose frame it is.
-        b: place of the one that is moved.
-        alignment: T_a_b, refined; not used unless it was accepted.
-        correspondences: that it was found from.
-        log10_false_alarms: of the alignment; of those that contradict each other and that nothing
-            else confirms, the lower counts.
+        a: index of the reference map.
+        b: index of the other map.
+        alignment: refined alignment T_a_b; not used if it was rejected.
+        correspondences: correspondences that the alignment was computed from.
+        log10_false_alarms: logarithm of the expected number of false alarms. Of contradictory
+            alignments without other confirmation the one with the lowest number is used.
     """
 
     a: int
@@ -39,7 +39,7 @@ class AlignedPair:
 
     @property
     def inliers(self) -> Correspondences:
-        """The pairs of landmarks that the alignment says are one."""
+        """Correspondences that are inliers of the alignment."""
         return self.correspondences[self.alignment.inlier]
 
 
@@ -49,16 +49,17 @@ class FusedMap:
 
     Attributes:
         landmarks: the fused map.
-        parents: (N, M) row of each map that went into each landmark, ABSENT for none.
-        T_first_map: (M, 3) motion of each map into the fused frame; NaN for maps left out.
-        motion_covariance: (M, 3, 3) of these; zero for the first, NaN for maps left out.
-        drift_sigma_m: (M,) s_drift of each map as far as it was counted; NaN for maps left out.
-        duplicate_share: share of the landmarks that another one still passes for, by the gate and
-            descriptor test of the second pass.
-        left_out: name of each map that has no part in it, with the reason.
-        fallback: why it is by a simpler fuser than was asked for; empty if it is not.
-        paths: (T_k, 3) the members' poses in the fused frame, in their order, by a fuser that finds
-            them anew; else empty.
+        parents: row of each landmark in each map, shape (N, M); ABSENT for none.
+        T_first_map: pose of each map in the fused frame, shape (M, 3); NaN for maps left out.
+        motion_covariance: covariances of these poses, shape (M, 3, 3); zero for the first, NaN for
+            maps left out.
+        drift_sigma_m: s_drift of each map that was added, shape (M,); NaN for maps left out.
+        duplicate_share: share of the landmarks that pass the gate and descriptor test with another
+            landmark.
+        left_out: name of each map that was not fused, with the reason.
+        fallback: reason for the use of a simpler fuser than the requested one; empty if none.
+        paths: path of each member in the fused frame, shape (T_k, 3); empty if the fuser does not
+            estimate paths.
     """
 
     landmarks: LandmarkMap
@@ -73,30 +74,30 @@ class FusedMap:
 
     @property
     def members(self) -> np.ndarray:
-        """Places of the maps in it; the first of them has the frame."""
+        """Indices of the fused maps; the first map defines the frame."""
         return np.flatnonzero(np.isfinite(self.T_first_map[:, 0]))
 
 
 @dataclass(frozen=True)
 class Fusion:
-    """What a team's maps became.
+    """Result of a merge.
 
     Attributes:
-        fused: a map for each set of maps that alignments connect, that of the most maps first.
-            Maps that nothing connects are none; if that is so of all, the first is there alone.
-        place: of each pair, what the team's others say of its alignment.
+        fused: a fused map for each set of connected maps, largest set first. Unconnected maps are
+            not included; if no maps are connected, only the first map is.
+        edge_status: status of the alignment of each pair.
     """
 
     fused: tuple[FusedMap, ...]
-    place: tuple[Place, ...]
+    edge_status: tuple[EdgeStatus, ...]
 
 
 _DIGITS = re.compile("([0-9]+)")
 
 
 def name_order(name: str) -> tuple[list[Any], str]:
-    """A sorting key of names, in which R2 stands before R10."""
-    parts = _DIGITS.split(name)  # words and numbers in turn, a word first
+    """Return a natural sorting key: R2 is before R10."""
+    parts = _DIGITS.split(name)  # alternating words and numbers
     numbers = [(len(digits), digits) for digits in (part.lstrip("0") for part in parts[1::2])]
     return [
         key for both in zip_longest(parts[::2], numbers) for key in both if key is not None
@@ -105,19 +106,19 @@ def name_order(name: str) -> tuple[list[Any], str]:
 
 @dataclass(frozen=True)
 class MergeParameters:
-    """How maps are merged.
+    """Parameters of a merge.
 
     Attributes:
-        team: which alignments of more than two maps are believed.
-        max_descriptor_distance: of landmarks that are taken for one point though no alignment names
-            them; with labels on both sides these decide instead.
-        gate_probability: of keeping two landmarks of one point there (chi-square, 2 degrees of
-            freedom, drift included; in joint fusion of the Student-t that is fitted).
-        height: which landmarks can have one height (not for planar maps and joint covariances).
-        use_alignment_uncertainty: add J S_T J^T, the covariance of the map's place to first order,
-            to the landmarks that the Kalman fusers move. The paper does not. This error is common
-            to all of them, which per-landmark covariances cannot say; and as it is told from the
-            first map, the order of the maps then weighs their landmarks.
+        team: selection of consistent alignments between more than two maps.
+        max_descriptor_distance: largest descriptor distance of landmarks that are associated
+            without an alignment; not used if both have labels.
+        gate_probability: probability that landmarks of the same point pass the gate (chi-square, 2
+            degrees of freedom, drift included; joint fusion: fitted Student-t distribution).
+        height: test of the heights; not used for planar maps and joint covariances.
+        use_alignment_uncertainty: add J S_T J^T, the first-order covariance of the map's pose, to
+            the landmarks that the Kalman fusers transform. The paper does not add it. The error is
+            common to all landmarks of a map, so separate covariances overstate it; and the result
+            depends on the order of the maps.
     """
 
     team: TeamParameters = field(default_factory=TeamParameters)
@@ -129,23 +130,25 @@ class MergeParameters:
     def __post_init__(self) -> None:
         require_in_range(self)
 
-    def same_point(self, planar: bool) -> SamePoint:
-        """The test for landmarks that no alignment names."""
-        return SamePoint(self.max_descriptor_distance, self.gate_probability, self.height, planar)
+    def association_test(self, planar: bool) -> AssociationTest:
+        """Return the test for landmarks that are no inliers of an alignment."""
+        return AssociationTest(
+            self.max_descriptor_distance, self.gate_probability, self.height, planar
+        )
 
 
 @dataclass(frozen=True)
 class Component:
-    """Some of a team's M maps, placed; at least one.
+    """Connected component: K of M maps with their poses in a common frame.
 
     Attributes:
-        maps: all M of them.
-        members: (K,) places of those that are fused; the first has the frame.
-        pairs: the alignments that are believed, each of two members.
-        T_first_map: (M, 3) motion of each member into the fused frame; NaN for the others.
-        motion_covariance: (M, 3, 3) of these.
+        maps: all M maps.
+        members: indices of the maps that are fused, shape (K,); the first defines the frame.
+        pairs: alignments between members that are used.
+        T_first_map: pose of each member in the fused frame, shape (M, 3); NaN for the others.
+        motion_covariance: covariances of these poses, shape (M, 3, 3).
         left_out: name of each other map, with the reason.
-        recordings: what each of the M maps was smoothed from; empty or None where it is not known.
+        recordings: log that each map was smoothed from; empty or None if unknown.
     """
 
     maps: tuple[LandmarkMap, ...]
@@ -154,23 +157,24 @@ class Component:
     T_first_map: Float
     motion_covariance: Float
     left_out: tuple[tuple[str, str], ...]
-    recordings: tuple[Recording | None, ...] = ()
+    recordings: tuple[AssociatedLog | None, ...] = ()
 
     @property
     def by_name(self) -> list[int]:
-        """The members in the order of their names, which does not depend on who has the frame."""
+        """Members in the order of their names, which does not depend on the frame."""
         return sorted(self.members.tolist(), key=lambda k: name_order(self.maps[k].name))
 
     @property
     def planar(self) -> bool:
-        """Whether heights carry no information."""
+        """True if heights carry no information."""
         return any(self.maps[k].planar for k in self.members)
 
     @property
     def drift_sigma_m(self) -> Float:
-        """s_drift (M,) of each map: the root of the mean of its halves; NaN for those left out.
+        """Standard deviation s_drift of each map, shape (M,); NaN for maps left out.
 
-        An alignment's s_drift^2 belongs to two maps and is given half to each.
+        Half of an alignment's s_drift^2 is attributed to each of its maps. A map has the mean over
+        its alignments.
         """
         drift = np.full(len(self.maps), np.nan)
         for k in self.members:
@@ -179,28 +183,22 @@ class Component:
         return drift
 
     def on(self, maps: Sequence[LandmarkMap]) -> "Component":
-        """The same with other maps of the same robots, whose landmarks came from the same places.
+        """Return the component with other maps of the same observations.
 
-        Of the alignments' pairs those stay whose landmarks are in both.
+        Inliers without a landmark in both new maps are removed.
         """
-        row_of = [_rows(old, new) for old, new in zip(self.maps, maps, strict=True)]
-        pairs = [_with_rows(pair, row_of[pair.a], row_of[pair.b]) for pair in self.pairs]
+        row_of = []  # row in the new map of each landmark of the old map
+        for old, new in zip(self.maps, maps, strict=True):
+            rows = {int(source): row for row, source in enumerate(new.source_observation)}
+            sources = old.source_observation
+            row_of.append(np.array([rows.get(int(s), ABSENT) for s in sources], dtype=np.int64))
+        pairs = []
+        for pair in self.pairs:
+            known = pair.inliers
+            index_a = row_of[pair.a][known.index_a]
+            index_b = row_of[pair.b][known.index_b]
+            kept = (index_a != ABSENT) & (index_b != ABSENT)
+            inliers = Correspondences(index_a[kept], index_b[kept], known.distance[kept])
+            alignment = replace(pair.alignment, inlier=np.ones(len(inliers), dtype=bool))
+            pairs.append(replace(pair, alignment=alignment, correspondences=inliers))
         return replace(self, maps=tuple(maps), pairs=tuple(pairs))
-
-
-_NONE = -1
-
-
-def _rows(old: LandmarkMap, new: LandmarkMap) -> np.ndarray:
-    """(N,) row in the new map of each landmark of the old one."""
-    place = {int(source): row for row, source in enumerate(new.source_observation)}
-    return np.array([place.get(int(s), _NONE) for s in old.source_observation], dtype=np.int64)
-
-
-def _with_rows(pair: AlignedPair, row_of_a: np.ndarray, row_of_b: np.ndarray) -> AlignedPair:
-    known = pair.inliers
-    index_a, index_b = row_of_a[known.index_a], row_of_b[known.index_b]
-    kept = (index_a != _NONE) & (index_b != _NONE)
-    offered = Correspondences(index_a[kept], index_b[kept], known.distance[kept])
-    inlier = np.ones(len(offered), dtype=bool)
-    return replace(pair, alignment=replace(pair.alignment, inlier=inlier), correspondences=offered)

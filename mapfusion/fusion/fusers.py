@@ -1,7 +1,7 @@
-"""Fusers by name: built-in ones, and those of installed packages.
+"""Fusers by name: built-in fusers and plug-ins.
 
-A package offers one as an entry point of the group `mapfusion.fusers`: its name, and a class that
-is made without arguments and is a `Fuser`.
+A package provides a fuser by an entry point of the group `mapfusion.fusers`: its name and a class
+that implements `Fuser` and has a constructor without arguments.
 """
 
 import importlib
@@ -13,18 +13,20 @@ from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
 
 
 class Fuser(Protocol):
-    """Makes one map of several that believed alignments connect.
+    """Interface of fusers, which fuse the maps of a connected component.
 
-    It is made without arguments. What it cannot fuse it carries over; it raises nothing.
+    The constructor has no arguments. Landmarks that cannot be fused are kept; `fuse` raises no
+    errors.
 
     Attributes:
-        smoothed: whether it is to be given smoothed maps, where there are any, else the filter's.
+        smoothed: true if the fuser uses the smoother's maps if there are any; false if it uses the
+            filter's maps.
     """
 
     smoothed: bool
 
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
-        """Fuse the component's members."""
+        """Fuse the maps of a component."""
         ...
 
 
@@ -36,16 +38,16 @@ FUSERS = {
     "joint": "mapfusion.fusion.joint:JointFuser",
     "batch": "mapfusion.fusion.batch:Batch",
 }
-# Reference that smooths all logs again, which takes as long as all the rest of fusing.
+# Reference that smooths all logs jointly, which is much slower than the other fusers.
 REFERENCE = "batch"
-USUAL = "joint"  # what fuses maps unless another one is named
+USUAL = "joint"  # default fuser
 
 
 def target_of(name: str) -> str:
-    """`module:class` of the fuser of that name; of two of one name it is ours.
+    """Return `module:class` of a fuser; built-in names take precedence.
 
     Raises:
-        ValueError: there is none of that name.
+        ValueError: the name is unknown.
     """
     if name in FUSERS:
         return FUSERS[name]
@@ -58,10 +60,10 @@ def target_of(name: str) -> str:
 
 
 def make_fuser(name: str = USUAL) -> Fuser:
-    """The fuser of that name.
+    """Return the fuser with this name.
 
     Raises:
-        ValueError: there is none of that name, or the package's own cannot be used.
+        ValueError: the name is unknown, or a plug-in cannot be used.
     """
     target = target_of(name)
     module, _, attribute = target.partition(":")

@@ -1,7 +1,7 @@
-"""Joint fusion: motions, shared errors and landmarks of all maps in one estimate.
+"""Joint fusion: poses, shared errors and landmarks of all maps in one least-squares estimate.
 
-Where maps carry joint covariances, landmarks that meet straighten their maps as a whole, so that
-also those move that one robot alone has seen. Maps without one are fused by what they have.
+Common landmarks of maps with joint covariances also correct the landmarks that only one robot has
+observed. Maps without a joint covariance are fused by their marginal covariances.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from mapfusion.align.alignment import MIN_PAIRS
-from mapfusion.fusion.aligned_landmarks import ABSENT, AlignedLandmarks, Pair, joined
+from mapfusion.fusion.aligned_landmarks import (
+    ABSENT,
+    AlignedLandmarks,
+    CandidatePairs,
+    cluster_landmarks,
+)
 from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint_estimate import (
     JointEstimate,
@@ -31,19 +36,19 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.robust_loss import student_bound
 from mapfusion.tables import DESCRIPTOR_LENGTH, NO_LABEL
 
-_SOURCE_UNKNOWN = -1  # a fused landmark comes from no single observation
+_SOURCE_UNKNOWN = -1  # a fused landmark has no source observation
 
 
 @dataclass(frozen=True)
 class JointlyFused:
-    """K members of a component, estimated.
+    """Estimate of K members of a component.
 
     Attributes:
-        component: what was fused.
-        maps: of the members.
-        points: (C, K) rows of the members that are one point, ABSENT for none; those of several
-            maps first.
-        estimate: of these.
+        component: the component.
+        maps: maps of the members.
+        points: rows of each point's landmarks in the members' maps, shape (C, K), ABSENT for none;
+            points of several maps come first.
+        estimate: the estimate.
     """
 
     component: Component
@@ -52,46 +57,25 @@ class JointlyFused:
     estimate: JointEstimate
 
     def fused_map(self, parameters: MergeParameters) -> FusedMap:
-        """As fusers return it."""
+        """Return the fused map with descriptors, labels and parents."""
         members, n_maps = self.component.members, len(self.component.maps)
-        T, covariance = np.full((n_maps, 3), np.nan), np.full((n_maps, 3, 3), np.nan)
-        T[members] = self.estimate.T_first_map
-        covariance[members] = self.estimate.motion_covariance
-        parents = np.full((len(self.points), n_maps), ABSENT)
-        parents[:, members] = self.points
-        landmarks, joint = self._landmarks()
-        # what all landmarks share moves duplicates together and does not keep them apart
-        alone = replace(landmarks, covariance_m2=joint.own_m2, joint=None)
-        still = AlignedLandmarks.of([alone], 0, IDENTITY, None, 0.0, use_drift=False)
-        drift = np.full(n_maps, np.nan)
-        drift[members] = 0.0
-        return FusedMap(
-            landmarks,
-            parents,
-            T,
-            covariance,
-            drift,
-            parameters.same_point(self.component.planar).duplicate_share(still),
-            self.component.left_out,
-        )
-
-    def _landmarks(self) -> tuple[LandmarkMap, JointCovariance]:
-        position, joint = self._points()
-        given = [self.component.maps[k] for k in self.component.members]
+        position, joint = self._positions()
+        given = [self.component.maps[k] for k in members]
         n, has = len(self.points), self.points != ABSENT
-        count, most = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        count, largest_count = np.zeros(n, np.int64), np.zeros(n, np.int64)
         descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan, np.float32)
         label = np.full(n, NO_LABEL, np.int32)
         for k, own in enumerate(given):
-            rows, its = np.flatnonzero(has[:, k]), self.points[has[:, k], k]
-            count[rows] += own.count[its]
-            if own.descriptor is not None:  # of the landmark that was seen most
-                more = own.count[its] > most[rows]
-                descriptor[rows[more]] = own.descriptor[its[more]]
-                most[rows[more]] = own.count[its[more]]
+            rows, landmarks = np.flatnonzero(has[:, k]), self.points[has[:, k], k]
+            count[rows] += own.count[landmarks]
+            if own.descriptor is not None:  # of the landmark with most observations
+                more = own.count[landmarks] > largest_count[rows]
+                descriptor[rows[more]] = own.descriptor[landmarks[more]]
+                largest_count[rows[more]] = own.count[landmarks[more]]
             if own.label is not None:
-                label[rows] = np.where(label[rows] == NO_LABEL, own.label[its], label[rows])
-        made = LandmarkMap(
+                unlabelled = label[rows] == NO_LABEL
+                label[rows] = np.where(unlabelled, own.label[landmarks], label[rows])
+        fused = LandmarkMap(
             position,
             joint.marginal_m2,
             count.astype(np.int32),
@@ -102,70 +86,89 @@ class JointlyFused:
             given[0].name,
             joint,
         )
-        return made, joint
 
-    def _points(self) -> tuple[Float, JointCovariance]:
-        """Points g (C, 3) and what their errors have in common: dg/du of the unknowns' errors."""
+        # duplicates are found by the independent errors, because shared errors move both landmarks
+        independent = replace(fused, covariance_m2=joint.own_m2, joint=None)
+        landmarks = AlignedLandmarks.of([independent], 0, IDENTITY, None, 0.0, use_drift=False)
+        test = parameters.association_test(self.component.planar)
+
+        T, covariance = np.full((n_maps, 3), np.nan), np.full((n_maps, 3, 3), np.nan)
+        T[members] = self.estimate.T_first_map
+        covariance[members] = self.estimate.motion_covariance
+        parents, drift = np.full((n, n_maps), ABSENT), np.full(n_maps, np.nan)
+        parents[:, members], drift[members] = self.points, 0.0
+        duplicate_share, left_out = test.duplicate_share(landmarks), self.component.left_out
+        return FusedMap(fused, parents, T, covariance, drift, duplicate_share, left_out)
+
+    def _positions(self) -> tuple[Float, JointCovariance]:
+        """Return the points (C, 3) and their joint covariance.
+
+        A point g has the error dg/du of the unknowns' errors, and an independent error.
+        """
         n, has, estimate = len(self.points), self.points != ABSENT, self.estimate
         n_dimensions, n_unknowns = self.maps[0].position_m.shape[1], len(estimate.covariance)
         weight = has.astype(np.float64)
         weight[: len(estimate.weight)] = estimate.weight
         factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
         rows = [np.flatnonzero(has[:, k]) for k in range(len(self.maps))]
-        said = [estimate.said(self.maps, k, self.points[own, k]) for k, own in enumerate(rows)]
+        transformed = [
+            estimate.transformed(self.maps, k, self.points[own, k]) for k, own in enumerate(rows)
+        ]
         W = [
             weighted_information(each, weight[own, k])
-            for k, (own, each) in enumerate(zip(rows, said, strict=True))
+            for k, (own, each) in enumerate(zip(rows, transformed, strict=True))
         ]
         information = np.zeros((n, n_dimensions, n_dimensions))
         for own, its in zip(rows, W, strict=True):
             information[own] += its
         V = inverses(information)
-        total, moved = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
-        for k, (own, each, its) in enumerate(zip(rows, said, W, strict=True)):
+        total, jacobian = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
+        for k, (own, each, its) in enumerate(zip(rows, transformed, W, strict=True)):
             gain = V[own] @ its
             total[own] += np.einsum("nij,nj->ni", gain, each.y_m)
-            moved[own] += gain @ estimate.moved_m(self.maps, k, each, factor)
+            jacobian[own] += gain @ estimate.moved_m(self.maps, k, each, factor)
         covariance, position = np.zeros((n, 3, 3)), np.zeros((n, 3))
         covariance[:, :n_dimensions, :n_dimensions] = V
         position[:, :n_dimensions] = total
         shared = np.zeros((n_unknowns, n, 3))
-        shared[:, :, :n_dimensions] = moved.transpose(2, 0, 1)
+        shared[:, :, :n_dimensions] = jacobian.transpose(2, 0, 1)
         return position, reduce_rank(covariance, shared.reshape(n_unknowns, 3 * n))
 
 
-# What is one point is judged anew with each estimate, until nothing changes or for so many rounds.
+# Largest number of rounds of association and estimation.
 _MOST_ROUNDS = 5
-# Of landmarks' variances that are looked for with one radius: fewer take more searches, more find
-# more that is out of reach.
+# Landmarks whose variances are within this number of octaves are searched with one radius.
 _OCTAVES = 3
-# Heavier tails have no variance: they are of false pairs, not of landmarks.
+# Smallest degrees of freedom of the gate. Heavier tails have no variance; they are due to false
+# associations.
 _LEAST_DOF = 2.0
 
 
 class JointFuser:
-    """All maps at once; the first member's frame is the frame.
+    """Joint estimate of all maps in the frame of the first member.
 
-    Where landmarks do not tie the maps to each other, or covariances are of sizes too different to
-    be computed with, Kalman fusion with drift stands in.
+    Kalman fusion with drift is the fallback if common landmarks do not connect all maps, or if the
+    equations are singular.
     """
 
     smoothed = True
 
     @one_blas_thread
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
-        """Fuse the component's members."""
+        """Fuse the maps of a component."""
+        reason = f"a map has fewer than {MIN_PAIRS} landmarks in common with the others"
         try:
-            made = self._fused(component, parameters)
+            fused = self._fuse_jointly(component, parameters)
         except np.linalg.LinAlgError:
-            made = "the maps' covariances are of sizes too different to be computed with together"
-        if isinstance(made, str):
-            return replace(KalmanDrift().fuse(component, parameters), fallback=made)
-        return made
+            fused = None
+            reason = "the maps' covariances differ too much in size for a joint estimate"
+        if fused is None:
+            return replace(KalmanDrift().fuse(component, parameters), fallback=reason)
+        return fused
 
     @staticmethod
-    def _fused(component: Component, parameters: MergeParameters) -> FusedMap | str:
-        """The fused map, or why it cannot be made so."""
+    def _fuse_jointly(component: Component, parameters: MergeParameters) -> FusedMap | None:
+        """Return the fused map; None if common landmarks do not connect all maps."""
         n_dimensions = 2 if component.planar else 3
         drift = component.drift_sigma_m
         given = [component.maps[k] for k in component.members]
@@ -173,55 +176,50 @@ class JointFuser:
             JointMap.of(landmarks, float(drift[k]), n_dimensions)
             for landmarks, k in zip(given, component.members, strict=True)
         ]
-        sizes, inliers = [len(landmarks) for landmarks in given], _inliers(component)
-        points = joined(inliers, sizes)
-        if not _tied(points):
-            return f"fewer than {MIN_PAIRS} landmarks tie some map to the others"
-        estimate = _estimated(maps, component.T_first_map[component.members], points)
+        # inliers of the alignments; `a` is the lesser of the two members
+        member = {int(k): row for row, k in enumerate(component.members)}
+        inliers = []
+        for pair in component.pairs:
+            known = pair.inliers
+            sides = [(member[pair.a], known.index_a), (member[pair.b], known.index_b)]
+            (a, row_a), (b, row_b) = sorted(sides, key=lambda side: side[0])
+            inliers.append(CandidatePairs(a, b, row_a, row_b, known.distance))
+        sizes = [len(landmarks) for landmarks in given]
+        points = cluster_landmarks(inliers, sizes)
+        if not _is_connected(points):
+            return None
+        estimate = _estimate(maps, component.T_first_map[component.members], points)
         for _ in range(_MOST_ROUNDS):
-            pairs = _candidates(given, _placed(maps, estimate), inliers, parameters, estimate.dof)
-            now = joined(pairs, sizes)
-            if np.array_equal(points, now) or not _tied(now):
+            pairs = _candidates(given, maps, estimate, inliers, parameters)
+            new_points = cluster_landmarks(pairs, sizes)
+            if np.array_equal(points, new_points) or not _is_connected(new_points):
                 break
-            points, estimate = now, _estimated(maps, estimate.T_first_map, now)
+            points, estimate = new_points, _estimate(maps, estimate.T_first_map, new_points)
         return JointlyFused(component, maps, points, estimate).fused_map(parameters)
 
 
-def _tied(points: np.ndarray) -> bool:
-    """Whether each map's motion is determined by points (C, K) that it has in common with others.
-
-    Maps hang together by pairs of maps with enough points in common.
-    """
+def _is_connected(points: np.ndarray) -> bool:
+    """Return True if pairs of maps with enough common points (C, K) connect all maps."""
     has = (points != ABSENT).astype(np.int64)
     n_components, _ = connected_components(csr_matrix(has.T @ has >= MIN_PAIRS), directed=False)
     return n_components == 1
 
 
-def _estimated(maps: Sequence[JointMap], T_first_map: Float, points: np.ndarray) -> JointEstimate:
-    """From the points of several maps: those of one map alone say nothing."""
+def _estimate(maps: Sequence[JointMap], T_first_map: Float, points: np.ndarray) -> JointEstimate:
+    """Estimate from the points of several maps; other points carry no information."""
     several = np.count_nonzero(points != ABSENT, axis=1) > 1
     return estimate_jointly(maps, T_first_map, points[several])
 
 
-def _inliers(component: Component) -> list[Pair]:
-    """What alignments say is one; places are among the members, the lesser first."""
-    place = {int(k): row for row, k in enumerate(component.members)}
-    found = []
-    for p in component.pairs:
-        sides = [(place[p.a], p.inliers.index_a), (place[p.b], p.inliers.index_b)]
-        (a, row_a), (b, row_b) = sorted(sides, key=lambda side: side[0])
-        found.append(Pair(a, b, row_a, row_b, p.inliers.distance))
-    return found
-
-
 @dataclass(frozen=True)
-class _Placed:
-    """A map's n landmarks in the common frame.
+class _PlacedMap:
+    """Landmarks of a map in the common frame.
 
     Attributes:
-        position_m: (n, D).
-        own_m2: (n, D, D) covariance of what is each landmark's own.
-        shared_m: (n, D, U) how far one sigma of U independent shared variables moves it.
+        position_m: positions, shape (n, D).
+        own_m2: covariances of the independent errors, shape (n, D, D).
+        shared_m: displacement by one sigma of each of U independent shared variables, shape
+            (n, D, U).
     """
 
     position_m: Float
@@ -229,102 +227,84 @@ class _Placed:
     shared_m: Float
 
     @cached_property
-    def widest_m2(self) -> Float:
-        """(n,) two landmarks' together are no less than any variance of their difference."""
+    def bound_m2(self) -> Float:
+        """Share of each landmark in a bound of the variance of a difference, shape (n,)."""
         own, shared = np.trace(self.own_m2, axis1=1, axis2=2), self.shared_m
         return own + 2 * np.einsum("nij,nij->n", shared, shared)
 
 
-def _placed(maps: Sequence[JointMap], estimate: JointEstimate) -> list[_Placed]:
-    factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
-    said = [estimate.said(maps, k, np.arange(len(own))) for k, own in enumerate(maps)]
-    shared = [estimate.moved_m(maps, k, own, factor) for k, own in enumerate(said)]
-    return [_Placed(own.y_m, own.own_m2, moved) for own, moved in zip(said, shared, strict=True)]
-
-
 def _candidates(
     given: Sequence[LandmarkMap],
-    placed: Sequence[_Placed],
-    inliers: Sequence[Pair],
+    maps: Sequence[JointMap],
+    estimate: JointEstimate,
+    inliers: Sequence[CandidatePairs],
     parameters: MergeParameters,
-    dof: float,
-) -> list[Pair]:
-    """Landmarks of every two maps that may be one point.
+) -> list[CandidatePairs]:
+    """Return landmarks of every pair of maps that may be the same point.
 
-    Those of one label need nothing else and are not unlike at all. All others have to pass the
-    gate, and their descriptors have to be alike; without descriptors, an alignment has to have
-    named them. The gate is that of the Student-t with `dof` degrees of freedom which the points
-    agreed on so far follow: a Gaussian's would cut its tails off, and then none would be seen.
+    Landmarks with equal labels need no gate and have the dissimilarity 0. Other landmarks have to
+    pass the gate and the descriptor test; without descriptors they have to be inliers of an
+    alignment. The gate is that of the fitted Student-t distribution, because a Gaussian gate would
+    remove the tails that are fitted.
     """
-    dof = max(dof, _LEAST_DOF)
+    factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
+    placed = []
+    for k, own in enumerate(maps):
+        transformed = estimate.transformed(maps, k, np.arange(len(own)))
+        shared_m = estimate.moved_m(maps, k, transformed, factor)
+        placed.append(_PlacedMap(transformed.y_m, transformed.own_m2, shared_m))
+    labels = [np.full(len(own), NO_LABEL) if own.label is None else own.label for own in given]
+    dof = max(estimate.dof, _LEAST_DOF)
     bound = student_bound(parameters.gate_probability, dof, placed[0].position_m.shape[1])
     found = []
     for a, b in combinations(range(len(given)), 2):
-        i, j, unlike = _alike(given[a], given[b], *_near(placed[a], placed[b], bound))
-        near = unlike <= parameters.max_descriptor_distance
-        i, j, unlike = i[near], j[near], unlike[near]
-        if given[a].descriptor is None or given[b].descriptor is None:
-            i, j, unlike = _named(inliers, a, b)
-        kept = _inside(placed[a], placed[b], i, j, bound)
-        known_i, known_j = _of_one_label(given[a], given[b])
-        i, j = np.concatenate([known_i, i[kept]]), np.concatenate([known_j, j[kept]])
-        found.append(Pair(a, b, i, j, np.concatenate([np.zeros(len(known_i)), unlike[kept]])))
+        first, second = given[a].descriptor, given[b].descriptor
+        if first is None or second is None:
+            of_maps = [pair for pair in inliers if (pair.a, pair.b) == (a, b)]
+            rows = [np.stack([pair.row_a, pair.row_b]) for pair in of_maps]
+            i, j = np.concatenate([np.empty((2, 0), np.int64), *rows], axis=1)
+            distance = np.concatenate([np.empty(0), *(pair.dissimilarity for pair in of_maps)])
+        else:
+            i, j = _neighbours(placed[a], placed[b], bound)
+            unlabelled = (labels[a][i] == NO_LABEL) | (labels[b][j] == NO_LABEL)
+            i, j = i[unlabelled], j[unlabelled]
+            distance = np.linalg.norm(first[i] - second[j], axis=1).astype(np.float64)
+            similar = distance <= parameters.max_descriptor_distance
+            i, j, distance = i[similar], j[similar], distance[similar]
+
+        # gate of the differences, in which common errors cancel
+        one, other = placed[a], placed[b]
+        shared = one.shared_m[i] - other.shared_m[j]
+        S = one.own_m2[i] + other.own_m2[j] + shared @ np.swapaxes(shared, 1, 2)
+        off = one.position_m[i] - other.position_m[j]
+        inside = np.einsum("ni,nij,nj->n", off, inverses(S), off) <= bound
+
+        labelled_a, labelled_b = (np.flatnonzero(labels[k] != NO_LABEL) for k in (a, b))
+        same_a, same_b = np.nonzero(labels[a][labelled_a][:, None] == labels[b][labelled_b])
+        i = np.concatenate([labelled_a[same_a], i[inside]])
+        j = np.concatenate([labelled_b[same_b], j[inside]])
+        dissimilarity = np.concatenate([np.zeros(len(same_a)), distance[inside]])
+        found.append(CandidatePairs(a, b, i, j, dissimilarity))
     return found
 
 
-def _named(inliers: Sequence[Pair], a: int, b: int) -> tuple[np.ndarray, np.ndarray, Float]:
-    named = [pair for pair in inliers if (pair.a, pair.b) == (a, b)]
-    rows = [(pair.row_a, pair.row_b) for pair in named]
-    i, j = np.concatenate([np.empty((2, 0), np.int64), *map(np.stack, rows)], axis=1)
-    return i, j, np.concatenate([np.empty(0), *(pair.unlike for pair in named)])
+def _neighbours(a: _PlacedMap, b: _PlacedMap, bound: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of all pairs of landmarks that a gate may contain.
 
-
-def _inside(a: _Placed, b: _Placed, i: np.ndarray, j: np.ndarray, bound: float) -> np.ndarray:
-    """Which differences (n,) can be zero: what both share cancels."""
-    shared = a.shared_m[i] - b.shared_m[j]
-    S = a.own_m2[i] + b.own_m2[j] + shared @ np.swapaxes(shared, 1, 2)
-    off = a.position_m[i] - b.position_m[j]
-    return np.einsum("ni,nij,nj->n", off, inverses(S), off) <= bound
-
-
-def _of_one_label(a: LandmarkMap, b: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
-    named_a, named_b = (np.flatnonzero(_labels(own) != NO_LABEL) for own in (a, b))
-    i, j = np.nonzero(_labels(a)[named_a][:, None] == _labels(b)[named_b])
-    return named_a[i], named_b[j]
-
-
-def _labels(landmarks: LandmarkMap) -> np.ndarray:
-    return np.full(len(landmarks), NO_LABEL) if landmarks.label is None else landmarks.label
-
-
-def _alike(
-    a: LandmarkMap, b: LandmarkMap, i: np.ndarray, j: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, Float]:
-    """The pairs of rows that not both carry labels, with the distance of their descriptors."""
-    if a.descriptor is None or b.descriptor is None:
-        return i[:0], j[:0], np.empty(0)
-    unnamed = (_labels(a)[i] == NO_LABEL) | (_labels(b)[j] == NO_LABEL)
-    i, j = i[unnamed], j[unnamed]
-    return i, j, np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1).astype(np.float64)
-
-
-def _near(a: _Placed, b: _Placed, bound: float) -> tuple[np.ndarray, np.ndarray]:
-    """All pairs of landmarks whose difference a gate could hold.
-
-    Landmarks of the one map are taken by how uncertain they are, some octaves at a time: few that
-    are far and uncertain would make the gates of all others wide.
+    Landmarks of `b` are searched in groups of similar uncertainty, so that a few uncertain ones do
+    not enlarge the search radius of all.
     """
-    wide_a, wide_b = a.widest_m2, b.widest_m2
-    octave = _OCTAVES * np.ceil(np.log2(wide_b) / _OCTAVES)
+    bound_a, bound_b = a.bound_m2, b.bound_m2
+    octave = _OCTAVES * np.ceil(np.log2(bound_b) / _OCTAVES)
     rows_a, rows_b = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for each in np.unique(octave):
         rows = np.flatnonzero(octave == each)
-        radius_m = np.sqrt(bound * (wide_a + 2.0**each))
+        radius_m = np.sqrt(bound * (bound_a + 2.0**each))
         tree = KDTree(b.position_m[rows])
         found = tree.query_ball_point(a.position_m, radius_m, return_sorted=True)
-        rows_a.append(np.repeat(np.arange(len(wide_a)), [len(own) for own in found]))
+        rows_a.append(np.repeat(np.arange(len(bound_a)), [len(own) for own in found]))
         rows_b.append(rows[np.fromiter(chain.from_iterable(found), np.int64)])
     i, j = np.concatenate(rows_a), np.concatenate(rows_b)
     off = a.position_m[i] - b.position_m[j]
-    near = np.einsum("ni,ni->n", off, off) <= bound * (wide_a[i] + wide_b[j])
+    near = np.einsum("ni,ni->n", off, off) <= bound * (bound_a[i] + bound_b[j])
     return i[near], j[near]

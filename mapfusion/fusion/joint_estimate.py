@@ -1,17 +1,17 @@
-"""Joint least squares over maps that carry joint covariances.
+"""Joint least squares of maps with joint covariances.
 
-Of map k the landmarks are x = m + C' z_k + e (`joint_covariance.py`): z_k is standard normal and
-shared, e is the landmark's own. Landmarks of several maps that are one point g say
+The landmarks of map k are x = m + C' z_k + e (`joint_covariance.py`) with standard normal shared
+variables z_k and independent errors e. Landmarks of several maps that are the same point g have
 
-    T_k (m + C' z_k + e) = g,    so that    y_k(u) = T_k (m + C' z_k) is g but for e
+    T_k (m + C' z_k + e) = g,    so that    y_k(u) = T_k (m + C' z_k) = g - R_k e.
 
-and u = (T_1, ..., z_0, z_1, ...) is all that has to be found: some hundred unknowns, whatever the
-number of landmarks. Given u each point is the weighted mean of what its maps say, and goes first:
+The unknowns are u = (T_1, ..., z_0, z_1, ...). Their number does not depend on that of landmarks.
+For given u each point is a weighted mean, and is eliminated:
 
     g = V sum W_k y_k,   V = (sum W_k)^-1,    cost = |z|^2 + sum (y_k - g)' W_k (y_k - g)
 
-with W_k the inverse covariance of T_k e, times the weight of a Student-t: a landmark may be another
-point than it is taken for. The first map's frame is the frame, so T_0 is no unknown.
+W_k is the inverse covariance of R_k e, times the weight of a Student-t distribution, because
+associations may be false. The frame is that of the first map, so T_0 is known.
 """
 
 from collections.abc import Sequence
@@ -28,18 +28,18 @@ from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float, inverses
 from mapfusion.geometry.se2 import inverse, rotation_about_z, transform_points, wrap
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.smoother.robust_loss import MOST_DOF, fitted_dof, information_share, student_weights
+from mapfusion.smoother.robust_loss import MOST_DOF, fit_dof, information_share, student_weights
 
 
 @dataclass(frozen=True)
 class JointMap:
-    """N landmarks of a map as they enter.
+    """N landmarks of a map with their joint covariance.
 
     Attributes:
-        position_m: (N, D); D is 2 for planar maps.
-        joint: of the positions, in three dimensions, but for the calibration.
-        calibration: what its camera leaves open: two shared variables more, the last ones, unless
-            it is known exactly. Maps of one camera have them in common.
+        position_m: positions, shape (N, D); D is 2 for planar maps.
+        joint: joint covariance of the positions in three dimensions, without the calibration.
+        calibration: calibration error of the camera. Unless it is zero it adds two shared
+            variables, which are the last ones and common to all maps of the camera.
     """
 
     position_m: Float
@@ -51,16 +51,17 @@ class JointMap:
 
     @property
     def n_shared(self) -> int:
-        """R."""
+        """Number of shared variables R."""
         return self.joint.rank + (0 if self.calibration.is_none else N_OF_CAMERA)
 
     @classmethod
     def of(cls, landmarks: LandmarkMap, own_sigma_m: float, n_dimensions: int) -> "JointMap":
-        """A map without a joint covariance shares none, but has more of its landmarks' own.
+        """Convert a map.
 
         Args:
             landmarks: the map.
-            own_sigma_m: that is added in the plane where a map has no joint covariance: s_drift.
+            own_sigma_m: s_drift, standard deviation of an independent error of x and y that is
+                added if the map has no joint covariance.
             n_dimensions: 2 or 3.
         """
         joint = landmarks.joint
@@ -71,14 +72,14 @@ class JointMap:
         return cls(landmarks.position_m[:, :n_dimensions], joint, landmarks.calibration)
 
 
-class Said(NamedTuple):
-    """What a map says of some landmarks, at a guess of the unknowns.
+class TransformedLandmarks(NamedTuple):
+    """Landmarks of a map in the common frame, for given unknowns.
 
     Attributes:
-        y_m: (n, D) where they are, in the common frame.
-        own_m2: (n, D, D) covariance of their own errors, there.
-        information: (n, D, D) its inverse.
-        by_unknown: (n, D, U_k) dy / du by the unknowns that it depends on.
+        y_m: positions, shape (n, D).
+        own_m2: covariances of the independent errors, shape (n, D, D).
+        information: inverses of these covariances, shape (n, D, D).
+        by_unknown: Jacobians dy / du by the unknowns of the map, shape (n, D, U_k).
     """
 
     y_m: Float
@@ -87,15 +88,16 @@ class Said(NamedTuple):
     by_unknown: Float
 
 
-class MapRows(NamedTuple):
-    """Some of a map's landmarks as they enter each step.
+class LandmarkRows(NamedTuple):
+    """Selected landmarks of a map in its own frame.
 
     Attributes:
-        position_m: (n, D).
-        own_m2: (n, D, D).
-        information: (n, D, D) its inverse.
-        moved_m: (n, D, R) how far one sigma of each shared variable moves them, but for the camera.
-        calibration: the camera's.
+        position_m: positions, shape (n, D).
+        own_m2: covariances of the independent errors, shape (n, D, D).
+        information: inverses of these covariances, shape (n, D, D).
+        moved_m: displacement by one sigma of each shared variable without those of the camera,
+            shape (n, D, R).
+        calibration: calibration error of the camera.
     """
 
     position_m: Float
@@ -105,8 +107,8 @@ class MapRows(NamedTuple):
     calibration: CalibrationError
 
     @classmethod
-    def of(cls, own_map: JointMap, rows: np.ndarray) -> "MapRows":
-        """The landmarks `rows` (n,) of a map."""
+    def of(cls, own_map: JointMap, rows: np.ndarray) -> "LandmarkRows":
+        """Return the landmarks `rows` (n,) of a map."""
         position = own_map.position_m[rows]
         d, joint = position.shape[1], own_map.joint
         own = joint.own_m2[rows][:, :d, :d]
@@ -114,10 +116,16 @@ class MapRows(NamedTuple):
         return cls(position, own, inverses(own), np.ascontiguousarray(moved), own_map.calibration)
 
 
-def said_of(own: MapRows, T: Float, shared: Float, arm_m: Float) -> Said:
-    """What a map says of its rows under its motion and shared variables.
+def transform_landmarks(
+    own: LandmarkRows, T: Float, shared: Float, arm_m: Float
+) -> TransformedLandmarks:
+    """Transform landmarks into the common frame.
 
-    The camera's errors move points at `arm_m` (n, D).
+    Args:
+        own: landmarks of a map.
+        T: pose of the map, shape (3,).
+        shared: shared variables of the map, shape (R,).
+        arm_m: positions in the map that the errors of the camera displace, shape (n, D).
     """
     (n, d), moved = own.position_m.shape, own.moved_m
     if not own.calibration.is_none:
@@ -129,29 +137,31 @@ def said_of(own: MapRows, T: Float, shared: Float, arm_m: Float) -> Said:
     by[:, :2, :3], by[:, 2:, :3] = motion_jacobian(T, point), 0.0
     np.matmul(R, moved, out=by[:, :, 3:])
     turned = R @ own.own_m2 @ R.T, R @ own.information @ R.T
-    return Said(transform_points(T, point), *turned, by)
+    return TransformedLandmarks(transform_points(T, point), *turned, by)
 
 
-def weighted_information(said: Said, weight: Float) -> Float:
-    """W (n, D, D)."""
-    return weight[:, None, None] * said.information
+def weighted_information(transformed: TransformedLandmarks, weight: Float) -> Float:
+    """Return W, shape (n, D, D)."""
+    return weight[:, None, None] * transformed.information
 
 
-# The next step would move what is sought, as a whole and in squared sigmas, by no more than this.
+# Convergence tolerance: squared length of the next step in sigmas.
 _CONVERGED = 1e-3
 _MOST_STEPS = 50
 
 
 @dataclass(frozen=True)
 class JointEstimate:
-    """K maps in the frame of the first.
+    """Poses and shared variables of K maps in the frame of the first.
 
     Attributes:
-        T_first_map: (K, 3), the first is no motion.
-        shared: of each map, (R_k,) its shared variables z.
-        covariance: (U, U) of all unknowns: three for each motion but the first, then the z.
-        weight: (C, K) of the Student-t, as information; 0 where a map has no part.
-        dof: degrees of freedom of the Student-t.
+        T_first_map: poses, shape (K, 3); the first is the identity.
+        shared: shared variables z of each map, shape (R_k,).
+        covariance: covariance of all unknowns, shape (U, U): three for each pose except the first,
+            then the shared variables.
+        weight: factors of the Student-t distribution on the information, shape (C, K); 0 if the
+            map lacks the point.
+        dof: degrees of freedom of the Student-t distribution.
     """
 
     T_first_map: Float
@@ -162,38 +172,48 @@ class JointEstimate:
 
     @property
     def motion_covariance(self) -> Float:
-        """(K, 3, 3) of each motion; the first is known."""
+        """Covariances of the poses, shape (K, 3, 3); zero for the first."""
         found = np.zeros((len(self.T_first_map), 3, 3))
         for k in range(1, len(found)):
             own = slice(3 * k - 3, 3 * k)
             found[k] = self.covariance[own, own]
         return found
 
-    def said(self, maps: Sequence[JointMap], k: int, rows: np.ndarray) -> Said:
-        """What map k says of its landmarks `rows` (n,), by its own unknowns: see `unknowns`."""
-        own = MapRows.of(maps[k], rows)
-        return said_of(own, self.T_first_map[k], self.shared[k], own.position_m)
+    def transformed(
+        self, maps: Sequence[JointMap], k: int, rows: np.ndarray
+    ) -> TransformedLandmarks:
+        """Transform the landmarks `rows` (n,) of map k into the common frame."""
+        own = LandmarkRows.of(maps[k], rows)
+        return transform_landmarks(own, self.T_first_map[k], self.shared[k], own.position_m)
 
     def unknowns(self, maps: Sequence[JointMap], k: int) -> np.ndarray:
-        """(U_k,) where those that map k depends on stand among all, ABSENT for none."""
+        """Return the indices (U_k,) of map k's unknowns in u; ABSENT for the known first pose."""
         return _columns(maps)[k]
 
-    def moved_m(self, maps: Sequence[JointMap], k: int, said: Said, factor: Float) -> Float:
-        """(n, D, U) how far a sigma of each independent variable moves what map k says.
+    def moved_m(
+        self, maps: Sequence[JointMap], k: int, transformed: TransformedLandmarks, factor: Float
+    ) -> Float:
+        """Return the displacement by independent unit variables, shape (n, D, U).
 
-        These are the columns of a lower triangular `factor` (U, U) of the unknowns' covariance.
+        Args:
+            maps: all maps.
+            k: index of the map.
+            transformed: landmarks of map k in the common frame.
+            factor: lower triangular factor (U, U) of the unknowns' covariance.
         """
         columns = self.unknowns(maps, k)
         known = columns != ABSENT
-        by = said.by_unknown[:, :, known].reshape(said.y_m.size, np.count_nonzero(known))
-        n = 1 + int(columns.max(initial=ABSENT))  # what comes after them in the factor is zero
-        moved = np.zeros((said.y_m.size, len(factor)))
+        by = transformed.by_unknown[:, :, known].reshape(
+            transformed.y_m.size, np.count_nonzero(known)
+        )
+        n = 1 + int(columns.max(initial=ABSENT))  # later columns of the factor are zero
+        moved = np.zeros((transformed.y_m.size, len(factor)))
         np.matmul(by, factor[columns[known], :n], out=moved[:, :n])
-        return moved.reshape(*said.y_m.shape, len(factor))
+        return moved.reshape(*transformed.y_m.shape, len(factor))
 
 
 def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
-    """Where in u motion and shared variables of each map stand; the first map's motion nowhere."""
+    """Return the indices of each map's unknowns in u; ABSENT for the pose of the first map."""
     first, of_camera, found = 3 * (len(maps) - 1), dict[str, np.ndarray](), list[np.ndarray]()
     for k, own in enumerate(maps):
         motion = np.arange(3 * k - 3, 3 * k) if k else np.full(3, ABSENT)
@@ -210,23 +230,23 @@ def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
 def estimate_jointly(
     maps: Sequence[JointMap], T_first_map: Float, parents: np.ndarray
 ) -> JointEstimate:
-    """Gauss-Newton steps from given motions, each with new weights.
+    """Compute the estimate by Gauss-Newton steps with robust weights.
 
     Args:
-        maps: K of them.
-        T_first_map: (K, 3) where to start from; the first stays.
-        parents: (C, K) rows of the maps that are one point, ABSENT for none; points of one map
-            alone say nothing here.
+        maps: K maps.
+        T_first_map: initial poses, shape (K, 3); the first does not change.
+        parents: rows of each point's landmarks in the maps, shape (C, K), ABSENT for none; each
+            point has landmarks of at least two maps.
     """
     T, shared = np.array(T_first_map), [np.zeros(each.n_shared) for each in maps]
     columns = _columns(maps)
     has = parents != ABSENT
-    rows = [MapRows.of(own, parents[has[:, k], k]) for k, own in enumerate(maps)]
+    rows = [LandmarkRows.of(own, parents[has[:, k], k]) for k, own in enumerate(maps)]
     weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
-    said = _all_said(rows, T, shared, has, weight)
+    transformed = _transform_all(rows, T, shared, has, weight)
     while True:
-        points = _points(said, has, weight)
-        A, gradient = _equations(said, has, weight, points, columns, shared)
+        points = _points(transformed, has, weight)
+        A, gradient = _equations(transformed, has, weight, points, columns, shared)
         factor = scipy.linalg.cholesky(A, lower=True)
         step = -scipy.linalg.cho_solve((factor, True), gradient)
         moved = float(np.sum((factor.T @ step) ** 2))
@@ -235,7 +255,7 @@ def estimate_jointly(
             weight *= share
             A *= share
             z = _shared(columns)
-            A[z, z] += 1.0 - share  # what was known of them before is all there
+            A[z, z] += 1.0 - share  # the prior is not scaled
             covariance = scipy.linalg.inv(A)
             return JointEstimate(T, tuple(shared), covariance, weight, dof)
         for k, own in enumerate(columns):
@@ -243,41 +263,48 @@ def estimate_jointly(
             if k:
                 T[k] += step[own[:3]]
         T[:, 2] = wrap(T[:, 2])
-        said = _all_said(rows, T, shared, has, weight)
-        weight, dof = _reweighted(said, has, weight, dof)
+        transformed = _transform_all(rows, T, shared, has, weight)
+        weight, dof = _update_weights(transformed, has, weight, dof)
         if not all(own.calibration.is_none for own in maps):
-            said = _all_said(rows, T, shared, has, weight)  # from where points are seen now
+            transformed = _transform_all(rows, T, shared, has, weight)  # at the new points
         n_steps += 1
 
 
-def _all_said(
-    rows: Sequence[MapRows], T: Float, shared: Sequence[Float], has: np.ndarray, weight: Float
-) -> list[Said]:
-    """What each map says of its `rows`.
+def _transform_all(
+    rows: Sequence[LandmarkRows], T: Float, shared: Sequence[Float], has: np.ndarray, weight: Float
+) -> list[TransformedLandmarks]:
+    """Transform the landmarks of all maps into the common frame.
 
-    Errors of cameras move points from where all maps together see them. Moved from where the one
-    map does, they would move its noise too, and all maps shrink, since that shrinks residuals.
+    Errors of a camera displace the estimated points. If they displaced the observed landmarks,
+    their noise would be scaled as well, and the maps would shrink to reduce the residuals.
     """
-    said = [said_of(*each, each[0].position_m) for each in zip(rows, T, shared, strict=True)]
+    transformed = [
+        transform_landmarks(*each, each[0].position_m) for each in zip(rows, T, shared, strict=True)
+    ]
     if all(own.calibration.is_none for own in rows):
-        return said
-    g = _points(said, has, weight).g_m
+        return transformed
+    g = _points(transformed, has, weight).g_m
     arms = [transform_points(inverse(T[k]), g[has[:, k]]) for k in range(len(rows))]
-    return list(map(said_of, rows, T, shared, arms))
+    return list(map(transform_landmarks, rows, T, shared, arms))
 
 
 class _Points(NamedTuple):
-    """Points g (C, D) as the weighted means of what maps say, and their covariances V (C, D, D)."""
+    """Weighted means of the landmarks of each point.
+
+    Attributes:
+        g_m: positions g, shape (C, D).
+        covariance_m2: covariances V, shape (C, D, D).
+    """
 
     g_m: Float
     covariance_m2: Float
 
 
-def _points(said: Sequence[Said], has: np.ndarray, weight: Float) -> _Points:
-    n_dimensions = said[0].y_m.shape[1]
+def _points(transformed: Sequence[TransformedLandmarks], has: np.ndarray, weight: Float) -> _Points:
+    n_dimensions = transformed[0].y_m.shape[1]
     information = np.zeros((len(has), n_dimensions, n_dimensions))
     total = np.zeros((len(has), n_dimensions))
-    for k, own in enumerate(said):
+    for k, own in enumerate(transformed):
         W = weighted_information(own, weight[has[:, k], k])
         information[has[:, k]] += W
         total[has[:, k]] += np.einsum("nij,nj->ni", W, own.y_m)
@@ -286,25 +313,25 @@ def _points(said: Sequence[Said], has: np.ndarray, weight: Float) -> _Points:
 
 
 def _equations(
-    said: Sequence[Said],
+    transformed: Sequence[TransformedLandmarks],
     has: np.ndarray,
     weight: Float,
     points: _Points,
     columns: Sequence[np.ndarray],
     shared: Sequence[Float],
 ) -> tuple[Float, Float]:
-    """The normal equations of a step: matrix (U, U) and gradient (U,)."""
+    """Return the normal equations of a step: matrix (U, U) and gradient (U,)."""
     n_unknowns = 1 + max(int(own.max(initial=ABSENT)) for own in columns)
-    A, gradient = np.zeros((n_unknowns + 1,) * 2), np.zeros(n_unknowns + 1)  # the last: ABSENT
-    W = [weighted_information(own, weight[has[:, k], k]) for k, own in enumerate(said)]
-    for k, own in enumerate(said):
+    A, gradient = np.zeros((n_unknowns + 1,) * 2), np.zeros(n_unknowns + 1)  # last: ABSENT
+    W = [weighted_information(own, weight[has[:, k], k]) for k, own in enumerate(transformed)]
+    for k, own in enumerate(transformed):
         off = own.y_m - points.g_m[has[:, k]]
-        pulled = (W[k] @ off[:, :, None]).ravel()
-        gradient[columns[k]] += own.by_unknown.reshape(-1, len(columns[k])).T @ pulled
+        weighted = (W[k] @ off[:, :, None]).ravel()
+        gradient[columns[k]] += own.by_unknown.reshape(-1, len(columns[k])).T @ weighted
         by, its = own.by_unknown, columns[k]
         between = W[k] - W[k] @ points.covariance_m2[has[:, k]] @ W[k]
         A[np.ix_(its, its)] += by.reshape(-1, len(its)).T @ (between @ by).reshape(-1, len(its))
-        for m, other in enumerate(said[:k]):
+        for m, other in enumerate(transformed[:k]):
             both = has[:, k] & has[:, m]
             here, there = both[has[:, k]], both[has[:, m]]
             between = -W[k][here] @ points.covariance_m2[both] @ W[m][there]
@@ -322,39 +349,32 @@ def _equations(
 
 
 def _shared(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """Where in u the shared variables of all maps stand."""
+    """Return the indices of the shared variables in u."""
     return np.unique(np.concatenate([own[3:] for own in columns]))
 
 
-def _reweighted(
-    said: Sequence[Said], has: np.ndarray, weight: Float, dof: float
+def _update_weights(
+    transformed: Sequence[TransformedLandmarks], has: np.ndarray, weight: Float, dof: float
 ) -> tuple[Float, float]:
-    """Weights (C, K) of the Student-t, and its degrees of freedom, for what is off now.
+    """Compute new weights (C, K) and degrees of freedom of the Student-t distribution.
 
-    Those so far are near the new ones.
-
-    The squares are those expected about the true points (the E step of Lange et al., 1989).
+    The degrees of freedom are fitted to the distances of the landmarks from their unweighted mean.
+    If they are Gaussian, the sum for M maps in D dimensions has a chi-square distribution with
+    D (M - 1) degrees of freedom. The weights are those of the squares about the true points (E step
+    of Lange et al., 1989).
     """
-    new, points = np.zeros_like(weight), _points(said, has, weight)
-    n_dimensions = points.g_m.shape[1]
-    dof = fitted_dof(
-        _disagreement(said, has), n_dimensions * (np.count_nonzero(has, axis=1) - 1), dof
-    )
-    for k, own in enumerate(said):
+    unweighted = _points(transformed, has, has.astype(np.float64))
+    total = np.zeros(len(has))
+    for k, own in enumerate(transformed):
+        off = own.y_m - unweighted.g_m[has[:, k]]
+        total[has[:, k]] += np.einsum("ni,nij,nj->n", off, own.information, off)
+    n_dimensions = unweighted.g_m.shape[1]
+    dof = fit_dof(total, n_dimensions * (np.count_nonzero(has, axis=1) - 1), dof)
+
+    new, points = np.zeros_like(weight), _points(transformed, has, weight)
+    for k, own in enumerate(transformed):
         off = own.y_m - points.g_m[has[:, k]]
         spread = off[:, :, None] * off[:, None, :] + points.covariance_m2[has[:, k]]
         squares = np.einsum("nij,nij->n", own.information, spread)
         new[has[:, k], k] = student_weights(squares, dof, n_dimensions)
     return new, dof
-
-
-def _disagreement(said: Sequence[Said], has: np.ndarray) -> Float:
-    """(C,) how far what maps say of a point lies from its mean, all with their whole weight.
-
-    Of M maps in D dimensions a chi-square with D (M - 1) degrees of freedom, if Gaussian.
-    """
-    points, total = _points(said, has, has.astype(np.float64)), np.zeros(len(has))
-    for k, own in enumerate(said):
-        off = own.y_m - points.g_m[has[:, k]]
-        total[has[:, k]] += np.einsum("ni,nij,nj->n", off, own.information, off)
-    return total

@@ -1,7 +1,7 @@
 """Kalman fusion of pairs of landmarks (eq. 12-16), with and without the drift of the maps.
 
-First by the inliers of its alignments with these, then what they missed is paired by gate and
-descriptor with any fused landmark; the rest is carried over.
+Maps are fused one after the other. Landmarks are paired by the inliers of the alignments first, and
+the remaining ones by gate and descriptor. Landmarks without a partner are kept.
 """
 
 from collections.abc import Sequence
@@ -12,25 +12,24 @@ from mapfusion.fusion.aligned_landmarks import (
     ABSENT,
     AlignedLandmarks,
     FusePairs,
-    SamePoint,
     one_to_one,
 )
 from mapfusion.fusion.fused_map import AlignedPair, Component, FusedMap, MergeParameters
 from mapfusion.geometry.numerics import Float
 
 
-def fused_in_turn(
+def fuse_sequentially(
     component: Component, parameters: MergeParameters, fuse_pairs: FusePairs, use_drift: bool
 ) -> FusedMap:
-    """The members fused.
+    """Fuse the maps of a component one after the other.
 
     Args:
-        component: what is fused.
-        parameters: how landmarks are paired that no alignment names.
-        fuse_pairs: what becomes of two landmarks.
-        use_drift: weigh with, and report, S + s_drift^2 I instead of the paper's S.
+        component: the maps with their poses.
+        parameters: parameters of the pairing.
+        fuse_pairs: function that fuses two landmarks.
+        use_drift: use S + s_drift^2 I instead of the paper's covariance S.
     """
-    fused = landmarks_in_turn(component, parameters, fuse_pairs, use_drift)
+    fused = fuse_landmarks_sequentially(component, parameters, fuse_pairs, use_drift)
     planar, drift = component.planar, component.drift_sigma_m
     return FusedMap(
         fused.landmark_map(planar, component.maps[component.members[0]].name),
@@ -38,39 +37,46 @@ def fused_in_turn(
         component.T_first_map,
         component.motion_covariance,
         drift if use_drift else np.where(np.isnan(drift), np.nan, 0.0),
-        parameters.same_point(planar).duplicate_share(fused),
+        parameters.association_test(planar).duplicate_share(fused),
         component.left_out,
     )
 
 
-def landmarks_in_turn(
+def fuse_landmarks_sequentially(
     component: Component, parameters: MergeParameters, fuse_pairs: FusePairs, use_drift: bool
 ) -> AlignedLandmarks:
-    """The landmarks alone, of the same."""
+    """Return the landmarks that `fuse_sequentially` computes."""
     members, planar = component.by_name, component.planar
-    test, drift = parameters.same_point(planar), component.drift_sigma_m
+    test, drift = parameters.association_test(planar), component.drift_sigma_m
 
-    def moved(k: int) -> AlignedLandmarks:
+    def transformed(k: int) -> AlignedLandmarks:
         sigma_T = component.motion_covariance[k] if parameters.use_alignment_uncertainty else None
         T = component.T_first_map[k]
         return AlignedLandmarks.of(component.maps, k, T, sigma_T, drift[k], use_drift)
 
-    fused = moved(members[0])
+    fused = transformed(members[0])
     for k in members[1:]:
-        other = moved(k)
-        rows, others = _paired(fused, other, *_inliers(fused, k, component.pairs), test)
-        fused = fused.joined(other, rows, others, 2 if planar else 3, fuse_pairs)
+        other = transformed(k)
+        rows, others = _inliers(fused, k, component.pairs)
+        # associate the landmarks that are no inliers of an alignment
+        unmatched = np.setdiff1d(np.arange(len(fused)), rows)
+        unmatched_others = np.setdiff1d(np.arange(len(other)), others)
+        candidates = test.candidates(fused[unmatched], other[unmatched_others])
+        more_rows, more_others = one_to_one(*candidates)
+        rows = np.concatenate([rows, unmatched[more_rows]])
+        others = np.concatenate([others, unmatched_others[more_others]])
+        fused = fused.fuse_with(other, rows, others, 2 if planar else 3, fuse_pairs)
     return fused
 
 
 def _inliers(
     fused: AlignedLandmarks, k: int, pairs: Sequence[AlignedPair]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the fused map and of map k that alignments with maps in it say are one.
+    """Return rows of the fused map and of map k that are inliers of an alignment.
 
-    Where two say different things, what is most alike counts.
+    Contradictory pairs are resolved in the order of their descriptor distance.
     """
-    rows, others, unlike = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
+    rows, others, dissimilarity = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
     for pair in pairs:
         if k not in (pair.a, pair.b):
             continue
@@ -84,45 +90,25 @@ def _inliers(
         has = row_of[index] != ABSENT
         rows.append(row_of[index[has]])
         others.append(own[has])
-        unlike.append(pair.inliers.distance[has])
-    return one_to_one(np.concatenate(rows), np.concatenate(others), np.concatenate(unlike))
+        dissimilarity.append(pair.inliers.distance[has])
+    return one_to_one(np.concatenate(rows), np.concatenate(others), np.concatenate(dissimilarity))
 
 
-def _paired(
-    fused: AlignedLandmarks,
-    other: AlignedLandmarks,
-    rows: np.ndarray,
-    others: np.ndarray,
-    test: SamePoint,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the fused and of the other map that are one: those given, then what they missed."""
-    missed_rows = np.setdiff1d(np.arange(len(fused)), rows)
-    missed_others = np.setdiff1d(np.arange(len(other)), others)
-    more_rows, more_others = one_to_one(*test.candidates(fused[missed_rows], other[missed_others]))
-    return (
-        np.concatenate([rows, missed_rows[more_rows]]),
-        np.concatenate([others, missed_others[more_others]]),
-    )
-
-
-class Kalman:
-    """With the landmarks' covariances as the filter states them, as the paper has it."""
-
-    smoothed = False
-
-    def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
-        """Fuse the component's members."""
-        return fused_in_turn(component, parameters, kalman_fused, use_drift=False)
-
-
-def kalman_fused(
+def kalman_update(
     position_i: Float, covariance_i: Float, position_j: Float, covariance_j: Float
 ) -> tuple[Float, Float]:
-    """Stationary Kalman filter on pairs of landmarks in one frame (eq. 12 to 14).
+    """Fuse N pairs of landmarks in a common frame by a stationary Kalman filter (eq. 12 to 14).
 
-    Eq. 13 is printed with L_i - L_j, which moves the result away from L_j; the sign here is right.
+    Eq. 13 is printed with L_i - L_j, which has the wrong sign.
 
-    Positions are (N, D), covariances (N, D, D), those returned as well.
+    Args:
+        position_i: positions of the first landmarks, shape (N, D).
+        covariance_i: covariances of the first landmarks, shape (N, D, D).
+        position_j: positions of the second landmarks, shape (N, D).
+        covariance_j: covariances of the second landmarks, shape (N, D, D).
+
+    Returns:
+        fused positions (N, D) and covariances (N, D, D).
     """
     # S_i and S_i + S_j are symmetric, so K^T solves (S_i + S_j) K^T = S_i
     gain = np.swapaxes(np.linalg.solve(covariance_i + covariance_j, covariance_i), 1, 2)  # eq. 12
@@ -131,11 +117,21 @@ def kalman_fused(
     return position, (covariance + np.swapaxes(covariance, 1, 2)) / 2
 
 
-class KalmanDrift:
-    """With S + s_drift^2 I in place of the paper's S."""
+class Kalman:
+    """Kalman fusion with the covariances of the filter, as in the paper."""
 
     smoothed = False
 
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
-        """Fuse the component's members."""
-        return fused_in_turn(component, parameters, kalman_fused, use_drift=True)
+        """Fuse the maps of a component."""
+        return fuse_sequentially(component, parameters, kalman_update, use_drift=False)
+
+
+class KalmanDrift:
+    """Kalman fusion with the covariances S + s_drift^2 I."""
+
+    smoothed = False
+
+    def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
+        """Fuse the maps of a component."""
+        return fuse_sequentially(component, parameters, kalman_update, use_drift=True)

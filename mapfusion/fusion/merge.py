@@ -9,48 +9,47 @@ from mapfusion.align.alignment import Status
 from mapfusion.align.drift import whole_map_covariance
 from mapfusion.fusion.fused_map import AlignedPair, Component, Fusion, MergeParameters, name_order
 from mapfusion.fusion.fusers import Fuser, make_fuser
-from mapfusion.fusion.pose_graph import Relations
-from mapfusion.fusion.team_graph import Place, TeamGraph, TeamParameters, team_graph
-from mapfusion.geometry.numerics import Float
+from mapfusion.fusion.pose_graph import AlignmentEdges
+from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters, team_graph
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import require_shape
-from mapfusion.smoother.joint_smoothing import Recording
+from mapfusion.smoother.joint_smoothing import AssociatedLog
 
 DEFAULTS = MergeParameters()
 
 
 @dataclass(frozen=True)
 class ConnectedMaps:
-    """Maps of a team, and what its alignments say together.
+    """Connected components of a team's maps.
 
     Attributes:
-        components: maps that believed alignments connect, those of the most maps first. Maps that
-            nothing connects are none; if that is so of all, the first is there alone.
-        place: of each pair, what the team's others say of its alignment.
+        components: components of at least two maps, largest first; if no maps are connected, a
+            component with the first map only.
+        edge_status: status of the alignment of each pair.
     """
 
     components: tuple[Component, ...]
-    place: tuple[Place, ...]
+    edge_status: tuple[EdgeStatus, ...]
 
     def fused_by(
         self,
         fuser: Fuser,
         parameters: MergeParameters,
         smoothed: Sequence[LandmarkMap] | None = None,
-        recordings: Sequence[Recording | None] = (),
+        recordings: Sequence[AssociatedLog | None] = (),
     ) -> Fusion:
-        """Each component made one map.
+        """Fuse the maps of each component.
 
         Args:
-            fuser: what makes it.
-            parameters: its settings.
-            smoothed: the same robots' maps by the smoother, for fusers that take these.
-            recordings: what each of these was smoothed from, for fusers that smooth again.
+            fuser: fusion method.
+            parameters: parameters of the merge.
+            smoothed: smoothed maps of the same robots, for fusers that use them.
+            recordings: logs of the smoothed maps, for fusers that smooth again.
         """
         given = [replace(each, recordings=tuple(recordings)) for each in self.components]
         if fuser.smoothed and smoothed is not None:
             given = [component.on(smoothed) for component in given]
-        return Fusion(tuple(fuser.fuse(each, parameters) for each in given), self.place)
+        return Fusion(tuple(fuser.fuse(each, parameters) for each in given), self.edge_status)
 
 
 def merge(
@@ -59,21 +58,21 @@ def merge(
     parameters: MergeParameters = DEFAULTS,
     fuser: Fuser | None = None,
 ) -> Fusion:
-    """Fuse two or more maps, as far as alignments connect them.
+    """Fuse the maps that accepted alignments connect.
 
-    The order in which maps and pairs are given decides on frames alone, and where two answers are
-    equally good.
+    The order of maps and pairs affects only the frames, and the choice between equally good
+    results.
 
     Args:
-        maps: M of them.
-        pairs: each two of them at most once; of ambiguous ones as many as there are alternatives.
-            Alignments that were not accepted are left out, but for an alternative that those of
-            other maps tell from its rivals.
-        parameters: how to merge.
-        fuser: what makes connected maps one; the `joint` one if None.
+        maps: M maps, at least two.
+        pairs: alignments, at most one for two maps. Two maps with an ambiguous alignment have one
+            entry for each alternative. Rejected alignments are not used. An alternative is used if
+            alignments of other maps confirm it alone.
+        parameters: parameters of the merge.
+        fuser: fusion method; None: `joint`.
 
     Raises:
-        ValueError: pairs that do not fit the maps, or fewer than two maps.
+        ValueError: the pairs do not fit the maps, or there are fewer than two maps.
     """
     return connect(maps, pairs, parameters.team).fused_by(fuser or make_fuser(), parameters)
 
@@ -83,64 +82,50 @@ def connect(
     pairs: Sequence[AlignedPair],
     parameters: TeamParameters = DEFAULTS.team,
 ) -> ConnectedMaps:
-    """Judge all accepted alignments together (`mapfusion/team`), and place the maps by them.
+    """Select consistent alignments (`team_graph`) and compute the poses of connected maps.
+
+    Args:
+        maps: M maps, at least two.
+        pairs: alignments; see `merge`.
+        parameters: parameters of the selection.
 
     Raises:
-        ValueError: pairs that do not fit the maps, or fewer than two maps.
+        ValueError: the pairs do not fit the maps, or there are fewer than two maps.
     """
-    _require_fitting(maps, pairs)
-    rank = _ranks(maps)
+    _require_valid_pairs(maps, pairs)
+    # Sort maps by name, so that the result does not depend on their order.
+    rank = np.empty(len(maps), dtype=np.int64)
+    by_rank = np.array(sorted(range(len(maps)), key=lambda k: name_order(maps[k].name)))
+    rank[by_rank] = np.arange(len(maps))
     order = sorted(range(len(pairs)), key=lambda e: sorted((rank[pairs[e].a], rank[pairs[e].b])))
     accepted = [e for e in order if pairs[e].alignment.ok]
-    open_ = [e for e in order if pairs[e].alignment.status is Status.AMBIGUOUS]
-    by_itself, left_open = ([pairs[e] for e in some] for some in (accepted, open_))
-    graph = _graph(maps, by_itself, left_open, rank, parameters)
-    said = dict(zip([*accepted, *open_], graph.place, strict=True))
-    place = tuple(said.get(e, Place.REFUSED) for e in range(len(pairs)))
-    believed = [pairs[e] for e in order if place[e] in (Place.CONFIRMED, Place.BRIDGE)]
-    several = np.flatnonzero(np.bincount(graph.component) > 1)
-    components = []
-    for name in several if len(several) else graph.component[:1]:
-        members = np.flatnonzero(graph.component == name)
-        own = tuple(pair for pair in believed if graph.component[pair.a] == name)
-        left_out = _left_out(maps, members, pairs, place)
-        T, covariance = _of_members(graph, members)
-        components.append(Component(tuple(maps), members, own, T, covariance, left_out))
-    return ConnectedMaps(tuple(components), place)
-
-
-def _of_members(graph: TeamGraph, members: np.ndarray) -> tuple[Float, Float]:
-    """Motions (M, 3) with their covariances (M, 3, 3), NaN for all but the members."""
-    T, covariance = np.full_like(graph.T_root_robot, np.nan), np.full_like(graph.covariance, np.nan)
-    T[members], covariance[members] = graph.T_root_robot[members], graph.covariance[members]
-    return T, covariance
-
-
-def _ranks(maps: Sequence[LandmarkMap]) -> np.ndarray:
-    """(M,) place of each map in the order of their names; of one name, that of the maps."""
-    rank = np.empty(len(maps), dtype=np.int64)
-    rank[sorted(range(len(maps)), key=lambda k: name_order(maps[k].name))] = np.arange(len(maps))
-    return rank
-
-
-def _graph(
-    maps: Sequence[LandmarkMap],
-    accepted: Sequence[AlignedPair],
-    alternatives: Sequence[AlignedPair],
-    rank: np.ndarray,
-    parameters: TeamParameters,
-) -> TeamGraph:
-    """All alignments judged together, robots by their rank; each component's root is its first."""
-    by_rank = np.argsort(rank)
-    both = (_relations(maps, some) for some in (accepted, alternatives))
-    ranked, open_ = (replace(each, robots=rank[each.robots]) for each in both)
-    graph = team_graph(ranked, parameters, by_rank, open_)
-    return TeamGraph(
-        graph.component[rank], graph.T_root_robot[rank], graph.covariance[rank], graph.place
+    ambiguous = [e for e in order if pairs[e].alignment.status is Status.AMBIGUOUS]
+    edges, alternatives = (
+        _alignment_edges(maps, [pairs[e] for e in rows], rank) for rows in (accepted, ambiguous)
     )
+    graph = team_graph(edges, parameters, by_rank, alternatives)
+    status_of = dict(zip([*accepted, *ambiguous], graph.edge_status, strict=True))
+    status = tuple(status_of.get(e, EdgeStatus.REFUSED) for e in range(len(pairs)))
+    used = [pairs[e] for e in order if status[e] in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE)]
+
+    component = graph.component[rank]
+    several = np.flatnonzero(np.bincount(component) > 1)
+    components = []
+    for name in several if len(several) else component[:1]:
+        members = np.flatnonzero(component == name)
+        own = tuple(pair for pair in used if component[pair.a] == name)
+        left_out = _left_out(maps, members, pairs, status)
+        T, covariance = np.full((len(maps), 3), np.nan), np.full((len(maps), 3, 3), np.nan)
+        T[members] = graph.T_root_robot[rank[members]]
+        covariance[members] = graph.covariance[rank[members]]
+        components.append(Component(tuple(maps), members, own, T, covariance, left_out))
+    return ConnectedMaps(tuple(components), status)
 
 
-def _relations(maps: Sequence[LandmarkMap], accepted: Sequence[AlignedPair]) -> Relations:
+def _alignment_edges(
+    maps: Sequence[LandmarkMap], pairs: Sequence[AlignedPair], rank: np.ndarray
+) -> AlignmentEdges:
+    """Return the alignments as edges between the ranks of their maps."""
     covariance = [
         whole_map_covariance(
             pair.alignment.T_a_b,
@@ -148,14 +133,14 @@ def _relations(maps: Sequence[LandmarkMap], accepted: Sequence[AlignedPair]) -> 
             pair.alignment.drift_sigma_m,
             maps[pair.a].position_m[pair.inliers.index_a, :2],
         )
-        for pair in accepted
+        for pair in pairs
     ]
-    return Relations(
+    return AlignmentEdges(
         len(maps),
-        np.array([(pair.a, pair.b) for pair in accepted], dtype=np.int64).reshape(-1, 2),
-        np.array([pair.alignment.T_a_b for pair in accepted]).reshape(-1, 3),
+        rank[np.array([(pair.a, pair.b) for pair in pairs], dtype=np.int64).reshape(-1, 2)],
+        np.array([pair.alignment.T_a_b for pair in pairs]).reshape(-1, 3),
         np.array(covariance).reshape(-1, 3, 3),
-        np.array([pair.log10_false_alarms for pair in accepted], dtype=np.float64),
+        np.array([pair.log10_false_alarms for pair in pairs], dtype=np.float64),
     )
 
 
@@ -163,39 +148,40 @@ def _left_out(
     maps: Sequence[LandmarkMap],
     members: np.ndarray,
     pairs: Sequence[AlignedPair],
-    place: Sequence[Place],
+    status: Sequence[EdgeStatus],
 ) -> tuple[tuple[str, str], ...]:
-    """Name of each other map, in their order, with the reason."""
-    inside, why = set(members.tolist()), []
+    """Return the name of each map that is no member, with the reason."""
+    inside, reasons = set(members.tolist()), []
     for k in sorted(set(range(len(maps))) - inside):
-        told = {
-            said: pair
-            for pair, said in zip(reversed(pairs), reversed(place), strict=True)
+        pair_of = {
+            each: pair
+            for pair, each in zip(reversed(pairs), reversed(status), strict=True)
             if (pair.a == k and pair.b in inside) or (pair.b == k and pair.a in inside)
         }
-        if Place.AMBIGUOUS in told or Place.CONTRADICTED in told:
+        if EdgeStatus.AMBIGUOUS in pair_of or EdgeStatus.CONTRADICTED in pair_of:
             reason = "the team's alignments contradict each other about it"
-        elif Place.UNCONFIRMED in told:
+        elif EdgeStatus.UNCONFIRMED in pair_of:
             reason = "no other alignment confirms its own"
-        elif told:
-            reason = told[Place.REFUSED].alignment.reason
+        elif pair_of:
+            reason = pair_of[EdgeStatus.REFUSED].alignment.reason
         else:
             reason = "no alignment connects it"
-        why.append((maps[k].name, reason))
-    return tuple(why)
+        reasons.append((maps[k].name, reason))
+    return tuple(reasons)
 
 
-def _require_fitting(maps: Sequence[LandmarkMap], pairs: Sequence[AlignedPair]) -> None:
+def _require_valid_pairs(maps: Sequence[LandmarkMap], pairs: Sequence[AlignedPair]) -> None:
+    """Raise ValueError if the pairs do not fit the maps."""
     if len(maps) < 2:
         raise ValueError(f"maps: {len(maps)} given, at least 2 are needed")
-    met: set[frozenset[int]] = set()
+    known: set[frozenset[int]] = set()
     for k, pair in enumerate(pairs):
         both = frozenset((pair.a, pair.b))
         if len(both) < 2 or not 0 <= min(both) <= max(both) < len(maps):
             raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are no two of {len(maps)} maps")
-        if both in met and pair.alignment.status is not Status.AMBIGUOUS:
+        if both in known and pair.alignment.status is not Status.AMBIGUOUS:
             raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are given twice")
-        met.add(both)
+        known.add(both)
         require_shape(
             f"pairs[{k}].alignment.inlier", pair.alignment.inlier, (len(pair.correspondences),)
         )

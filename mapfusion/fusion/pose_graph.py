@@ -14,15 +14,16 @@ from mapfusion.parameters import require_finite, require_shape
 
 
 @dataclass(frozen=True)
-class Relations:
+class AlignmentEdges:
     """E alignments between N robots' maps.
 
     Attributes:
-        n_robots: N.
-        robots: (E, 2) a and b of each, two different ones of 0 to N - 1.
-        T_a_b: (E, 3).
-        covariance: (E, 3, 3) of T_a_b.
-        log10_false_alarms: (E,) of each alignment by itself, the lower the surer.
+        n_robots: number of robots N.
+        robots: different robots a and b of each alignment, 0 to N - 1, shape (E, 2).
+        T_a_b: pose of map b in map a, shape (E, 3).
+        covariance: covariances of T_a_b, shape (E, 3, 3).
+        log10_false_alarms: logarithm of the expected number of false alarms of each alignment,
+            shape (E,).
     """
 
     n_robots: int
@@ -47,19 +48,19 @@ class Relations:
     def __len__(self) -> int:
         return len(self.robots)
 
-    def __getitem__(self, rows: np.ndarray) -> "Relations":
-        """Some of them."""
+    def __getitem__(self, rows: np.ndarray) -> "AlignmentEdges":
+        """Return the edges with these row numbers."""
         parts = (self.robots, self.T_a_b, self.covariance, self.log10_false_alarms)
-        return Relations(self.n_robots, *(part[rows] for part in parts))
+        return AlignmentEdges(self.n_robots, *(part[rows] for part in parts))
 
-    def joined(self, other: "Relations") -> "Relations":
-        """With others between the same robots behind them."""
+    def concatenated(self, other: "AlignmentEdges") -> "AlignmentEdges":
+        """Return these edges followed by others between the same robots."""
         names = ("robots", "T_a_b", "covariance", "log10_false_alarms")
         both = (np.concatenate([getattr(self, n), getattr(other, n)]) for n in names)
-        return Relations(self.n_robots, *both)
+        return AlignmentEdges(self.n_robots, *both)
 
-    def reach_m(self) -> float:
-        """The farthest that any of them moves a map."""
+    def max_distance_m(self) -> float:
+        """Return the largest translation of an edge, in m."""
         return float(np.linalg.norm(self.T_a_b[:, :2], axis=1).max(initial=0.0))
 
 
@@ -74,7 +75,7 @@ class Motions:
         return Motions(self.T[rows], self.covariance[rows])
 
     def inverse(self) -> "Motions":
-        """The way back, to first order."""
+        """Return the inverse motions, with covariances to first order."""
         back = inverse(self.T)
         cos, sin = np.cos(self.T[:, 2]), np.sin(self.T[:, 2])
         J = np.zeros((len(back), 3, 3))
@@ -83,8 +84,8 @@ class Motions:
         J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = back[:, 1], -back[:, 0], -1.0
         return Motions(back, J @ self.covariance @ J.swapaxes(1, 2))
 
-    def then(self, other: "Motions") -> "Motions":
-        """Chained with motions that are independent of these, to first order."""
+    def compose_independent(self, other: "Motions") -> "Motions":
+        """Compose with independent motions, with covariances to first order."""
         cos, sin = np.cos(self.T[:, 2]), np.sin(self.T[:, 2])
         x, y = other.T[:, 0], other.T[:, 1]
         by_first = np.tile(np.eye(3), (len(x), 1, 1))
@@ -97,32 +98,35 @@ class Motions:
         return Motions(compose(self.T, other.T), covariance)
 
 
-# Gauss-Newton steps; what agrees is off by a few deviations, which leaves nothing after the third.
+# Number of Gauss-Newton steps. For consistent edges the steps converge after the third.
 _STEPS = 4
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where robots' maps lie in the frame of one of them.
+    """Poses of n robots' maps in the frame of one of them, the root.
 
     Attributes:
-        row: (N,) place of each robot of the team below, -1 for those that are not placed.
-        T_root_robot: (n, 3); the first is the root, at the identity.
-        covariance: (n, n, 3, 3) of all poses jointly; zero for the root.
+        row: row of each robot of the team in the arrays below, shape (N,); -1 for none.
+        T_root_robot: poses, shape (n, 3); the first is the root, at the identity.
+        covariance: joint covariance of all poses, shape (n, n, 3, 3); zero for the root.
     """
 
     row: np.ndarray
     T_root_robot: Float
     covariance: Float
 
-    def holds(self, robots: np.ndarray) -> np.ndarray:
-        """Whether robots (...) are placed."""
+    def contains(self, robots: np.ndarray) -> np.ndarray:
+        """Return True for robots (...) with a pose."""
         return self.row[robots] >= 0
 
     def squared_distances(self, robots: np.ndarray, motions: Motions) -> tuple[Float, Float]:
-        """(n,) Mahalanobis distances of motions between placed robots (n, 2); the S behind them.
+        """Compare motions between pairs of robots (n, 2) with the placement.
 
         The motions are independent of the placement.
+
+        Returns:
+            squared Mahalanobis distances (n,) and their covariances S (n, 3, 3).
         """
         a, b = self.row[robots[:, 0]], self.row[robots[:, 1]]
         e, before, after = _residuals(self.T_root_robot, a, b, motions.T)
@@ -134,74 +138,74 @@ class Placement:
         return np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0]), S
 
     def relative(self, robots: np.ndarray) -> Motions:
-        """T_a_b of pairs (n, 2) of placed robots."""
+        """Return T_a_b of pairs (n, 2) of robots."""
         a, b = self.row[robots[:, 0]], self.row[robots[:, 1]]
         T = between(self.T_root_robot[a], self.T_root_robot[b])
         _, S = self.squared_distances(robots, Motions(T, np.zeros((len(T), 3, 3))))
         return Motions(T, S)
 
 
-def placed(relations: Relations, which: np.ndarray, root: int | None = None) -> Placement:
-    """Place the robots that alignments `which` (rows) connect, in the frame of one of them.
+def optimize_poses(edges: AlignmentEdges, rows: np.ndarray, root: int | None = None) -> Placement:
+    """Compute the poses of the robots that edges connect.
 
-    That is the first, unless a root is named.
+    Args:
+        edges: the alignments.
+        rows: rows of the edges that are used.
+        root: robot that defines the frame; by default the first robot.
 
     Raises:
-        ValueError: they do not connect their robots.
+        ValueError: the edges do not connect their robots.
     """
-    robots = np.unique(relations.robots[which])
+    robots = np.unique(edges.robots[rows])
     if root is not None:
         robots = np.concatenate([[root], robots[robots != root]])
-    row = np.full(relations.n_robots, -1)
+    row = np.full(edges.n_robots, -1)
     row[robots] = np.arange(len(robots))
-    a, b = row[relations.robots[which]].T
-    T, covariance = relations.T_a_b[which], relations.covariance[which]
-    at = _chained(len(robots), a, b, T)
+    a, b = row[edges.robots[rows]].T
+    T, covariance = edges.T_a_b[rows], edges.covariance[rows]
+    # initial poses: chains of alignments from the root
+    n = len(robots)
+    at = np.full((n, 3), np.nan)
+    at[0] = IDENTITY
+    while not np.isfinite(at).all():
+        known = np.isfinite(at[:, 0])
+        forward, backward = known[a] & ~known[b], known[b] & ~known[a]
+        if not (forward | backward).any():
+            raise ValueError("rows: these alignments do not connect their robots")
+        at[b[forward]] = compose(at[a[forward]], T[forward])
+        at[a[backward]] = compose(at[b[backward]], inverse(T[backward]))
     information = np.asarray(np.linalg.inv(covariance), np.float64)
     for _ in range(_STEPS):
         normal, right = _equations(at, a, b, T, information)
         step = np.linalg.solve(normal, right).reshape(-1, 3)
         at[1:] += step
         at[:, 2] = wrap(at[:, 2])
-    n = len(robots)
     P = np.zeros((n, n, 3, 3))
     joint = np.linalg.inv(_equations(at, a, b, T, information)[0])
     P[1:, 1:] = joint.reshape(n - 1, 3, n - 1, 3).swapaxes(1, 2)
     return Placement(row, at, P)
 
 
-def _chained(n: int, a: np.ndarray, b: np.ndarray, T_a_b: Float) -> Float:
-    """(n, 3) poses along some alignments from the first."""
-    at = np.full((n, 3), np.nan)
-    at[0] = IDENTITY
-    for _ in range(n):
-        known = np.isfinite(at[:, 0])
-        if known.all():
-            return at
-        on, back = known[a] & ~known[b], known[b] & ~known[a]
-        at[b[on]] = compose(at[a[on]], T_a_b[on])
-        at[a[back]] = compose(at[b[back]], inverse(T_a_b[back]))
-    raise ValueError("which: these alignments do not connect their robots")
-
-
 def _residuals(at: Float, a: np.ndarray, b: np.ndarray, T_a_b: Float) -> tuple[Float, Float, Float]:
-    """Residuals (n, 3) and their derivatives (n, 3, 3) by the poses of a and of b."""
+    """Return residuals (n, 3) and their Jacobians (n, 3, 3) by the poses of a and of b."""
     n = len(a)
     e = between(at[a], at[b]) - T_a_b
     e[:, 2] = wrap(e[:, 2])
     to_a = rotation(at[a, 2]).swapaxes(1, 2)
-    way = at[b, :2] - at[a, :2]
+    translation = at[b, :2] - at[a, :2]
     before, after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
     after[:, :2, :2], after[:, 2, 2] = to_a, 1.0
     before[:, :2, :2], before[:, 2, 2] = -to_a, -1.0
-    before[:, :2, 2] = np.einsum("nij,nj->ni", to_a, np.stack([way[:, 1], -way[:, 0]], 1))
+    before[:, :2, 2] = np.einsum(
+        "nij,nj->ni", to_a, np.stack([translation[:, 1], -translation[:, 0]], 1)
+    )
     return e, before, after
 
 
 def _equations(
     at: Float, a: np.ndarray, b: np.ndarray, T_a_b: Float, information: Float
 ) -> tuple[Float, Float]:
-    """Normal matrix and right side of a step of all poses but the first."""
+    """Return normal matrix and right side for a step of all poses except the first."""
     n = len(at)
     e, before, after = _residuals(at, a, b, T_a_b)
     normal, right = np.zeros((n, n, 3, 3)), np.zeros((n, 3))

@@ -1,20 +1,17 @@
-"""Consistent alignments of a team: edges confirmed or refused by loops, and connected components.
+"""Selection of consistent alignments of a team, and poses of the connected robots.
 
-A reading is grown from one alignment, loop by loop: a path of further alignments that leaves the
-robots placed so far and comes back to them where the placement says. Each loop is a coincidence, or
-the alignments in it are true together. How many loops chance would close is told before one is
-believed, as for a single alignment (`align/acceptance.py`).
+Alignments are the edges of a pose graph. A loop of edges is closed if their composition agrees with
+the identity. Starting from one edge, a consistent set grows loop by loop: a path of further edges
+leaves the robots with a pose and returns to them in agreement with the poses. A loop counts if few
+loops would be closed by chance, as for a single alignment (`verification.false_alarms`).
 
-An alignment that is ambiguous by its own verdict fits, and so may its rivals. Where alignments that
-were accepted connect the same two robots another way round, they say where the one lies to the
-other: of the alternatives the one that closes this loop is right, if no other closes it as well and
-chance would not. Loops of alternatives alone tell nothing: what made one of them fit, a room that
-is there twice, makes false ones agree.
+If two consistent sets contradict each other, at most one of them is true. PCM (Mangelson et al.
+2018) uses the largest set only. One cause can make several false alignments agree with each other,
+so a contradiction by a smaller set counts here, too.
 
-Alignments that confirm each other around loops make a reading (`readings.py`). Where two readings
-contradict each other, at most one is true. Kim, Mangelson et al. look for the largest set alone
-(PCM, 2018); whatever made one false alignment may have made others that agree with it, so here a
-smaller set counts as a warning, too.
+An ambiguous alignment has several alternatives. If accepted alignments connect the same two robots
+by another path, the alternative that closes the loop is selected, provided that no other does.
+Loops that consist of alternatives are not used: a repeated room makes false alternatives agree.
 """
 
 from collections.abc import Iterator
@@ -24,22 +21,22 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.fusion.pose_graph import Motions, Placement, Relations, placed
+from mapfusion.fusion.pose_graph import AlignmentEdges, Motions, Placement, optimize_poses
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.parameters import Probability, Range, require_in_range
 
-# Paths out of the placed robots that are followed at one time, which bounds the work: of ten robots
-# that all met, those over two more robots from one alignment are 112, those over three 672.
-_MOST_PATHS = 400
+# Largest number of paths that are extended at the same time, which bounds the work.
+_MAX_PATHS = 400
 
 
 @dataclass(frozen=True)
 class LoopTest:
-    """When a loop of alignments counts as closed.
+    """Test if a loop of alignments is closed.
 
     Attributes:
-        gate_probability: of closing a loop of true alignments (chi-square, 3 degrees of freedom).
-        false_alarms: loops that chance may be expected to close in a team, of each length.
+        gate_probability: probability that a loop of true alignments passes (chi-square, 3 degrees
+            of freedom).
+        false_alarms: expected number of loops of each length in a team that chance closes.
     """
 
     gate_probability: Probability = 0.999
@@ -53,35 +50,45 @@ class LoopTest:
         """Largest squared Mahalanobis distance."""
         return chi_square_bound(self.gate_probability, 3)
 
-    def chance(self, S: Float, reach_m: float) -> Float:
-        """(n,) that a motion drawn within reach, turned by anything, lies in gates S (n, 3, 3)."""
-        inside = 4 / 3 * np.pi * self.gate**1.5 * np.sqrt(np.linalg.det(S))
-        anywhere = np.pi * reach_m**2 * 2 * np.pi
-        return np.minimum(inside / anywhere, 1.0)
+    def chance(self, S: Float, max_distance_m: float) -> Float:
+        """Return the probability that a random motion is within a gate, shape (n,).
+
+        Args:
+            S: covariances of the gates, shape (n, 3, 3).
+            max_distance_m: radius of the disc of the random translations; angles are uniform.
+        """
+        gate_volume = 4 / 3 * np.pi * self.gate**1.5 * np.sqrt(np.linalg.det(S))
+        volume = np.pi * max_distance_m**2 * 2 * np.pi
+        return np.minimum(gate_volume / volume, 1.0)
 
 
 @dataclass(frozen=True)
-class Reading:
-    """Alignments that agree, and where they put their robots."""
+class ConsistentSet:
+    """Consistent edges and the poses of their robots.
 
-    which: np.ndarray  # (n,) rows of the relations, ascending
+    Attributes:
+        rows: rows of the edges, ascending, shape (n,).
+        placement: poses of the robots.
+    """
+
+    rows: np.ndarray
     placement: Placement
 
     @property
     def robots(self) -> np.ndarray:
-        """Those it places, ascending."""
+        """Robots with a pose, ascending."""
         return np.flatnonzero(self.placement.row >= 0)
 
 
 @dataclass(frozen=True)
 class _Paths:
-    """Paths from placed robots through robots that are not placed.
+    """Paths from robots with a pose through robots without one.
 
     Attributes:
-        steps: (n, L) rows of directed alignments.
-        last: (n,) robot they have come to.
-        visited: (n, N) bool.
-        motions: from the first robot to the last.
+        steps: rows of directed edges, shape (n, L).
+        last: last robot of each path, shape (n,).
+        visited: true for visited robots, shape (n, N).
+        motions: motion from the first robot to the last.
     """
 
     steps: np.ndarray
@@ -89,177 +96,178 @@ class _Paths:
     visited: np.ndarray
     motions: Motions
 
+    def __getitem__(self, rows: np.ndarray) -> "_Paths":
+        return _Paths(self.steps[rows], self.last[rows], self.visited[rows], self.motions[rows])
+
 
 @dataclass(frozen=True)
 class _Loops:
-    """Loops of one length: alignments (n, L) in their order, and squared distances (n,)."""
+    """Closed loops of equal length.
+
+    Attributes:
+        steps: rows of the edges in their order, shape (n, L).
+        distance: squared Mahalanobis distances, shape (n,).
+    """
 
     steps: np.ndarray
     distance: Float
 
-    def best(self) -> np.ndarray:
-        """The one whose way out most others confirm, of these the best closed."""
-        confirmed = np.bincount(self.steps[:, 0])[self.steps[:, 0]]
-        return self.steps[np.lexsort([self.distance, -confirmed])[0]]
 
+class LoopSearch:
+    """Search for closed loops of edges, in both directions of each edge."""
 
-class Team:
-    """The alignments of a team, in both directions."""
-
-    def __init__(self, relations: Relations, test: LoopTest) -> None:
-        self.relations, self.test = relations, test
-        self._reach_m = relations.reach_m()
-        there = Motions(relations.T_a_b, relations.covariance)
-        back = there.inverse()
-        self._from = np.concatenate([relations.robots[:, 0], relations.robots[:, 1]])
-        self._to = np.concatenate([relations.robots[:, 1], relations.robots[:, 0]])
+    def __init__(self, edges: AlignmentEdges, test: LoopTest) -> None:
+        self.edges, self.test = edges, test
+        self._max_distance_m = edges.max_distance_m()
+        forward = Motions(edges.T_a_b, edges.covariance)
+        backward = forward.inverse()
+        self._from = np.concatenate([edges.robots[:, 0], edges.robots[:, 1]])
+        self._to = np.concatenate([edges.robots[:, 1], edges.robots[:, 0]])
         self._motions = Motions(
-            np.concatenate([there.T, back.T]), np.concatenate([there.covariance, back.covariance])
+            np.concatenate([forward.T, backward.T]),
+            np.concatenate([forward.covariance, backward.covariance]),
         )
 
-    def readings(self, allowed: np.ndarray) -> list[Reading]:
-        """Readings of the `allowed` (E,) alignments, those of most alignments first.
+    def consistent_sets(self, allowed: np.ndarray) -> list[ConsistentSet]:
+        """Return consistent sets of the `allowed` (E,) edges, largest first.
 
-        Each loop of them is in one reading at least.
+        Each closed loop of allowed edges is part of at least one set.
         """
-        found: list[Reading] = []
-        for loop in self._all_loops(allowed):
-            if not any(np.isin(loop, reading.which).all() for reading in found):
-                found.append(self._grown(loop, allowed))
-        return sorted(found, key=lambda reading: -len(reading.which))
+        if np.count_nonzero(allowed) < 2:
+            return []
+        # closed loops, shortest first, and then by their distance
+        distance_of: dict[tuple[int, ...], float] = {}
+        for seed in np.flatnonzero(allowed):
+            placement = optimize_poses(self.edges, np.array([seed]))
+            for loops in self._closed_loops(placement, allowed):
+                for loop, distance in zip(loops.steps, loops.distance, strict=True):
+                    distance_of.setdefault(tuple(np.union1d(seed, loop).tolist()), distance)
+        found: list[ConsistentSet] = []
+        for loop in sorted(distance_of, key=lambda loop: (len(loop), distance_of[loop])):
+            if not any(np.isin(loop, edge_set.rows).all() for edge_set in found):
+                found.append(self._grow(np.array(loop), allowed))
+        return sorted(found, key=lambda edge_set: -len(edge_set.rows))
 
-    def agreeing(self, placement: Placement, among: np.ndarray) -> np.ndarray:
-        """Rows of `among` (E,) between placed robots that agree with the placement."""
-        relations = self.relations
-        rows = np.flatnonzero(among & placement.holds(relations.robots).all(axis=1))
+    def consistent_rows(self, placement: Placement, among: np.ndarray) -> np.ndarray:
+        """Return the rows of `among` (E,) that agree with the placement."""
+        edges = self.edges
+        rows = np.flatnonzero(among & placement.contains(edges.robots).all(axis=1))
         distance, _ = placement.squared_distances(
-            relations.robots[rows], Motions(relations.T_a_b, relations.covariance)[rows]
+            edges.robots[rows], Motions(edges.T_a_b, edges.covariance)[rows]
         )
         return rows[distance <= self.test.gate]
 
-    def _all_loops(self, allowed: np.ndarray) -> list[np.ndarray]:
-        """Alignments (rows) of each loop, the shortest first, and of these the best closed."""
-        if np.count_nonzero(allowed) < 2:  # one alone closes none
-            return []
-        found: dict[tuple[int, ...], float] = {}
-        for seed in np.flatnonzero(allowed):
-            placement = placed(self.relations, np.array([seed]))
-            for loops in self._closed_loops(placement, allowed):
-                for loop, distance in zip(loops.steps, loops.distance, strict=True):
-                    found.setdefault(tuple(np.union1d(seed, loop).tolist()), distance)
-        ordered = sorted(found, key=lambda loop: (len(loop), found[loop]))
-        return [np.array(loop) for loop in ordered]
-
-    def _grown(self, which: np.ndarray, allowed: np.ndarray) -> Reading:
-        """All that loops can add to some alignments that agree."""
+    def _grow(self, rows: np.ndarray, allowed: np.ndarray) -> ConsistentSet:
+        """Add closed loops to a set of consistent edges until there is none."""
         while True:
-            placement = placed(self.relations, which)
+            placement = optimize_poses(self.edges, rows)
             loops = next(self._closed_loops(placement, allowed), None)
             if loops is None:
-                return Reading(which, placement)
-            which = np.union1d(which, loops.best())
-            inside = self.agreeing(placed(self.relations, which), allowed)
-            which = np.union1d(which, inside)
+                return ConsistentSet(rows, placement)
+            # the loop whose first step is part of most loops, and of these the best closed
+            n_confirming = np.bincount(loops.steps[:, 0])[loops.steps[:, 0]]
+            best = np.lexsort([loops.distance, -n_confirming])[0]
+            rows = np.union1d(rows, loops.steps[best])
+            rows = np.union1d(rows, self.consistent_rows(optimize_poses(self.edges, rows), allowed))
 
     def _closed_loops(self, placement: Placement, allowed: np.ndarray) -> Iterator[_Loops]:
-        """Those that chance would not close, the shortest first, until there are too many."""
-        n = len(self.relations)
+        """Yield significant closed loops by length, until there are too many paths."""
+        n = len(self.edges)
         usable = np.concatenate([allowed, allowed])
-        paths = self._first_steps(placement, usable)
-        while 0 < len(paths.last) <= _MOST_PATHS:
-            paths = self._extended(paths, usable)
-            home = placement.holds(paths.last)
-            closed, paths = _rows(paths, home), _rows(paths, ~home)
+        leaves = placement.contains(self._from) & ~placement.contains(self._to)
+        steps = np.flatnonzero(usable & leaves)
+        visited = np.zeros((len(steps), self.edges.n_robots), dtype=bool)
+        visited[np.arange(len(steps)), self._from[steps]] = True
+        visited[np.arange(len(steps)), self._to[steps]] = True
+        paths = _Paths(steps[:, None], self._to[steps], visited, self._motions[steps])
+        while 0 < len(paths.last) <= _MAX_PATHS:
+            paths = self._extend(paths, usable)
+            returned = placement.contains(paths.last)
+            closed, paths = paths[returned], paths[~returned]
             first = closed.steps[:, 0]
             ends = np.stack([self._from[first], closed.last], axis=1)
             distance, S = placement.squared_distances(ends, closed.motions)
-            # each is found in both directions, and any alignment may have been where one began
+            # each loop is found in both directions and can start with any edge
             n_tests = allowed.sum() * len(first) / 2
-            by_chance = n_tests * self.test.chance(S, self._reach_m)
+            by_chance = n_tests * self.test.chance(S, self._max_distance_m)
             true = (distance <= self.test.gate) & (by_chance <= self.test.false_alarms)
             if true.any():
                 yield _Loops(closed.steps[true] % n, distance[true])
 
-    def _first_steps(self, placement: Placement, usable: np.ndarray) -> _Paths:
-        steps = np.flatnonzero(usable & placement.holds(self._from) & ~placement.holds(self._to))
-        visited = np.zeros((len(steps), self.relations.n_robots), dtype=bool)
-        visited[np.arange(len(steps)), self._from[steps]] = True
-        visited[np.arange(len(steps)), self._to[steps]] = True
-        return _Paths(steps[:, None], self._to[steps], visited, self._motions[steps])
-
-    def _extended(self, paths: _Paths, usable: np.ndarray) -> _Paths:
-        """By each alignment that leads to a robot not visited yet, home or farther out."""
-        goes_on = (paths.last[:, None] == self._from) & usable & ~paths.visited[:, self._to]
-        path, step = np.nonzero(goes_on)
+    def _extend(self, paths: _Paths, usable: np.ndarray) -> _Paths:
+        """Extend each path by every edge to a robot that it has not visited."""
+        possible = (paths.last[:, None] == self._from) & usable & ~paths.visited[:, self._to]
+        path, step = np.nonzero(possible)
         visited = paths.visited[path]
         visited[np.arange(len(path)), self._to[step]] = True
         steps = np.column_stack([paths.steps[path], step])
-        motions = paths.motions[path].then(self._motions[step])
+        motions = paths.motions[path].compose_independent(self._motions[step])
         return _Paths(steps, self._to[step], visited, motions)
 
 
-def _rows(paths: _Paths, which: np.ndarray) -> _Paths:
-    return _Paths(paths.steps[which], paths.last[which], paths.visited[which], paths.motions[which])
-
-
-def told_apart(
-    relations: Relations, kept: np.ndarray, component: np.ndarray, open_: Relations, test: LoopTest
+def resolve_alternatives(
+    edges: AlignmentEdges,
+    kept: np.ndarray,
+    component: np.ndarray,
+    alternatives: AlignmentEdges,
+    test: LoopTest,
 ) -> np.ndarray:
-    """Rows (n,) of the alternatives that accepted alignments tell from their rivals.
+    """Return the rows (n,) of alternatives that accepted alignments confirm alone.
 
     Args:
-        relations: that were accepted.
-        kept: (E,) bool, those that are believed.
-        component: (N,) of the robots, as they connect them.
-        open_: the alternatives; those of the same two robots are each other's rivals.
-        test: when a loop counts as closed.
+        edges: accepted alignments.
+        kept: true for those that are used, shape (E,).
+        component: connected component of each robot, shape (N,).
+        alternatives: alternatives of ambiguous alignments; those of the same two robots exclude
+            each other.
+        test: test of closed loops.
     """
-    low, high = np.sort(open_.robots, axis=1).T
+    low, high = np.sort(alternatives.robots, axis=1).T
     together = np.flatnonzero(component[low] == component[high])
-    distance, by_chance = np.full(len(open_), np.inf), np.ones(len(open_))
+    distance, by_chance = np.full(len(alternatives), np.inf), np.ones(len(alternatives))
     for name in np.unique(component[low[together]]):
-        inside = kept & (component[relations.robots] == name).all(axis=1)
-        placement = placed(relations, np.flatnonzero(inside))
+        inside = kept & (component[edges.robots] == name).all(axis=1)
+        placement = optimize_poses(edges, np.flatnonzero(inside))
         rows = together[component[low[together]] == name]
-        motions = Motions(open_.T_a_b, open_.covariance)[rows]
-        distance[rows], S = placement.squared_distances(open_.robots[rows], motions)
-        by_chance[rows] = test.chance(S, max(relations.reach_m(), open_.reach_m()))
+        motions = Motions(alternatives.T_a_b, alternatives.covariance)[rows]
+        distance[rows], S = placement.squared_distances(alternatives.robots[rows], motions)
+        by_chance[rows] = test.chance(S, max(edges.max_distance_m(), alternatives.max_distance_m()))
     closes = distance <= test.gate
-    told = []
+    resolved = []
     for pair in np.unique(np.stack([low, high], axis=1)[together], axis=0):
         rivals = np.flatnonzero((low == pair[0]) & (high == pair[1]))
         closing = rivals[closes[rivals]]
-        # any alternative of any two robots may be the one that closes a loop by chance
+        # every alternative of every pair of robots is a test
         if len(closing) == 1 and len(together) * by_chance[closing[0]] <= test.false_alarms:
-            told.append(closing[0])
-    return np.array(told, dtype=np.int64)
+            resolved.append(closing[0])
+    return np.array(resolved, dtype=np.int64)
 
 
 class Unconfirmed(StrEnum):
-    """What becomes of alignments that no loop confirms."""
+    """Treatment of alignments that no loop confirms."""
 
-    KEEP = "keep"  # the pair's own verdict vouches for them; of two readings the larger one counts
-    DROP = "drop"  # nothing counts that no loop confirms, or that another loop speaks against
+    KEEP = "keep"  # used if nothing contradicts them; of contradictory sets the larger one is used
+    DROP = "drop"  # not used; sets with a contradiction are not used, either
 
 
-class Place(StrEnum):
-    """What the others say of an alignment."""
+class EdgeStatus(StrEnum):
+    """Status of an alignment given the other alignments of the team."""
 
-    CONFIRMED = "confirmed"  # a loop of others agrees
-    BRIDGE = "bridge"  # nothing confirms it and nothing speaks against it
-    CONTRADICTED = "contradicted"  # the team's other alignments say something else
-    AMBIGUOUS = "ambiguous"  # of two readings, either of which has loops of its own
-    UNCONFIRMED = "unconfirmed"  # nothing confirms it, and that is asked for
-    REFUSED = "refused"  # by its own verdict: the others were not asked
+    CONFIRMED = "confirmed"  # part of a closed loop
+    BRIDGE = "bridge"  # the only connection: neither confirmed nor contradicted
+    CONTRADICTED = "contradicted"  # inconsistent with the poses by the other alignments
+    AMBIGUOUS = "ambiguous"  # part of one of several sets that contradict each other
+    UNCONFIRMED = "unconfirmed"  # not confirmed although confirmation is required
+    REFUSED = "refused"  # rejected by itself, and not compared with others
 
 
 @dataclass(frozen=True)
 class TeamParameters:
-    """How a team's alignments are judged together.
+    """Parameters of the selection of consistent alignments.
 
     Attributes:
-        unconfirmed: what becomes of those that no loop confirms.
-        loop: when a loop counts as closed.
+        unconfirmed: treatment of alignments that no loop confirms.
+        loop: test of closed loops.
     """
 
     unconfirmed: Unconfirmed = Unconfirmed.KEEP
@@ -271,176 +279,158 @@ class TeamParameters:
 
 @dataclass(frozen=True)
 class TeamGraph:
-    """A team's robots, placed.
+    """Poses of N robots by consistent alignments.
 
     Attributes:
-        component: (N,) 0 for the robots placed together in the largest number, 1, ...; those that
-            nothing connects have one of their own. Of equal ones the one with the first robot is
-            first.
-        T_root_robot: (N, 3) in the frame of the component's root.
-        covariance: (N, 3, 3) of these.
-        place: (E,) what is said of each alignment, a `Place`; behind them of each alternative,
-            which is REFUSED where nothing tells it from its rivals.
+        component: number of each robot's connected component, shape (N,). The largest component is
+            0; of equally large ones the one with the first robot comes first.
+        T_root_robot: poses in the frame of the component's root, shape (N, 3).
+        covariance: covariances of the poses, shape (N, 3, 3).
+        edge_status: `EdgeStatus` of each alignment and, after them, of each alternative; REFUSED
+            for alternatives that are not resolved.
     """
 
     component: np.ndarray
     T_root_robot: Float
     covariance: Float
-    place: np.ndarray
+    edge_status: np.ndarray
 
 
 def team_graph(
-    relations: Relations,
+    edges: AlignmentEdges,
     parameters: TeamParameters = TeamParameters(),
     rank: np.ndarray | None = None,
-    alternatives: Relations | None = None,
+    alternatives: AlignmentEdges | None = None,
 ) -> TeamGraph:
-    """Find the alignments that are true together, and place the robots by them.
+    """Select consistent alignments and compute the poses of the robots.
 
-    The order of robots and of alignments makes no difference but for the frame, and where two
-    answers are equally good.
+    The order of robots and alignments affects only the frame, and the choice between equally good
+    results.
 
     Args:
-        relations: between the robots' maps.
-        parameters: which of them are believed.
-        rank: (N,) of the robots; a component's root is the one of least rank, by default its first.
-        alternatives: motions that robots' maps leave open, one or more for two robots. At most one
-            of these is believed, and only where the alignments tell it (`alternatives.py`).
+        edges: accepted alignments between the robots' maps.
+        parameters: parameters of the selection.
+        rank: rank of each robot, shape (N,); the root of a component has the lowest rank. By
+            default the root is the first robot.
+        alternatives: alternatives of ambiguous alignments, one or more for two robots. At most one
+            of them is used, if accepted alignments confirm it alone (`resolve_alternatives`).
     """
     if alternatives is None or not len(alternatives):
-        return _judged(relations, parameters, rank)
-    connected = _judged(relations, replace(parameters, unconfirmed=Unconfirmed.KEEP), rank)
-    kept = np.isin(connected.place, [Place.CONFIRMED, Place.BRIDGE])
-    told = told_apart(relations, kept, connected.component, alternatives, parameters.loop)
-    graph = _judged(relations.joined(alternatives[told]), parameters, rank)
-    of_alternatives = np.full(len(alternatives), Place.REFUSED, dtype=object)
-    of_alternatives[told] = graph.place[len(relations) :]
-    place = np.concatenate([graph.place[: len(relations)], of_alternatives])
-    return replace(graph, place=place)
+        return _graph_of_accepted(edges, parameters, rank)
+    connected = _graph_of_accepted(edges, replace(parameters, unconfirmed=Unconfirmed.KEEP), rank)
+    kept = np.isin(connected.edge_status, [EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE])
+    resolved = resolve_alternatives(edges, kept, connected.component, alternatives, parameters.loop)
+    graph = _graph_of_accepted(edges.concatenated(alternatives[resolved]), parameters, rank)
+    of_alternatives = np.full(len(alternatives), EdgeStatus.REFUSED, dtype=object)
+    of_alternatives[resolved] = graph.edge_status[len(edges) :]
+    status = np.concatenate([graph.edge_status[: len(edges)], of_alternatives])
+    return replace(graph, edge_status=status)
 
 
-def _judged(relations: Relations, parameters: TeamParameters, rank: np.ndarray | None) -> TeamGraph:
-    """The graph of alignments that were accepted, or told apart."""
-    team = Team(relations, parameters.loop)
-    everything = np.ones(len(relations), dtype=bool)
-    confirmed, ambiguous = _without_rivals(team, team.readings(everything), parameters.unconfirmed)
+def _graph_of_accepted(
+    edges: AlignmentEdges, parameters: TeamParameters, rank: np.ndarray | None
+) -> TeamGraph:
+    """Return the graph of accepted alignments and resolved alternatives."""
+    search = LoopSearch(edges, parameters.loop)
+    confirmed, ambiguous = _confirmed_edges(search, parameters.unconfirmed)
     kept, bridge = confirmed.copy(), np.zeros_like(confirmed)
     if parameters.unconfirmed is Unconfirmed.KEEP:
-        bridge = _bridges(team, kept, ~confirmed & ~ambiguous)
+        # connect separate components by single alignments, most reliable first
+        component, free = _components(edges, kept), ~confirmed & ~ambiguous
+        for row in np.argsort(edges.log10_false_alarms, kind="stable"):
+            a, b = component[edges.robots[row]]
+            if free[row] and a != b:
+                bridge[row] = True
+                component[component == b] = a
         kept |= bridge
-    component = _components(relations, kept)
-    rank = np.arange(relations.n_robots) if rank is None else rank
-    T, covariance, agrees = _solved(team, component, kept, rank)
-    place = np.full(len(relations), Place.UNCONFIRMED, dtype=object)
-    together = component[relations.robots[:, 0]] == component[relations.robots[:, 1]]
-    place[ambiguous] = Place.AMBIGUOUS
-    place[together & ~agrees] = Place.CONTRADICTED
-    place[bridge] = Place.BRIDGE
-    place[confirmed] = Place.CONFIRMED
-    return TeamGraph(component, T, covariance, place)
+
+    component = _components(edges, kept)
+    rank = np.arange(edges.n_robots) if rank is None else rank
+    T, covariance = np.zeros((len(component), 3)), np.zeros((len(component), 3, 3))
+    agrees = kept.copy()
+    for name in np.unique(component):
+        inside = kept & (component[edges.robots] == name).all(axis=1)
+        if not inside.any():
+            continue
+        robots = np.flatnonzero(component == name)
+        root = int(robots[np.argmin(rank[robots])])
+        placement = optimize_poses(edges, np.flatnonzero(inside), root)
+        row = placement.row[robots]
+        T[robots] = placement.T_root_robot[row]
+        covariance[robots] = placement.covariance[row, row]
+        agrees[search.consistent_rows(placement, np.ones_like(kept))] = True
+
+    status = np.full(len(edges), EdgeStatus.UNCONFIRMED, dtype=object)
+    together = component[edges.robots[:, 0]] == component[edges.robots[:, 1]]
+    status[ambiguous] = EdgeStatus.AMBIGUOUS
+    status[together & ~agrees] = EdgeStatus.CONTRADICTED
+    status[bridge] = EdgeStatus.BRIDGE
+    status[confirmed] = EdgeStatus.CONFIRMED
+    return TeamGraph(component, T, covariance, status)
 
 
-def _without_rivals(
-    team: Team, readings: list[Reading], unconfirmed: Unconfirmed
-) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (E,) of alignments in readings that stand, and of those that rivals leave open."""
-    E = len(team.relations)
-    kept, ambiguous = np.zeros(E, dtype=bool), np.zeros(E, dtype=bool)
-    standing: list[Reading] = []
-    for reading in readings:  # the larger ones first
-        larger = (other for other in standing if len(other.which) > len(reading.which))
+def _confirmed_edges(search: LoopSearch, unconfirmed: Unconfirmed) -> tuple[np.ndarray, np.ndarray]:
+    """Return masks (E,) of edges that loops confirm, and of edges in contradictory sets.
+
+    A rival divides the robots of a set into groups whose relative poses agree, and the rest. Edges
+    within a group are confirmed if loops of such edges confirm them.
+    """
+    edges = search.edges
+    confirmed, ambiguous = np.zeros(len(edges), dtype=bool), np.zeros(len(edges), dtype=bool)
+    remaining: list[ConsistentSet] = []
+    for edge_set in search.consistent_sets(np.ones(len(edges), dtype=bool)):  # largest first
+        larger = (other for other in remaining if len(other.rows) > len(edge_set.rows))
         if unconfirmed is Unconfirmed.DROP or not any(
-            _contradict(team, reading, other) for other in larger
+            _contradict(search, edge_set, other) for other in larger
         ):
-            standing.append(reading)
-    for reading in standing:
-        others = (other for other in standing if other is not reading)
-        rivals = [other for other in others if _contradict(team, reading, other)]
-        stands = _undisputed(team, reading, rivals)
-        kept[stands] = True
-        ambiguous[np.setdiff1d(reading.which, stands)] = True
-    return kept, ambiguous & ~kept
+            remaining.append(edge_set)
+    for edge_set in remaining:
+        others = (other for other in remaining if other is not edge_set)
+        rivals = [other for other in others if _contradict(search, edge_set, other)]
+        undisputed = edge_set.rows
+        if rivals:
+            group = np.zeros((edges.n_robots, len(rivals)), dtype=np.int64)
+            for k, rival in enumerate(rivals):
+                shared = np.intersect1d(edge_set.robots, rival.robots)
+                same = _same_relative_poses(search, edge_set, rival, shared)
+                group[shared, k] = 1 + np.argmax(same, axis=1)
+            a, b = edges.robots.T
+            inside = np.zeros(len(edges), dtype=bool)
+            inside[edge_set.rows] = True
+            inside &= np.all(group[a] == group[b], axis=1)
+            parts = [part.rows for part in search.consistent_sets(inside)]
+            undisputed = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *parts]))
+        confirmed[undisputed] = True
+        ambiguous[np.setdiff1d(edge_set.rows, undisputed)] = True
+    return confirmed, ambiguous & ~confirmed
 
 
-def _contradict(team: Team, one: Reading, other: Reading) -> bool:
-    """Whether two readings put two robots differently."""
+def _contradict(search: LoopSearch, one: ConsistentSet, other: ConsistentSet) -> bool:
+    """Return True if the relative pose of two robots differs between two sets."""
     shared = np.intersect1d(one.robots, other.robots)
-    return not _alike(team, one, other, shared).all()
+    return not _same_relative_poses(search, one, other, shared).all()
 
 
-def _alike(team: Team, one: Reading, other: Reading, shared: np.ndarray) -> np.ndarray:
-    """(n, n) bool, whether both put the shared robots (n,) alike, two by two."""
+def _same_relative_poses(
+    search: LoopSearch, one: ConsistentSet, other: ConsistentSet, shared: np.ndarray
+) -> np.ndarray:
+    """Return True for pairs (n, n) of shared robots (n,) with equal relative poses in both sets."""
     i, j = np.triu_indices(len(shared), 1)
     pairs = np.stack([shared[i], shared[j]], axis=1)
     motions = other.placement.relative(pairs)
     distance, _ = one.placement.squared_distances(pairs, motions)
-    alike = np.eye(len(shared), dtype=bool)
-    alike[i, j] = alike[j, i] = distance <= team.test.gate
-    return alike
+    same = np.eye(len(shared), dtype=bool)
+    same[i, j] = same[j, i] = distance <= search.test.gate
+    return same
 
 
-def _undisputed(team: Team, reading: Reading, rivals: list[Reading]) -> np.ndarray:
-    """Its alignments (rows) that no rival touches and that loops of such alone confirm.
-
-    A rival splits a reading's robots into groups that both put alike, and the rest.
-    """
-    robots, relations = reading.robots, team.relations
-    group = np.zeros((relations.n_robots, len(rivals)), dtype=np.int64)
-    for k, rival in enumerate(rivals):
-        shared = np.intersect1d(robots, rival.robots)
-        alike = _alike(team, reading, rival, shared)
-        group[shared, k] = 1 + np.argmax(alike, axis=1)
-    a, b = relations.robots.T
-    inside = np.zeros(len(relations), dtype=bool)
-    inside[reading.which] = True
-    inside &= np.all(group[a] == group[b], axis=1)
-    if not rivals:
-        return reading.which
-    left = [each.which for each in team.readings(inside)]
-    return np.unique(np.concatenate([np.empty(0, dtype=np.int64), *left]))
-
-
-def _bridges(team: Team, kept: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """(E,) those that connect what is not connected yet, the surest first."""
-    relations = team.relations
-    component = _components(relations, kept)
-    bridge = np.zeros_like(kept)
-    for row in np.argsort(relations.log10_false_alarms, kind="stable"):
-        a, b = component[relations.robots[row]]
-        if free[row] and a != b:
-            bridge[row] = True
-            component[component == b] = a
-    return bridge
-
-
-def _components(relations: Relations, kept: np.ndarray) -> np.ndarray:
-    """(N,) the component of each robot: those of most robots first, then by their first robot."""
-    label = np.arange(relations.n_robots)
-    for a, b in relations.robots[kept]:
+def _components(edges: AlignmentEdges, kept: np.ndarray) -> np.ndarray:
+    """Return the component of each robot, shape (N,), ordered by size and then by first robot."""
+    label = np.arange(edges.n_robots)
+    for a, b in edges.robots[kept]:
         low, high = sorted((label[a], label[b]))
         label[label == high] = low
     first, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
     place = np.empty(len(first), dtype=np.int64)
     place[np.lexsort([first, -count])] = np.arange(len(first))
     return place[inverse]
-
-
-def _solved(
-    team: Team, component: np.ndarray, kept: np.ndarray, rank: np.ndarray
-) -> tuple[Float, Float, np.ndarray]:
-    """Poses (N, 3) by the kept alignments, covariances (N, 3, 3), and which (E,) agree."""
-    relations = team.relations
-    T, covariance = np.zeros((len(component), 3)), np.zeros((len(component), 3, 3))
-    agrees = kept.copy()
-    for name in np.unique(component):
-        inside = kept & (component[relations.robots] == name).all(axis=1)
-        if not inside.any():
-            continue
-        robots = np.flatnonzero(component == name)
-        root = int(robots[np.argmin(rank[robots])])
-        placement = placed(relations, np.flatnonzero(inside), root)
-        row = placement.row[robots]
-        T[robots] = placement.T_root_robot[row]
-        covariance[robots] = placement.covariance[row, row]
-        agrees[team.agreeing(placement, np.ones_like(kept))] = True
-    return T, covariance, agrees

@@ -1,4 +1,4 @@
-"""Sparse Cholesky factorisation in skyline storage, and an ordering that keeps it sparse.
+"""Sparse Cholesky factorisation in skyline storage, and an ordering that keeps the factor sparse.
 
 The matrix has zero blocks for poses without a common landmark. A good order has all other blocks
 near the diagonal. The Cholesky factor has only zeros before the first entry of each row (the
@@ -6,9 +6,8 @@ envelope: George and Liu 1981, "Computer Solution of Large Sparse Positive Defin
 4). Candidates are the order of Cuthill and McKee (1969), breadth-first searches from other poses,
 sweeps that move each pose to the mean place of its neighbours, and the order of time.
 
-The factor has only zeros before the first entry of each row (the envelope, see
-`envelope_order.py`). Rows are stored by blocks, from the first entry of the block to its diagonal
-block. The factorisation consists of dense matrix products of blocks.
+Rows are stored by blocks, from the first entry of the block to its diagonal block. The
+factorisation consists of dense matrix products of blocks.
 """
 
 from dataclasses import dataclass
@@ -22,8 +21,8 @@ from scipy.sparse.csgraph import breadth_first_order, reverse_cuthill_mckee
 
 from mapfusion.geometry.numerics import Float
 
-# Number of breadth-first searches, and of sweeps over the best order. More make it hardly better.
-_BEGINS, _SWEEPS = 16, 4
+# Number of breadth-first searches, and of sweeps over the best order.
+_SEARCHES, _SWEEPS = 16, 4
 
 
 def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.ndarray:
@@ -37,27 +36,7 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
     by_number = np.arange(n_members)
     if n_members < 2:
         return by_number
-    related = _related(group, member, n_members)
-    starts, column = related.indptr[:-1], related.indices.astype(np.int64)
-
-    def work(place: np.ndarray) -> int:
-        """Return the cost of a factor: the sum of squared row lengths."""
-        return int(np.sum((place - np.minimum.reduceat(place[column], starts)) ** 2))
-
-    begins = np.unique(np.linspace(0, n_members - 1, _BEGINS).round().astype(np.int64))
-    found = [breadth_first_order(related, each, return_predecessors=False)[::-1] for each in begins]
-    found.append(reverse_cuthill_mckee(related, symmetric_mode=True))
-    swept = min(map(_places, found), key=work)
-    orders = [by_number, swept]
-    for _ in range(_SWEEPS):
-        mean = related @ swept / np.diff(related.indptr)
-        swept = _places(np.argsort(mean, kind="stable"))
-        orders += [swept, n_members - 1 - swept]
-    return min(orders, key=work)
-
-
-def _related(group: np.ndarray, member: np.ndarray, n_members: int) -> csr_matrix:
-    """Return a matrix of ones for related members, including each with itself."""
+    # matrix of ones for related members
     chain = np.arange(n_members - 1)
     n_groups = int(group.max(initial=-1)) + 1
     groups = np.concatenate([group, n_groups + chain, n_groups + chain])
@@ -66,7 +45,22 @@ def _related(group: np.ndarray, member: np.ndarray, n_members: int) -> csr_matri
     has = csr_matrix((np.ones(len(groups)), (members, groups)), shape=shape)
     related = (has @ has.T).tocsr()
     related.data[:] = 1.0
-    return related
+    starts, column = related.indptr[:-1], related.indices.astype(np.int64)
+
+    def cost(place: np.ndarray) -> int:
+        """Return the cost of a factor: the sum of squared row lengths."""
+        return int(np.sum((place - np.minimum.reduceat(place[column], starts)) ** 2))
+
+    begins = np.unique(np.linspace(0, n_members - 1, _SEARCHES).round().astype(np.int64))
+    found = [breadth_first_order(related, each, return_predecessors=False)[::-1] for each in begins]
+    found.append(reverse_cuthill_mckee(related, symmetric_mode=True))
+    swept = min(map(_places, found), key=cost)
+    orders = [by_number, swept]
+    for _ in range(_SWEEPS):
+        mean = related @ swept / np.diff(related.indptr)
+        swept = _places(np.argsort(mean, kind="stable"))
+        orders += [swept, n_members - 1 - swept]
+    return min(orders, key=cost)
 
 
 def _places(order: np.ndarray) -> np.ndarray:
@@ -79,7 +73,10 @@ def _places(order: np.ndarray) -> np.ndarray:
 def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Return the first related place of each place, shape (n,); its own if there is none before.
 
-    Groups and members are those of `envelope_order`, `place` (n,) is what it gave.
+    Args:
+        group: group numbers, as in `envelope_order`.
+        member: members of these groups, as in `envelope_order`.
+        place: result of `envelope_order`, shape (n,).
     """
     n, at = len(place), place[member]
     first, least = np.arange(n), np.full(int(group.max(initial=-1)) + 1, n)
@@ -162,7 +159,7 @@ class Envelope:
         return found
 
     def where(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return where blocks of three by three are stored, shape (m, 3, 3).
+        """Return the indices of the entries of 3 by 3 blocks, shape (m, 3, 3).
 
         `rows` and `columns` (m,) are block numbers with column <= row.
         """
@@ -225,7 +222,7 @@ class Factor:
         return x
 
     def _parts(self, right: np.ndarray) -> list[_Part]:
-        """Return the blocks in the precision of `right`."""
+        """Return the blocks of rows in the precision of `right`."""
         return self._single if right.dtype == np.float32 else self._double
 
     @cached_property

@@ -21,17 +21,17 @@ from mapfusion.geometry.joint_covariance import RANK, KnownErrors, SharedErrors
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.smoother.cholesky import Envelope, Factor, factor_in_envelope
 from mapfusion.smoother.normal_equations import Estimate, NormalEquations, Weights, point_equations
-from mapfusion.smoother.problem import Sightings
+from mapfusion.smoother.problem import OrderedObservations
 from mapfusion.smoother.schur_complement import (
-    Points,
-    Reduced,
-    along_points,
-    along_way,
-    known_points,
-    left_couplings,
-    moved_points,
-    subtract_points,
-    without_offsets,
+    PointCovariances,
+    ReducedEquations,
+    coupling_times_points,
+    coupling_times_poses,
+    eliminate_offsets,
+    point_covariances,
+    reduced_couplings,
+    substitute_points,
+    subtract_point_terms,
 )
 
 
@@ -40,21 +40,23 @@ class ReducedPoses:
     """Equations of T poses. The first pose is known, so its rows are zero.
 
     Attributes:
-        seen: the observations.
+        obs: the observations.
         equations: the equations of poses, landmarks and offsets.
-        left: the equations after the offsets are eliminated.
+        reduced: the equations after the offsets are eliminated.
     """
 
-    seen: Sightings
+    obs: OrderedObservations
     equations: NormalEquations
-    left: Reduced
+    reduced: ReducedEquations
 
     def gradient(self) -> Float:
         """Return the gradient, shape (T, 3)."""
         equations = self.equations
         still = np.zeros_like(equations.points.track_gradient)
-        moved = moved_points(self.seen, equations.points, self.left, still)
-        total = equations.pose_gradient + along_points(self.seen, equations.coupling, *moved)
+        steps = substitute_points(self.obs, equations.points, self.reduced, still)
+        total = equations.pose_gradient + coupling_times_points(
+            self.obs, equations.coupling, *steps
+        )
         total[0] = 0.0
         return total
 
@@ -66,16 +68,21 @@ class ReducedPoses:
         Raises:
             LinAlgError: the matrix is not positive definite.
         """
-        envelope = self.seen.order.envelope
+        envelope = self.obs.order.envelope
         S = envelope.zeros()
-        _put_poses(S, envelope, self.seen.pose_place[1:] - 1, self.equations)
-        subtract_points(self.seen, self.equations, self.left, S)
+        # blocks of odometry and of each pose's own observations
+        place = self.obs.pose_place[1:] - 1
+        S[envelope.where(place, place)] = self.equations.pose_block[1:]
+        after, before, link = place[1:], place[:-1], self.equations.link[1:]
+        link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
+        S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link
+        subtract_point_terms(self.obs, self.equations, self.reduced, S)
         return factor_in_envelope(S, envelope)
 
-    def solved(self, factor: Factor, right: Float) -> Float:
+    def solve(self, factor: Factor, right: Float) -> Float:
         """Solve for x (T, 3) with the matrix of this factor and the right side (T, 3)."""
         ordered = np.empty((len(right) - 1, 3))
-        ordered[self.seen.pose_place[1:] - 1] = right[1:]
+        ordered[self.obs.pose_place[1:] - 1] = right[1:]
         return self.by_frame(factor.solve_transposed(factor.solve(ordered.ravel())))
 
     def by_frame(self, ordered: Float) -> Float:
@@ -83,21 +90,10 @@ class ReducedPoses:
 
         The order is that of the rows of `factor`.
         """
-        place = self.seen.pose_place
+        place = self.obs.pose_place
         found = np.zeros((len(place), 3))
         found[1:] = ordered.reshape(-1, 3)[place[1:] - 1]
         return found
-
-
-def _put_poses(S: Float, envelope: Envelope, place: np.ndarray, equations: NormalEquations) -> None:
-    """Write the blocks of odometry and of each pose's own observations into S.
-
-    `place` (T - 1,) is the row of each unknown pose.
-    """
-    S[envelope.where(place, place)] = equations.pose_block[1:]
-    after, before, link = place[1:], place[:-1], equations.link[1:]
-    link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
-    S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link
 
 
 @dataclass(frozen=True)
@@ -105,23 +101,23 @@ class PathErrors:
     """Y (R, 3L) for the R coordinates of the unknown poses in their order.
 
     Attributes:
-        seen: the observations.
+        obs: the observations.
         factor: L.
-        moved: (N, 3, 3) entries of C A, by observation.
+        pose_landmark: block of C A of each observation, shape (N, 3, 3).
     """
 
-    seen: Sightings
+    obs: OrderedObservations
     factor: Factor
-    moved: Float
+    pose_landmark: Float
 
     @classmethod
     def of(
-        cls, seen: Sightings, equations: NormalEquations, own_m2: Float, factor: Factor
+        cls, obs: OrderedObservations, equations: NormalEquations, own_m2: Float, factor: Factor
     ) -> "PathErrors":
         """Return Y for equations whose landmarks are eliminated, with `own_m2` and the factor."""
-        left = without_offsets(seen, equations.points)
-        coupling = left_couplings(seen, equations.coupling, left)
-        return cls(seen, factor, coupling @ own_m2[seen.landmark])
+        reduced = eliminate_offsets(obs, equations.points)
+        coupling = reduced_couplings(obs, equations.coupling, reduced)
+        return cls(obs, factor, coupling @ own_m2[obs.landmark])
 
     def __len__(self) -> int:
         return len(self.factor)
@@ -134,41 +130,43 @@ class PathErrors:
 
     def gram(self, columns: Float) -> Float:
         """Return Y Y' times columns (R, c), computed in single precision."""
-        moving = self._moving_roughly
-        by_landmark = moving @ self.factor.solve_transposed(columns.astype(np.float32))
-        return self.factor.solve(moving.T @ by_landmark).astype(np.float64)
+        AC = self._landmark_pose_single
+        by_landmark = AC @ self.factor.solve_transposed(columns.astype(np.float32))
+        return self.factor.solve(AC.T @ by_landmark).astype(np.float64)
 
     def spread(self, columns: Float) -> Float:
         """Return Y' times columns (R, c), shape (3L, c)."""
-        return self._moving @ self.factor.solve_transposed(columns)
+        return self._landmark_pose @ self.factor.solve_transposed(columns)
 
     def gathered(self, by_landmark: Float) -> Float:
         """Return Y times columns (3L, c), shape (R, c)."""
-        return self.factor.solve(self._moving.T @ by_landmark)
+        return self.factor.solve(self._landmark_pose.T @ by_landmark)
 
     def squares(self) -> Float:
         """Return the diagonal blocks of Y' Y, shape (L, 3, 3)."""
-        total = np.zeros((self.seen.n_landmarks, 3, 3))
+        total = np.zeros((self.obs.n_landmarks, 3, 3))
         covariance, offset = self.factor.inverse, self.factor.envelope.offset
-        place = self.seen.unknown_place
-        _add_squares(self.seen.starts, place, self.moved, offset, covariance, total)
+        place = self.obs.unknown_place
+        _add_squares(self.obs.starts, place, self.pose_landmark, offset, covariance, total)
         return total + np.swapaxes(total, 1, 2)
 
     @cached_property
-    def _moving(self) -> csr_array:
+    def _landmark_pose(self) -> csr_array:
         """A C' with one block for each observation, shape (3L, R)."""
-        place, each = self.seen.unknown_place, np.arange(3)
+        place, each = self.obs.unknown_place, np.arange(3)
         known = place >= 0
-        rows = 3 * self.seen.landmark[known, None] + each
+        rows = 3 * self.obs.landmark[known, None] + each
         columns = 3 * place[known, None] + each
         rows, columns = np.broadcast_arrays(rows[:, None, :], columns[:, :, None])
-        shape = 3 * self.seen.n_landmarks, len(self)
-        return csr_array((self.moved[known].ravel(), (rows.ravel(), columns.ravel())), shape)
+        shape = 3 * self.obs.n_landmarks, len(self)
+        return csr_array(
+            (self.pose_landmark[known].ravel(), (rows.ravel(), columns.ravel())), shape
+        )
 
     @cached_property
-    def _moving_roughly(self) -> csr_array:
+    def _landmark_pose_single(self) -> csr_array:
         """A C' in single precision."""
-        known = self._moving
+        known = self._landmark_pose
         entries = known.data.astype(np.float32), known.indices, known.indptr
         return csr_array(entries, known.shape)
 
@@ -177,12 +175,12 @@ class PathErrors:
 def _add_squares(
     starts: np.ndarray,
     place: np.ndarray,
-    moved: Float,
+    pose_landmark: Float,
     offset: np.ndarray,
     Z: Float,
     total: Float,
 ) -> None:
-    """Write matrices whose sum with their transposes is moved' Z moved of each landmark."""
+    """Write half of Y' Y of each landmark: the sum with its transpose is the diagonal block."""
     of_pose = np.empty((3, 3))
     for j in range(len(starts) - 1):
         for i in range(starts[j], starts[j + 1]):
@@ -194,11 +192,10 @@ def _add_squares(
             for k in range(starts[j], i + 1):
                 if place[k] >= 0:
                     share = 0.5 if k == i else 1.0
-                    # Add a share of the poses' covariance times what moves observation k's
-                    # landmark.
+                    # add a share of the poses' covariance times the block of observation k
                     row = 3 * place[i]
                     column = 3 * place[k]
-                    above = row < column  # its mirror image is stored
+                    above = row < column  # the transpose is stored
                     down, across = (column, row) if above else (row, column)
                     at0, at1, at2 = (
                         offset[down] + across,
@@ -207,9 +204,9 @@ def _add_squares(
                     )
                     for q in range(3):
                         x, y, z = (
-                            share * moved[k, 0, q],
-                            share * moved[k, 1, q],
-                            share * moved[k, 2, q],
+                            share * pose_landmark[k, 0, q],
+                            share * pose_landmark[k, 1, q],
+                            share * pose_landmark[k, 2, q],
                         )
                         if above:
                             for r in range(3):
@@ -221,19 +218,19 @@ def _add_squares(
             for r in range(3):
                 for q in range(3):
                     total[j, r, q] += (
-                        moved[i, 0, r] * of_pose[0, q]
-                        + moved[i, 1, r] * of_pose[1, q]
-                        + moved[i, 2, r] * of_pose[2, q]
+                        pose_landmark[i, 0, r] * of_pose[0, q]
+                        + pose_landmark[i, 1, r] * of_pose[1, q]
+                        + pose_landmark[i, 2, r] * of_pose[2, q]
                     )
 
 
 _GB = 1e9
 _ITEM = np.dtype(np.float64).itemsize
 # Number of arrays in memory at the same time. In the envelope: factor and inverse of two successive
-# steps. Of the points: their blocks with the poses as built, in rows, solved and as LAPACK copies
-# them; and the points' own blocks.
+# steps. Blocks of points with poses: as built, by rows, solved, and copies of LAPACK. Blocks of
+# points.
 _FACTORS, _WIDE, _SQUARE = 4.0, 5.0, 6.0
-_BLOCK, _BLOCKS = 9, 12  # entries of a block of three by three; blocks of a pose, sighting, track
+_BLOCK, _BLOCKS = 9, 12  # entries of a 3 by 3 block; blocks per pose, observation and track
 _CONDENSED = 6.0  # arrays of the map's shared directions
 _BAND = 5  # below the diagonal of a chain of poses of three coordinates
 
@@ -243,7 +240,7 @@ class Solution(NamedTuple):
 
     Attributes:
         step: step of the poses (zero for the first), landmarks and offsets.
-        moved: squared length of the step of the reduced system, in sigmas.
+        squared_step: squared length of the step of the reduced system, in sigmas.
         own_m2: covariance of each landmark for a known path, shape (L, 3, 3).
         offset_m2: covariance of each track's offset for a known path, shape (B, 3, 3).
         track_m2: covariance of each track's point for a known path, shape (B, 3, 3).
@@ -253,7 +250,7 @@ class Solution(NamedTuple):
     """
 
     step: Estimate
-    moved: float
+    squared_step: float
     own_m2: Float
     offset_m2: Float
     track_m2: Float
@@ -261,145 +258,148 @@ class Solution(NamedTuple):
     landmarks_first: bool
 
 
-def solve(seen: Sightings, equations: NormalEquations) -> Solution:
+def solve(obs: OrderedObservations, equations: NormalEquations) -> Solution:
     """Solve the equations of these observations for the next step."""
-    if _is_landmarks_first(seen):
-        return _landmarks_first(seen, equations)
-    return _poses_first(seen, equations)
+    if _is_landmarks_first(obs):
+        return _eliminate_landmarks_first(obs, equations)
+    return _eliminate_poses_first(obs, equations)
 
 
 def solve_points(
-    seen: Sightings, at: Estimate, weights: Weights, stray_information: float
-) -> tuple[Estimate, Points]:
+    obs: OrderedObservations, at: Estimate, weights: Weights, offset_prior: float
+) -> tuple[Estimate, PointCovariances]:
     """Return the step of landmarks and offsets for a fixed path, and their covariances."""
-    equations = point_equations(seen, at, weights, stray_information)
-    left = without_offsets(seen, equations)
+    equations = point_equations(obs, at, weights, offset_prior)
+    reduced = eliminate_offsets(obs, equations)
     still = np.zeros_like(equations.track_gradient)
-    moved = moved_points(seen, equations, left, still)
-    return Estimate(np.zeros_like(at.path), *moved), known_points(seen, left)
+    steps = substitute_points(obs, equations, reduced, still)
+    return Estimate(np.zeros_like(at.path), *steps), point_covariances(obs, reduced)
 
 
-def memory_bytes(seen: Sightings) -> float:
+def memory_bytes(obs: OrderedObservations) -> float:
     """Return an upper bound of the memory that smoothing these observations takes, in bytes.
 
     It counts the matrices of `solve` and of the covariances, the blocks of observations and tracks,
     and the map's joint covariance.
     """
-    n_poses, n_landmarks = 3 * seen.order.n_poses, 3 * seen.n_landmarks
-    if _is_landmarks_first(seen):
-        entries, n_shared = _FACTORS * int(seen.order.envelope.offset[-1]), n_poses
+    n_poses, n_landmarks = 3 * obs.order.n_poses, 3 * obs.n_landmarks
+    if _is_landmarks_first(obs):
+        entries, n_shared = _FACTORS * int(obs.order.envelope.offset[-1]), n_poses
     else:
-        n = 3 * _n_points(seen)
+        n = 3 * _n_points(obs)
         entries, n_shared = n * (_WIDE * n_poses + _SQUARE * n), n_landmarks
-    blocks = len(seen) + len(seen.strays) + seen.order.n_poses
+    blocks = len(obs) + len(obs.has_offset) + obs.order.n_poses
     condensed = min(RANK, n_shared) * (n_shared + n_landmarks)
     return _ITEM * (entries + _BLOCK * _BLOCKS * blocks + _CONDENSED * condensed)
 
 
-def require_memory(seen: Sightings, max_memory_gb: float) -> None:
+def require_memory(obs: OrderedObservations, max_memory_gb: float) -> None:
     """Raise MemoryError if smoothing these observations may take more memory."""
-    needed_gb = memory_bytes(seen) / _GB
+    needed_gb = memory_bytes(obs) / _GB
     if needed_gb > max_memory_gb:
         raise MemoryError(f"may take {needed_gb:.2g} GB, more than it is given")
 
 
-def _is_landmarks_first(seen: Sightings) -> bool:
-    return seen.order.is_sparser_than(_n_points(seen))
+def _is_landmarks_first(obs: OrderedObservations) -> bool:
+    return obs.order.is_sparser_than(_n_points(obs))
 
 
-def _n_points(seen: Sightings) -> int:
-    return seen.n_landmarks + int(np.count_nonzero(seen.strays))
+def _n_points(obs: OrderedObservations) -> int:
+    return obs.n_landmarks + int(np.count_nonzero(obs.has_offset))
 
 
-def shared_errors(seen: Sightings, equations: NormalEquations, solution: Solution) -> SharedErrors:
+def shared_errors(
+    obs: OrderedObservations, equations: NormalEquations, solution: Solution
+) -> SharedErrors:
     """Return Y (R, 3L); the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y."""
     if solution.landmarks_first:
-        return PathErrors.of(seen, equations, solution.own_m2, solution.factor)
-    return KnownErrors(_beside_own(solution.own_m2, solution.factor.dense()))
+        return PathErrors.of(obs, equations, solution.own_m2, solution.factor)
+    # the joint covariance without the diagonal blocks `own_m2`, from the landmarks' information
+    own_m2 = solution.own_m2
+    n, each = len(own_m2), np.arange(len(own_m2))
+    lower = solution.factor.dense()[-3 * n :, -3 * n :]  # landmarks are last
+    joint = scipy.linalg.cho_solve((lower, True), np.eye(3 * n), check_finite=False)
+    joint.reshape(n, 3, n, 3)[each, :, each, :] -= own_m2
+    variance, direction = np.linalg.eigh(joint)
+    return KnownErrors((np.sqrt(np.maximum(variance, 0.0)) * direction).T[::-1])
 
 
 def pose_covariances(
-    seen: Sightings, equations: NormalEquations, solution: Solution, frames: np.ndarray
+    obs: OrderedObservations, equations: NormalEquations, solution: Solution, frames: np.ndarray
 ) -> Float:
     """Return the covariances (n, 3, 3) of the poses of some frames (n,) after the first."""
     n_unknown, n = len(equations.pose_block) - 1, len(frames)
     chosen = np.zeros((n_unknown, 3, n, 3))
-    row = seen.pose_place[frames] if solution.landmarks_first else frames
+    row = obs.pose_place[frames] if solution.landmarks_first else frames
     chosen[row - 1, :, np.arange(n)] = np.eye(3)
     right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
-    if (
-        not solution.landmarks_first
-    ):  # errors of the path for known points, and errors from the points
+    if not solution.landmarks_first:
+        # errors of the path for known points, and errors from the points
         solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
-        right, alone = pose_point_blocks(seen, equations)[0].T @ solved, right.T @ solved
+        right, alone = pose_point_blocks(obs, equations)[0].T @ solved, right.T @ solved
     root = solution.factor.solve(right)
     return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
 
-def _beside_own(own_m2: Float, lower: Float) -> Float:
-    """Return Y (3L, 3L) from the factor of the landmarks' information."""
-    n, each = len(own_m2), np.arange(len(own_m2))
-    lower = lower[-3 * n :, -3 * n :]  # landmarks are last
-    joint = scipy.linalg.cho_solve((lower, True), np.eye(3 * n), check_finite=False)
-    joint.reshape(n, 3, n, 3)[each, :, each, :] -= own_m2
-    variance, direction = np.linalg.eigh(joint)
-    return (np.sqrt(np.maximum(variance, 0.0)) * direction).T[::-1]
-
-
-def _landmarks_first(seen: Sightings, equations: NormalEquations) -> Solution:
-    left = without_offsets(seen, equations.points)
-    poses = ReducedPoses(seen, equations, left)
+def _eliminate_landmarks_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
+    reduced = eliminate_offsets(obs, equations.points)
+    poses = ReducedPoses(obs, equations, reduced)
     gradient, factor = poses.gradient(), poses.factor()
-    way = poses.solved(factor, -gradient)
-    along = along_way(seen, equations.coupling, way)
-    step = Estimate(way, *moved_points(seen, equations.points, left, along))
-    moved, known = -float(np.vdot(gradient, way)), known_points(seen, left)
-    own = left.landmark_m2, known.offset_m2, known.track_m2
-    return Solution(step, moved, *own, factor, landmarks_first=True)
+    path_step = poses.solve(factor, -gradient)
+    path_term = coupling_times_poses(obs, equations.coupling, path_step)
+    step = Estimate(path_step, *substitute_points(obs, equations.points, reduced, path_term))
+    squared_step, known = -float(np.vdot(gradient, path_step)), point_covariances(obs, reduced)
+    own = reduced.landmark_m2, known.offset_m2, known.track_m2
+    return Solution(step, squared_step, *own, factor, landmarks_first=True)
 
 
-def _poses_first(seen: Sightings, equations: NormalEquations) -> Solution:
-    n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(seen.strays)
-    B, K, gradient = pose_point_blocks(seen, equations)
+def _eliminate_poses_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
+    n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(obs.has_offset)
+    B, K, gradient = pose_point_blocks(obs, equations)
     chain = chain_factor(equations)
     right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
     solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
     whole = Envelope(np.zeros(len(K), dtype=np.int64))
     factor = factor_in_envelope(whole.of(K - B.T @ solved[:, :-1]), whole)
     points = -factor.solve_transposed(factor.solve(gradient - B.T @ solved[:, -1]))
-    way, offsets = np.zeros((n_poses, 3)), np.zeros((len(seen.strays), 3))
-    way[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
-    offsets[seen.strays] = points[:n_offsets].reshape(-1, 3)
-    step = Estimate(way, points[n_offsets:].reshape(-1, 3), offsets)
-    left = without_offsets(seen, equations.points)
-    known = known_points(seen, left)
-    own = left.landmark_m2, known.offset_m2, known.track_m2
+    path_step, offsets = np.zeros((n_poses, 3)), np.zeros((len(obs.has_offset), 3))
+    path_step[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
+    offsets[obs.has_offset] = points[:n_offsets].reshape(-1, 3)
+    step = Estimate(path_step, points[n_offsets:].reshape(-1, 3), offsets)
+    reduced = eliminate_offsets(obs, equations.points)
+    known = point_covariances(obs, reduced)
+    own = reduced.landmark_m2, known.offset_m2, known.track_m2
     last = step.point_m.ravel()
-    moved = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
-    return Solution(step, moved, *own, factor, landmarks_first=False)
+    squared_step = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
+    return Solution(step, squared_step, *own, factor, landmarks_first=False)
 
 
-def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Float, Float, Float]:
+def pose_point_blocks(
+    obs: OrderedObservations, equations: NormalEquations
+) -> tuple[Float, Float, Float]:
     """Return the points' block with the poses, their own block and gradient; offsets come first."""
-    strays, n_poses = seen.strays, len(equations.pose_block)
-    row, stray = strays[seen.track], np.cumsum(strays) - 1
-    n, n_points = np.count_nonzero(strays), np.count_nonzero(strays) + seen.n_landmarks
+    has_offset, n_poses = obs.has_offset, len(equations.pose_block)
+    row, number = has_offset[obs.track], np.cumsum(has_offset) - 1
+    n, n_points = np.count_nonzero(has_offset), np.count_nonzero(has_offset) + obs.n_landmarks
     wide, K = np.zeros((n_poses, n_points, 3, 3)), np.zeros((n_points, n_points, 3, 3))
-    np.add.at(wide, (seen.frame[row], stray[seen.track[row]]), equations.coupling[row])
-    np.add.at(wide, (seen.frame, n + seen.landmark), equations.coupling)
+    np.add.at(wide, (obs.frame[row], number[obs.track[row]]), equations.coupling[row])
+    np.add.at(wide, (obs.frame, n + obs.landmark), equations.coupling)
     S, each, landmark = (
         equations.points.track_block,
         np.arange(n_points),
-        n + seen.landmark_of_track,
+        n + obs.landmark_of_track,
     )
-    own = np.concatenate([S[strays], _regular(seen, seen.sum_tracks(S))])
-    own[:n] += equations.points.offset_information[strays, None, None] * np.eye(3)
+    landmark_block = obs.sum_tracks(S)
+    if obs.n_dimensions == 2:  # z is not observed
+        landmark_block[:, 2, 2] = 1.0
+    own = np.concatenate([S[has_offset], landmark_block])
+    own[:n] += equations.points.offset_information[has_offset, None, None] * np.eye(3)
     K[each, each] = own
-    K[landmark[strays], each[:n]] = S[strays]
-    K[each[:n], landmark[strays]] = S[strays]
+    K[landmark[has_offset], each[:n]] = S[has_offset]
+    K[each[:n], landmark[has_offset]] = S[has_offset]
     gradient = [
-        (equations.points.track_gradient + equations.points.offset_gradient)[strays],
-        seen.sum_tracks(equations.points.track_gradient),
+        (equations.points.track_gradient + equations.points.offset_gradient)[has_offset],
+        obs.sum_tracks(equations.points.track_gradient),
     ]
     as_matrix = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
     K = K.transpose(0, 2, 1, 3).reshape(3 * n_points, 3 * n_points)
@@ -407,9 +407,9 @@ def pose_point_blocks(seen: Sightings, equations: NormalEquations) -> tuple[Floa
 
 
 def chain_factor(equations: NormalEquations) -> Float:
-    """Cholesky factor of the poses, which are a chain, but for the first.
+    """Return the Cholesky factor of the chain of poses after the first.
 
-    As LAPACK takes a band: row d is the d-th diagonal below the main.
+    It is a band matrix of LAPACK: row d is the d-th diagonal below the main diagonal.
     """
     n = 3 * len(equations.pose_block)
     band = np.zeros((_BAND + 1, n))
@@ -419,12 +419,3 @@ def chain_factor(equations: NormalEquations) -> Float:
                 band[r - q, q::3] = equations.pose_block[:, r, q]
             band[3 + r - q, q : n - 3 : 3] = equations.link[:, r, q]
     return scipy.linalg.cholesky_banded(band[:, 3:], lower=True, check_finite=False)
-
-
-def _regular(seen: Sightings, point_block: Float) -> Float:
-    """Return the landmarks' blocks; in planar data z, which is not observed, has information 1."""
-    if seen.n_dimensions == 3:
-        return point_block
-    regular = point_block.copy()
-    regular[:, 2, 2] = 1.0
-    return regular

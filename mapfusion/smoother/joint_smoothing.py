@@ -15,15 +15,15 @@ from mapfusion.geometry.se2 import IDENTITY, between, compose
 from mapfusion.parameters import require_shape
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.smoother.elimination import pose_covariances, require_memory
-from mapfusion.smoother.noise_estimation import AS_STATED, settled_with_levels
-from mapfusion.smoother.normal_equations import Estimate, first_points
-from mapfusion.smoother.optimizer import Problem, settled
-from mapfusion.smoother.problem import sightings_of
+from mapfusion.smoother.noise_estimation import UNIT_SCALES, optimize_with_noise
+from mapfusion.smoother.normal_equations import Estimate, initial_landmarks
+from mapfusion.smoother.optimizer import Problem, optimize
+from mapfusion.smoother.problem import order_observations
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters
 
 
 @dataclass(frozen=True)
-class Recording:
+class AssociatedLog:
     """Log of a robot with data association and path.
 
     Attributes:
@@ -45,11 +45,11 @@ class Recording:
         require_shape("path", self.path, (len(self.log), 3))
 
 
-_NOTHING = np.zeros((1, 3))  # information of the motion between two logs
+_UNKNOWN = np.zeros((1, 3))  # information of the motion between two logs
 
 
 @dataclass(frozen=True)
-class SmoothedTogether:
+class JointlySmoothed:
     """Result of smoothing K logs, in the frame of the first robot's first pose.
 
     Attributes:
@@ -67,12 +67,12 @@ class SmoothedTogether:
     paths: tuple[Float, ...]
 
 
-def smooth_together(
-    recordings: Sequence[Recording],
+def smooth_jointly(
+    recordings: Sequence[AssociatedLog],
     points: Sequence[np.ndarray],
     T_first_robot: Float,
     max_memory_gb: float,
-) -> SmoothedTogether:
+) -> JointlySmoothed:
     """Compute the most probable paths and points of K robots with equal noise levels.
 
     Args:
@@ -86,10 +86,10 @@ def smooth_together(
         LinAlgError: the pose of a robot is not determined.
         MemoryError: it may take more than `max_memory_gb`.
     """
-    log, point = _one_log([each.log for each in recordings]), np.concatenate(points)
-    stray_information = recordings[0].parameters.stray_information
-    seen = sightings_of(log, point, min_count=1, stray=stray_information > 0)
-    require_memory(seen, max_memory_gb)
+    log, point = _concatenate([each.log for each in recordings]), np.concatenate(points)
+    offset_prior = recordings[0].parameters.offset_prior
+    obs = order_observations(log, point, min_count=1, with_offsets=offset_prior > 0)
+    require_memory(obs, max_memory_gb)
     starts = np.cumsum([0, *(len(each.log) for each in recordings[:-1])])
     path = np.concatenate(
         [
@@ -99,27 +99,26 @@ def smooth_together(
     )
     path[0] = IDENTITY  # removes rounding errors
     information = [
-        np.concatenate([each.parameters.odometry_information(each.log), _NOTHING])
+        np.concatenate([each.parameters.odometry_information(each.log), _UNKNOWN])
         for each in recordings
     ]
-    problem = Problem(seen, log.odometry, np.concatenate(information)[:-1], stray_information)
-    start = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    own_odometry = all(each.parameters.has_own_odometry for each in recordings)
-    if own_odometry:
-        end, levels = settled_with_levels(problem, start)
+    problem = Problem(obs, log.odometry, np.concatenate(information)[:-1], offset_prior)
+    start = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
+    if all(each.parameters.has_own_odometry for each in recordings):
+        state, scales = optimize_with_noise(problem, start)
     else:
-        end, levels = settled(problem, start), AS_STATED
+        state, scales = optimize(problem, start), UNIT_SCALES
     covariance = np.zeros((len(starts), 3, 3))
-    covariance[1:] = pose_covariances(seen, end.equations, end.solution, starts[1:])
-    names = point[seen.row[seen.starts[:-1]]]
-    paths = tuple(np.split(end.estimate.path, starts[1:]))
-    smoothed = Smoothed.of(problem, end, point, levels)
+    covariance[1:] = pose_covariances(obs, state.equations, state.solution, starts[1:])
+    names = point[obs.row[obs.starts[:-1]]]
+    paths = tuple(np.split(state.estimate.path, starts[1:]))
+    smoothed = Smoothed.of(problem, state, point, scales)
     if smoothed.second_order is not None:
         covariance += smoothed.second_order.pose_covariances(starts)
-    return SmoothedTogether(smoothed, names, end.estimate.path[starts], covariance, paths)
+    return JointlySmoothed(smoothed, names, state.estimate.path[starts], covariance, paths)
 
 
-def _one_log(logs: Sequence[RobotLog]) -> RobotLog:
+def _concatenate(logs: Sequence[RobotLog]) -> RobotLog:
     """Concatenate the logs; they have no common tracks."""
     n_before = np.cumsum([0, *(len(log) for log in logs[:-1])])
     tracks, first_free = [], 0
@@ -129,7 +128,7 @@ def _one_log(logs: Sequence[RobotLog]) -> RobotLog:
         tracks.append(np.where(track == NO_TRACK, NO_TRACK, track.astype(np.int64) + first_free))
         first_free = max(first_free, int(tracks[-1].max(initial=NO_TRACK)) + 1)
     iteration = [log.iteration + n for log, n in zip(logs, n_before, strict=True)]
-    seen = Observations(
+    obs = Observations(
         np.concatenate([log.observations.position_m for log in logs]),
         np.concatenate([log.observations.covariance_m2 for log in logs]),
         track=np.concatenate(tracks),
@@ -140,5 +139,5 @@ def _one_log(logs: Sequence[RobotLog]) -> RobotLog:
         np.arange(n_before[-1] + len(logs[-1])) * 1.0,
         np.concatenate([log.odometry for log in logs]),
         np.concatenate(iteration),
-        seen,
+        obs,
     )

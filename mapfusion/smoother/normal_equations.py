@@ -20,7 +20,7 @@ import numpy as np
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float, sums_by, times_vectors
 from mapfusion.geometry.se2 import between, rotation, wrap
-from mapfusion.smoother.problem import Sightings
+from mapfusion.smoother.problem import OrderedObservations
 
 # Standard deviation of the odometry of a robot that stands still: far below the errors of any
 # sensor, and far above the rounding errors of a system of a thousand poses.
@@ -47,14 +47,14 @@ class Weights(NamedTuple):
     offset: Float
 
 
-class Shares(NamedTuple):
+class InformationShares(NamedTuple):
     """Expected shares of the weighted information of observations and of offsets."""
 
     observation: float
     offset: float
 
 
-WHOLE = Shares(1.0, 1.0)
+FULL_INFORMATION = InformationShares(1.0, 1.0)
 
 
 class PointEquations(NamedTuple):
@@ -94,32 +94,32 @@ class NormalEquations(NamedTuple):
 def odometry_information(odometry: Float, noise: MotionNoise) -> Float:
     """Return the inverse variances (T - 1, 3) of the increments (T, 3) after the first."""
     sigma = np.array([noise.standard_deviations(each) for each in odometry[1:]]).reshape(-1, 3)
-    return information_of(sigma)
+    return bounded_information(sigma)
 
 
-def information_of(sigma: Float) -> Float:
+def bounded_information(sigma: Float) -> Float:
     """Return bounded inverse variances (N, 3) of motions with standard deviations (N, 3)."""
     return 1.0 / (sigma**2 + _STILL**2)
 
 
-def information_under(information: Float, levels: Float) -> Float:
-    """Return the information (N, 3) of motions whose variances are multiplied by `levels` (3,).
+def scaled_information(information: Float, scales: Float) -> Float:
+    """Return the information (N, 3) of motions whose variances are multiplied by `scales` (3,).
 
-    It has the bound of `information_of`, which levels do not scale.
+    It has the bound of `bounded_information`, which is not scaled.
     """
-    return np.minimum(information / levels, _STILL**-2)
+    return np.minimum(information / scales, _STILL**-2)
 
 
-def least_levels(information: Float) -> Float:
-    """Return the levels (3,) below which no motion's information (N, 3) grows any more.
+def smallest_scales(information: Float) -> Float:
+    """Return the noise scales (3,) below which the information (N, 3) is at its bound.
 
-    They are 1 where no motion has any information.
+    They are 1 without any information.
     """
     least = np.min(np.where(information > 0, information, np.inf), axis=0, initial=np.inf)
     return np.where(np.isfinite(least), least * _STILL**2, 1.0)
 
 
-def turns(path: Float) -> Float:
+def heading_cos_sin(path: Float) -> Float:
     """Return cosine and sine of each heading, shape (T, 2)."""
     return np.stack([np.cos(path[:, 2]), np.sin(path[:, 2])], axis=1)
 
@@ -135,30 +135,32 @@ def disturbance_jacobians(path: Float) -> tuple[Float, Float]:
     """Return the Jacobians (T - 1, 3, 3) of each disturbance by the pose before and after it."""
     n = len(path) - 1
     to_robot = np.swapaxes(rotation(path[:-1, 2]), 1, 2)
-    way = path[1:, :2] - path[:-1, :2]
+    translation = path[1:, :2] - path[:-1, :2]
     before, after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
     after[:, :2, :2], after[:, 2, 2] = to_robot, 1.0
     before[:, :2, :2], before[:, 2, 2] = -to_robot, -1.0
-    before[:, :2, 2] = np.einsum("nij,nj->ni", to_robot, np.stack([way[:, 1], -way[:, 0]], 1))
+    before[:, :2, 2] = np.einsum(
+        "nij,nj->ni", to_robot, np.stack([translation[:, 1], -translation[:, 0]], 1)
+    )
     return before, after
 
 
 def normal_equations(
-    seen: Sightings,
+    obs: OrderedObservations,
     at: Estimate,
     weights: Weights,
-    stray_information: float,
+    offset_prior: float,
     odometry: Float,
     information: Float,
-    shares: Shares = WHOLE,
+    shares: InformationShares = FULL_INFORMATION,
 ) -> NormalEquations:
     """Return the equations of the next step.
 
     Args:
-        seen: the observations.
+        obs: the observations.
         at: the estimate.
         weights: weights of observations and offsets.
-        stray_information: information of an offset along each axis, in 1/m^2.
+        offset_prior: information of an offset along each axis, in 1/m^2.
         odometry: increments, shape (T, 3).
         information: information of the increments, shape (T - 1, 3).
         shares: shares of observations and offsets in the matrix; the gradient is not scaled.
@@ -168,13 +170,13 @@ def normal_equations(
         np.zeros((n_poses, 3, 3)),
         np.zeros((n_poses - 1, 3, 3)),
         np.zeros((n_poses, 3)),
-        np.empty((len(seen), 3, 3)),
-        _no_observations(at, weights, stray_information, shares),
+        np.empty((len(obs), 3, 3)),
+        _no_observations(at, weights, offset_prior, shares),
     )
-    share, frame = shares.observation, seen.frame
-    W, e, point = _in_map_frame(seen, at, weights.observation)
-    _put_points(seen, W, e, share, made.points)
-    # the lever: of de/dx the last column
+    share, frame = shares.observation, obs.frame
+    W, e, point = _in_map_frame(obs, at, weights.observation)
+    _put_points(obs, W, e, share, made.points)
+    # (a, b) is the lever arm, the last column of de/dx
     a, b = point[:, 1] - at.path[frame, 1], at.path[frame, 0] - point[:, 0]
     coupling = made.coupling
     coupling[:, :2] = -share * W[:, :2]
@@ -183,53 +185,50 @@ def normal_equations(
     made.pose_block[:, :, :2] = -sums_by(frame, coupling[:, :, :2], n_poses)
     turned = coupling[:, :, 0] * a[:, None] + coupling[:, :, 1] * b[:, None]
     made.pose_block[:, :, 2] = sums_by(frame, turned, n_poses)
-    _add_odometry(at.path, odometry, information, made)
+    # odometry
+    d = disturbances(at.path, odometry)
+    before, after = disturbance_jacobians(at.path)
+    for J, poses in ((before, slice(0, n_poses - 1)), (after, slice(1, n_poses))):
+        weighted = np.swapaxes(J, 1, 2) * information[:, None, :]
+        made.pose_block[poses] += weighted @ J
+        made.pose_gradient[poses] += np.einsum("nij,nj->ni", weighted, d)
+    made.link[:] = (np.swapaxes(after, 1, 2) * information[:, None, :]) @ before
     return made
 
 
 def point_equations(
-    seen: Sightings, at: Estimate, weights: Weights, stray_information: float
+    obs: OrderedObservations, at: Estimate, weights: Weights, offset_prior: float
 ) -> PointEquations:
     """Return the equations of the points for a fixed path; arguments as in `normal_equations`."""
-    made = _no_observations(at, weights, stray_information, WHOLE)
-    W, e, _ = _in_map_frame(seen, at, weights.observation)
-    _put_points(seen, W, e, 1.0, made)
+    made = _no_observations(at, weights, offset_prior, FULL_INFORMATION)
+    W, e, _ = _in_map_frame(obs, at, weights.observation)
+    _put_points(obs, W, e, 1.0, made)
     return made
 
 
 def _no_observations(
-    at: Estimate, weights: Weights, stray_information: float, shares: Shares
+    at: Estimate, weights: Weights, offset_prior: float, shares: InformationShares
 ) -> PointEquations:
-    n, of_offset = len(at.offset_m), weights.offset * stray_information
+    n, of_offset = len(at.offset_m), weights.offset * offset_prior
     nothing = np.zeros((n, 3, 3)), np.zeros((n, 3))
     return PointEquations(*nothing, shares.offset * of_offset, of_offset[:, None] * at.offset_m)
 
 
-def _add_odometry(path: Float, odometry: Float, information: Float, made: NormalEquations) -> None:
-    n = len(path) - 1
-    d = disturbances(path, odometry)
-    before, after = disturbance_jacobians(path)
-    for J, at in ((before, slice(0, n)), (after, slice(1, n + 1))):
-        weighted = np.swapaxes(J, 1, 2) * information[:, None, :]
-        made.pose_block[at] += weighted @ J
-        made.pose_gradient[at] += np.einsum("nij,nj->ni", weighted, d)
-    made.link[:] = (np.swapaxes(after, 1, 2) * information[:, None, :]) @ before
-
-
-def _in_map_frame(seen: Sightings, at: Estimate, weight: Float) -> tuple[Float, Float, Float]:
-    """Return what the N observations say in the map frame.
+def _in_map_frame(
+    obs: OrderedObservations, at: Estimate, weight: Float
+) -> tuple[Float, Float, Float]:
+    """Transform the observations into the map frame.
 
     Returns:
-        Their weighted information R W R' (N, 3, 3), their residuals (N, 3), and the points (N, 3)
-        that they are of.
+        weighted information R W R' (N, 3, 3), residuals (N, 3) and observed points (N, 3).
     """
-    point = (at.point_m[seen.landmark_of_track] + at.offset_m)[seen.track]
-    pose, z, (c, s) = at.path[seen.frame], seen.position_m, turns(at.path)[seen.frame].T
+    point = (at.point_m[obs.landmark_of_track] + at.offset_m)[obs.track]
+    pose, z, (c, s) = at.path[obs.frame], obs.position_m, heading_cos_sin(at.path)[obs.frame].T
     e = np.empty(point.shape)
     e[:, 0] = point[:, 0] - pose[:, 0] - (c * z[:, 0] - s * z[:, 1])
     e[:, 1] = point[:, 1] - pose[:, 1] - (s * z[:, 0] + c * z[:, 1])
     e[:, 2] = point[:, 2] - z[:, 2]
-    own, W = seen.information, np.empty(seen.information.shape)
+    own, W = obs.information, np.empty(obs.information.shape)
     along, across, mixed = own[:, 0, 0], own[:, 1, 1], own[:, 0, 1]
     W[:, 0, 0] = weight * (c * c * along - 2 * c * s * mixed + s * s * across)
     W[:, 1, 1] = weight * (s * s * along + 2 * c * s * mixed + c * c * across)
@@ -241,32 +240,34 @@ def _in_map_frame(seen: Sightings, at: Estimate, weight: Float) -> tuple[Float, 
     return W, e, point
 
 
-def _put_points(seen: Sightings, W: Float, e: Float, share: float, made: PointEquations) -> None:
-    """Put the sums of W, of which a share counts, and of W e of each track."""
-    n = len(seen.strays)
-    made.track_gradient[:] = sums_by(seen.track, times_vectors(W, e), n)
-    made.track_block[:] = sums_by(seen.track, share * W, n)
+def _put_points(
+    obs: OrderedObservations, W: Float, e: Float, share: float, made: PointEquations
+) -> None:
+    """Write the sums of `share` W and of W e over each track."""
+    n = len(obs.has_offset)
+    made.track_gradient[:] = sums_by(obs.track, times_vectors(W, e), n)
+    made.track_block[:] = sums_by(obs.track, share * W, n)
 
 
-def first_points(seen: Sightings, path: Float) -> Float:
+def initial_landmarks(obs: OrderedObservations, path: Float) -> Float:
     """Return the mean observed position of each landmark for a path, shape (L, 3)."""
-    pose, position = path[seen.frame], seen.position_m.copy()
+    pose, position = path[obs.frame], obs.position_m.copy()
     turned = np.einsum("nij,nj->ni", rotation(pose[:, 2]), position[:, :2])
     position[:, :2] = pose[:, :2] + turned
-    return seen.sum_by_landmark(position) / np.diff(seen.starts)[:, None]
+    return obs.sum_by_landmark(position) / np.diff(obs.starts)[:, None]
 
 
-def squared_distances(seen: Sightings, at: Estimate) -> Float:
-    """(N,) squared Mahalanobis distances of the observations from where they should be.
+def squared_distances(obs: OrderedObservations, at: Estimate) -> Float:
+    """Return the squared Mahalanobis distances of the observations, shape (N,).
 
-    In the robot's frame, where the information is: r' W r with r = R'(l + b - p) - z.
+    They are r' W r with the residuals r = R'(l + b - p) - z in the robot frame.
     """
-    point = (at.point_m[seen.landmark_of_track] + at.offset_m)[seen.track]
-    pose, W, (c, s) = at.path[seen.frame], seen.information, turns(at.path)[seen.frame].T
+    point = (at.point_m[obs.landmark_of_track] + at.offset_m)[obs.track]
+    pose, W, (c, s) = at.path[obs.frame], obs.information, heading_cos_sin(at.path)[obs.frame].T
     along, across = point[:, 0] - pose[:, 0], point[:, 1] - pose[:, 1]
-    r0 = c * along + s * across - seen.position_m[:, 0]
-    r1 = c * across - s * along - seen.position_m[:, 1]
-    r2 = point[:, 2] - seen.position_m[:, 2]
+    r0 = c * along + s * across - obs.position_m[:, 0]
+    r1 = c * across - s * along - obs.position_m[:, 1]
+    r2 = point[:, 2] - obs.position_m[:, 2]
     return (
         r0 * (W[:, 0, 0] * r0 + 2 * W[:, 0, 1] * r1)
         + r1 * (W[:, 1, 1] * r1 + 2 * W[:, 1, 2] * r2)
@@ -274,18 +275,18 @@ def squared_distances(seen: Sightings, at: Estimate) -> Float:
     )
 
 
-def squares_of_points(seen: Sightings, path: Float, covariance_m2: Float) -> Float:
-    """(N,) what squared distances are expected to be more by: the trace of W R' C R.
+def expected_point_squares(obs: OrderedObservations, path: Float, covariance_m2: Float) -> Float:
+    """Return the expected increase of squared distances by errors of the points, shape (N,).
 
-    About the tracks' true points, that is; those about points that were fitted to the same
-    observations are smaller.
+    It is the trace of W R' C R, if the points are independent of the observations. Distances from
+    points that are fitted to the same observations are smaller.
 
     Args:
-        seen: the observations.
-        path: (T, 3).
-        covariance_m2: (B, 3, 3) C of the tracks' points.
+        obs: the observations.
+        path: path, shape (T, 3).
+        covariance_m2: covariances C of the tracks' points, shape (B, 3, 3).
     """
-    C, W, (c, s) = covariance_m2[seen.track], seen.information, turns(path)[seen.frame].T
+    C, W, (c, s) = covariance_m2[obs.track], obs.information, heading_cos_sin(path)[obs.frame].T
     xx, xy, xz = C[:, 0, 0], C[:, 0, 1], C[:, 0, 2]
     yy, yz, zz = C[:, 1, 1], C[:, 1, 2], C[:, 2, 2]
     along = c * c * xx + 2 * c * s * xy + s * s * yy
@@ -301,13 +302,13 @@ def squares_of_points(seen: Sightings, path: Float, covariance_m2: Float) -> Flo
     )
 
 
-def offset_squares(seen: Sightings, at: Estimate, stray_information: float) -> Float:
+def offset_squares(obs: OrderedObservations, at: Estimate, offset_prior: float) -> Float:
     """Return the squared Mahalanobis distances of the offsets from zero."""
-    offset = at.offset_m[seen.strays, : seen.n_dimensions]
-    return stray_information * np.sum(offset**2, axis=1)
+    offset = at.offset_m[obs.has_offset, : obs.n_dimensions]
+    return offset_prior * np.sum(offset**2, axis=1)
 
 
-def known_dimensions(seen: Sightings, offset_m2: Float, information: Float) -> Float:
+def determined_dimensions(obs: OrderedObservations, offset_m2: Float, information: Float) -> Float:
     """Return the number of dimensions of each offset that the data determine.
 
     It is the trace of 1 - P C, with the offset's covariance C and its prior information P. It is
@@ -315,10 +316,10 @@ def known_dimensions(seen: Sightings, offset_m2: Float, information: Float) -> F
     landmark, and nearly n for one track among many.
 
     Args:
-        seen: the observations.
+        obs: the observations.
         offset_m2: C, shape (B, 3, 3).
         information: P along each axis, shape (B,).
     """
-    n, strays = seen.n_dimensions, seen.strays
-    unknown = information[strays] * np.trace(offset_m2[strays, :n, :n], axis1=1, axis2=2)
+    n, has_offset = obs.n_dimensions, obs.has_offset
+    unknown = information[has_offset] * np.trace(offset_m2[has_offset, :n, :n], axis1=1, axis2=2)
     return np.clip(n - unknown, 0, n)

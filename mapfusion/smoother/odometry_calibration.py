@@ -15,7 +15,7 @@ in opposite directions slip more. s is the share of a turn in place,
 model is linear in the constants.
 
 Each round smooths the logs, takes a Gauss-Newton step of the constants on the marginal likelihood
-and a step of the noise levels (`noise_levels.py`). No true poses are needed.
+and a step of the noise parameters (`noise_estimation`). No true poses are needed.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,25 +30,25 @@ from mapfusion.geometry.se2 import IDENTITY, compose, wrap
 from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import RobotLog, first_frames
 from mapfusion.smoother.noise_estimation import (
-    LEVELS,
-    Told,
+    NOISE_PARAMETERS,
+    NoiseStatistics,
     motion_posterior,
-    plain,
-    pooled,
+    noise_statistics,
     relative_errors,
-    told,
-    updated,
+    sum_statistics,
+    update_noise,
+    without_systematic_errors,
 )
 from mapfusion.smoother.normal_equations import (
     Estimate,
     disturbances,
-    first_points,
+    initial_landmarks,
     odometry_information,
     squared_distances,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, settled
-from mapfusion.smoother.problem import Sightings, sightings_of
-from mapfusion.smoother.robust_loss import fitted_dof, student_deviance
+from mapfusion.smoother.optimizer import Problem, optimize
+from mapfusion.smoother.problem import OrderedObservations, order_observations
+from mapfusion.smoother.robust_loss import fit_dof, student_deviance
 from mapfusion.smoother.smooth import SmootherParameters
 
 # r: half the track of a small robot (0.13 m of an iRobot Create, 0.2 m of a P3-AT).
@@ -87,7 +87,7 @@ class OdometryError:
 
     def corrected(self, odometry: Float) -> Float:
         """Return the increments (T, 3) without these errors."""
-        moved = odometry + np.einsum("kdc,c->kd", sensitivity(odometry), self.constants)
+        moved = odometry + np.einsum("kdc,c->kd", increment_jacobians(odometry), self.constants)
         moved[:, 2] = wrap(moved[:, 2])
         return moved
 
@@ -99,7 +99,7 @@ class OdometryError:
 N_CONSTANTS = len(fields(OdometryError))
 
 
-def sensitivity(odometry: Float) -> Float:
+def increment_jacobians(odometry: Float) -> Float:
     """Return the derivatives (T, 3, 5) of the increments (T, 3) by the constants."""
     by = np.zeros((len(odometry), 3, N_CONSTANTS))
     way, turn = np.hypot(odometry[:, 0], odometry[:, 1]), odometry[:, 2]
@@ -126,8 +126,8 @@ _CLOSE = 1e-5  # tolerance of the smoother in a round, in squared sigmas a coord
 # Rounds for each part of a log while the initial path is extended.
 _PART_ROUNDS = 3
 _MOST_ROUNDS = 40
-# Rounds end if constants change by less than this many standard errors, and levels by less than
-# this share.
+# Rounds end if constants change by less than this many standard errors, and noise parameters by
+# less than this share.
 _SETTLED = 0.1
 # Number of frames with observations in the first part of a log, and the growth of further parts.
 _FIRST_FRAMES, _GROWTH = 30, 1.4
@@ -157,8 +157,8 @@ class Calibration:
     Attributes:
         robots: robots in the order of the logs.
         motion: noise of the corrected odometry of all robots.
-        relative_errors: relative standard errors of the levels in the order of `LEVELS`, shape
-            (3,).
+        relative_errors: relative standard errors of the noise in the order of
+            `NOISE_PARAMETERS`, shape (3,).
         n_rounds: number of rounds.
         settled: true if the rounds converged.
     """
@@ -167,7 +167,7 @@ class Calibration:
     motion: MotionNoise
     relative_errors: Float
     n_rounds: int
-    settled: bool
+    optimize: bool
 
 
 @dataclass
@@ -175,39 +175,48 @@ class _Robot:
     """State of a log during the calibration."""
 
     log: RobotLog
-    seen: Sightings
-    stray_information: float
+    obs: OrderedObservations
+    offset_prior: float
     path: Float
     constants: Float
     covariance: Float
-    likeliest: Float  # (5,) constants before anything is seen
-    prior: Float  # (5,) standard deviations of these
-    deviance: float = np.inf  # twice the negative log likelihood that the last round began with
+    prior_mean: Float  # (5,) prior mean of the constants
+    prior_sigma: Float  # (5,) prior standard deviations of the constants
+    deviance: float = np.inf  # twice the negative log likelihood at the start of the last round
 
     @classmethod
-    def of(cls, log: RobotLog, seen: Sightings, stray_information: float, path: Float) -> "_Robot":
+    def of(
+        cls, log: RobotLog, obs: OrderedObservations, offset_prior: float, path: Float
+    ) -> "_Robot":
         """Return the initial state with the prior of any odometry."""
         nothing = np.zeros(N_CONSTANTS)
         covariance = np.diag(_PRIOR**2)
-        return cls(log, seen, stray_information, path, nothing, covariance, nothing, _PRIOR)
+        return cls(log, obs, offset_prior, path, nothing, covariance, nothing, _PRIOR)
 
-    def round(self, motion: MotionNoise) -> tuple[Told, float]:
+    def round(self, motion: MotionNoise) -> tuple[NoiseStatistics, float]:
         """Smooth and step the constants; return noise statistics and the step in sigmas."""
         odometry = OdometryError.of(self.constants).corrected(self.log.odometry)
         information = odometry_information(odometry, motion)
-        problem = Problem(self.seen, odometry, information, self.stray_information)
-        points = first_points(self.seen, self.path)
-        start = Estimate(self.path, points, np.zeros((len(self.seen.strays), 3)))
-        end = settled(problem, start, _CLOSE)
-        self.path, self.deviance = end.estimate.path, _deviance(problem, end)
-        by_constants = sensitivity(self.log.odometry)[1:]
-        posterior = motion_posterior(end, odometry, information, by_constants)
-        known = posterior.constants_information + np.diag(self.prior**-2)
+        problem = Problem(self.obs, odometry, information, self.offset_prior)
+        points = initial_landmarks(self.obs, self.path)
+        start = Estimate(self.path, points, np.zeros((len(self.obs.has_offset), 3)))
+        state = optimize(problem, start, _CLOSE)
+        self.path = state.estimate.path
+        # deviance of odometry and observations with fitted tails
+        squares, n = squared_distances(self.obs, state.estimate), self.obs.n_dimensions
+        self.deviance = student_deviance(squares, fit_dof(squares, n), n)
+        d = disturbances(self.path, odometry)
+        self.deviance += float(np.sum(information * d**2))
+        by_constants = increment_jacobians(self.log.odometry)[1:]
+        posterior = motion_posterior(state, odometry, information, by_constants)
+        known = posterior.constants_information + np.diag(self.prior_sigma**-2)
         self.covariance = np.asarray(np.linalg.inv(known), np.float64)
-        expected = (self.likeliest - self.constants) / self.prior**2
+        expected = (self.prior_mean - self.constants) / self.prior_sigma**2
         step = self.covariance @ (posterior.constants_gradient + expected)
         self.constants = self.constants + step
-        return told(posterior, odometry, information, motion), float(np.sqrt(step @ known @ step))
+        return noise_statistics(posterior, odometry, information, motion), float(
+            np.sqrt(step @ known @ step)
+        )
 
 
 def calibrate(
@@ -231,20 +240,23 @@ def calibrate(
         InputError: a log has too little motion or too few observations.
         ValueError: an array has a wrong shape.
     """
-    motion = plain(_FIRST)
+    motion = without_systematic_errors(_FIRST)
     robots = [
-        _begun(log, landmark, path, parameters, motion)
+        _initial_state(log, landmark, path, parameters, motion)
         for log, landmark, path in zip(logs, landmarks, paths, strict=True)
     ]
     n_rounds = 0
     while True:
         n_rounds += 1
         rounds = [robot.round(motion) for robot in robots]
-        all_told = pooled([each for each, _ in rounds])
-        before, motion = motion, updated(motion, all_told)
-        moved = max(0.0, *(step for _, step in rounds), _change(before, motion))
+        statistics = sum_statistics([each for each, _ in rounds])
+        before, motion = motion, update_noise(motion, statistics)
+        changes = (
+            abs(getattr(motion, name) / getattr(before, name) - 1) for name in NOISE_PARAMETERS
+        )
+        largest_step = max(0.0, *(step for _, step in rounds), *changes)
         on_round(n_rounds, _MOST_ROUNDS)
-        if moved < _SETTLED or n_rounds == _MOST_ROUNDS:
+        if largest_step < _SETTLED or n_rounds == _MOST_ROUNDS:
             break
     calibrated = tuple(
         RobotCalibration(
@@ -255,23 +267,12 @@ def calibrate(
         )
         for robot in robots
     )
-    return Calibration(calibrated, motion, relative_errors(all_told), n_rounds, moved < _SETTLED)
+    return Calibration(
+        calibrated, motion, relative_errors(statistics), n_rounds, largest_step < _SETTLED
+    )
 
 
-def _change(before: MotionNoise, after: MotionNoise) -> float:
-    """Return the largest relative change of a level."""
-    return max(abs(getattr(after, name) / getattr(before, name) - 1) for name in LEVELS)
-
-
-def _deviance(problem: Problem, end: Settled) -> float:
-    """Return the deviance of odometry and observations with fitted tails."""
-    walked = disturbances(end.estimate.path, problem.odometry)
-    squares, n = squared_distances(problem.seen, end.estimate), problem.seen.n_dimensions
-    seen = student_deviance(squares, fitted_dof(squares, n), n)
-    return seen + float(np.sum(problem.information * walked**2))
-
-
-def _begun(
+def _initial_state(
     log: RobotLog,
     landmark: np.ndarray,
     path: Float | None,
@@ -279,18 +280,21 @@ def _begun(
     motion: MotionNoise,
 ) -> _Robot:
     require_shape("landmark", landmark, (len(log.observations),))
-    stray = parameters.stray_information
+    with_offsets = parameters.offset_prior
     if path is not None:
         require_shape("path", path, (len(log), 3))
-        seen = sightings_of(log, landmark, parameters.min_count, stray=stray > 0)
-        return _checked(_Robot.of(log, seen, stray, path))
-    found = [_grown(log, landmark, parameters, motion, in_place) for in_place in _IN_PLACE_STARTS]
-    likeliest = min(found, key=lambda robot: robot.deviance)
-    likeliest.likeliest, likeliest.prior = np.zeros(N_CONSTANTS), _PRIOR
-    return likeliest
+        obs = order_observations(log, landmark, parameters.min_count, with_offsets=with_offsets > 0)
+        return _checked(_Robot.of(log, obs, with_offsets, path))
+    found = [
+        _smooth_increasing_parts(log, landmark, parameters, motion, in_place)
+        for in_place in _IN_PLACE_STARTS
+    ]
+    best = min(found, key=lambda robot: robot.deviance)
+    best.prior_mean, best.prior_sigma = np.zeros(N_CONSTANTS), _PRIOR
+    return best
 
 
-def _grown(
+def _smooth_increasing_parts(
     log: RobotLog,
     landmark: np.ndarray,
     parameters: SmootherParameters,
@@ -298,23 +302,30 @@ def _grown(
     in_place: float,
 ) -> _Robot:
     """Return the state after smoothing increasing parts of the log."""
-    observed, stray = np.unique(log.iteration), parameters.stray_information
-    grown = _Robot.of(log, sightings_of(log, landmark, 1, stray=False), stray, IDENTITY[None])
-    grown.likeliest = OdometryError(in_place=in_place).constants
-    grown.prior = OdometryError(*_PRIOR[:-1], in_place=_IN_PLACE_SIGMA).constants
-    grown.constants = grown.likeliest
+    observed, with_offsets = np.unique(log.iteration), parameters.offset_prior
+    grown = _Robot.of(
+        log, order_observations(log, landmark, 1, with_offsets=False), with_offsets, IDENTITY[None]
+    )
+    grown.prior_mean = OdometryError(in_place=in_place).constants
+    grown.prior_sigma = OdometryError(*_PRIOR[:-1], in_place=_IN_PLACE_SIGMA).constants
+    grown.constants = grown.prior_mean
     n_seen = _FIRST_FRAMES
     while True:
         whole = n_seen >= len(observed)
         n_frames = len(log) if whole else int(observed[n_seen]) + 1
         part = log if whole else first_frames(log, n_frames)
         least = parameters.min_count if whole else 1
-        grown.log, grown.seen = (
+        grown.log, grown.obs = (
             part,
-            sightings_of(part, landmark[: len(part.observations)], least, stray=stray > 0),
+            order_observations(
+                part, landmark[: len(part.observations)], least, with_offsets=with_offsets > 0
+            ),
         )
         odometry = OdometryError.of(grown.constants).corrected(part.odometry)
-        grown.path = _extended(grown.path, odometry)
+        path = np.concatenate([grown.path, np.empty((len(odometry) - len(grown.path), 3))])
+        for k in range(len(grown.path), len(odometry)):
+            path[k] = compose(path[k - 1], odometry[k])
+        grown.path = path
         for _ in range(_PART_ROUNDS):
             _checked(grown).round(motion)
         if whole:
@@ -322,17 +333,9 @@ def _grown(
         n_seen = int(n_seen * _GROWTH)
 
 
-def _extended(path: Float, odometry: Float) -> Float:
-    """Extend a path by the odometry (T, 3)."""
-    made = np.concatenate([path, np.empty((len(odometry) - len(path), 3))])
-    for k in range(len(path), len(odometry)):
-        made[k] = compose(made[k - 1], odometry[k])
-    return made
-
-
 def _checked(robot: _Robot) -> _Robot:
-    if not len(robot.seen):
+    if not len(robot.obs):
         raise InputError(
-            f"log {robot.log.robot}: no landmark was seen often enough to tell how the robot moved"
+            f"log {robot.log.robot}: no landmark was observed often enough to compute the motion"
         )
     return robot

@@ -15,8 +15,14 @@ from mapfusion.smoother.normal_equations import (
     normal_equations,
     squared_distances,
 )
-from mapfusion.smoother.problem import Sightings
-from mapfusion.smoother.robust_loss import NO_TAILS, Tails, informative, reweighted, unweighted
+from mapfusion.smoother.problem import OrderedObservations
+from mapfusion.smoother.robust_loss import (
+    GAUSSIAN_TAILS,
+    Tails,
+    information_shares,
+    unit_weights,
+    update_weights,
+)
 
 # Convergence tolerance: largest step of the poses, in squared sigmas a coordinate (0.003 sigma).
 # Single landmarks with inconsistent tracks may take many more steps to converge.
@@ -30,31 +36,31 @@ class Problem(NamedTuple):
     """Least-squares problem: observations, odometry and priors of the offsets.
 
     Attributes:
-        seen: the observations.
+        obs: the observations.
         odometry: increments, shape (T, 3).
         information: information of the increments after the first, shape (T - 1, 3); 0 for
             unknown increments.
-        stray_information: information of a track's offset along each axis, in 1/m^2.
+        offset_prior: information of a track's offset along each axis, in 1/m^2.
     """
 
-    seen: Sightings
+    obs: OrderedObservations
     odometry: Float
     information: Float
-    stray_information: float
+    offset_prior: float
 
     def cost(self, at: Estimate, weights: Weights) -> float:
         """Return the weighted sum of squares."""
-        walked = np.sum(self.information * disturbances(at.path, self.odometry) ** 2)
-        seen = np.sum(weights.observation * squared_distances(self.seen, at))
+        odometry = np.sum(self.information * disturbances(at.path, self.odometry) ** 2)
+        obs = np.sum(weights.observation * squared_distances(self.obs, at))
         offsets = np.sum(weights.offset[:, None] * at.offset_m**2)
-        return float(walked + seen + self.stray_information * offsets)
+        return float(odometry + obs + self.offset_prior * offsets)
 
 
-class Settled(NamedTuple):
+class OptimizerState(NamedTuple):
     """State after some steps.
 
     Attributes:
-        seen: the observations.
+        obs: the observations.
         estimate: the estimate.
         weights: weights of observations and offsets.
         tails: tails of their Student-t distributions.
@@ -63,7 +69,7 @@ class Settled(NamedTuple):
         solution: solution of the equations.
     """
 
-    seen: Sightings
+    obs: OrderedObservations
     estimate: Estimate
     weights: Weights
     tails: Tails
@@ -71,108 +77,103 @@ class Settled(NamedTuple):
     equations: NormalEquations
     solution: Solution
 
-    def is_within(self, least_move: float) -> bool:
+    def is_converged(self, tolerance: float) -> bool:
         """Return True if the next step is below a tolerance, in squared sigmas a coordinate."""
-        return self.solution.moved < least_move * self.estimate.path.size
+        return self.solution.squared_step < tolerance * self.estimate.path.size
 
 
-def settled(
+def optimize(
     problem: Problem,
     at: Estimate,
-    least_move: float = CONVERGED,
+    tolerance: float = CONVERGED,
     weights: Weights | None = None,
-    tails: Tails = NO_TAILS,
-) -> Settled:
+    tails: Tails = GAUSSIAN_TAILS,
+) -> OptimizerState:
     """Take steps from an estimate until one is below a tolerance.
 
     Args:
         problem: the least-squares problem.
         at: the initial estimate.
-        least_move: the tolerance, in squared sigmas a coordinate of the poses.
+        tolerance: the tolerance, in squared sigmas a coordinate of the poses.
         weights: the initial weights; ones by default.
         tails: the initial tails.
     """
-    weights = unweighted(problem.seen) if weights is None else weights
-    end = solved(problem, at, weights, tails)
-    while end.n_steps < _MOST_STEPS and not end.is_within(least_move):
-        end = solved(problem, *stepped(problem, end), end.n_steps + 1)
-    return end
+    weights = unit_weights(problem.obs) if weights is None else weights
+    state = linearize_and_solve(problem, at, weights, tails)
+    while state.n_steps < _MOST_STEPS and not state.is_converged(tolerance):
+        state = linearize_and_solve(problem, *take_step(problem, state), state.n_steps + 1)
+    return state
 
 
-def finished(problem: Problem, end: Settled) -> Settled:
+def take_final_step(problem: Problem, state: OptimizerState) -> OptimizerState:
     """Take the last step, which is small, without new weights."""
-    return end._replace(estimate=_further(problem, end), n_steps=end.n_steps + 1)
+    return state._replace(estimate=_line_search(problem, state), n_steps=state.n_steps + 1)
 
 
-def solved(
+def linearize_and_solve(
     problem: Problem,
     at: Estimate,
     weights: Weights,
     tails: Tails,
     n_steps: int = 0,
-) -> Settled:
+) -> OptimizerState:
     """Compute the next step from an estimate.
 
     It is a step of Fisher scoring: the gradient of the weighted squares over the expected
     information, which is less than the weighted information (`information_share`). The same
     equations give the covariance.
     """
-    seen, odometry, information, stray_information = problem
-    shares = informative(tails, seen.n_dimensions)
-    given = weights, stray_information, odometry, information, shares
-    equations = normal_equations(seen, at, *given)
-    solution = solve(seen, equations)
-    return Settled(seen, at, weights, tails, n_steps, equations, solution)
+    obs, odometry, information, offset_prior = problem
+    shares = information_shares(tails, obs.n_dimensions)
+    given = weights, offset_prior, odometry, information, shares
+    equations = normal_equations(obs, at, *given)
+    solution = solve(obs, equations)
+    return OptimizerState(obs, at, weights, tails, n_steps, equations, solution)
 
 
-def stepped(
-    problem: Problem, end: Settled, seen: Sightings | None = None
+def take_step(
+    problem: Problem, state: OptimizerState, obs: OrderedObservations | None = None
 ) -> tuple[Estimate, Weights, Tails]:
     """Return the estimate after the next step, with new weights and tails.
 
-    These are of the observations `seen` if given.
+    These are of the observations `obs` if given.
     """
-    after = problem if seen is None else problem._replace(seen=seen)
-    return followed(after, _further(problem, end), end.weights, end.tails)
+    after = problem if obs is None else problem._replace(obs=obs)
+    return update_points_and_weights(
+        after, _line_search(problem, state), state.weights, state.tails
+    )
 
 
-def followed(
-    problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = NO_TAILS
+def update_points_and_weights(
+    problem: Problem, at: Estimate, weights: Weights | None = None, tails: Tails = GAUSSIAN_TAILS
 ) -> tuple[Estimate, Weights, Tails]:
-    """Update points and robust weights by turns for a fixed path.
+    """Update points and robust weights alternately for a fixed path.
 
     They converge slowly for inconsistent tracks, and these updates are cheap. Initial weights are
     ones by default.
     """
-    seen, _, _, stray_information = problem
-    weights = unweighted(seen) if weights is None else weights
+    obs, _, _, offset_prior = problem
+    weights = unit_weights(obs) if weights is None else weights
     for _ in range(_FOLLOWING):
-        step, known = solve_points(seen, at, weights, stray_information)
+        step, known = solve_points(obs, at, weights, offset_prior)
         at = Estimate(at.path, at.point_m + step.point_m, at.offset_m + step.offset_m)
-        weights, tails = reweighted(seen, at, weights, tails, known, stray_information)
+        weights, tails = update_weights(obs, at, weights, tails, known, offset_prior)
     return at, weights, tails
 
 
-def _further(problem: Problem, end: Settled) -> Estimate:
+def _line_search(problem: Problem, state: OptimizerState) -> Estimate:
     """Take the step, or the half, quarter, ... of it that does not increase the cost.
 
     The cost has the weights of the step (a generalised M step: Dempster, Laird and Rubin 1977).
     The likelihood of the Student-t distributions about the fitted points has another minimum: it
     would reject steps under weights from expected squares.
     """
-    at, weights = end.estimate, end.weights
+    at, weights, step = state.estimate, state.weights, state.solution.step
     before, share = problem.cost(at, weights), 1.0
     for _ in range(_MOST_HALVINGS):
-        further = _moved(end, share)
-        if problem.cost(further, weights) <= before:
-            return further
+        after = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
+        after.path[:, 2] = wrap(after.path[:, 2])
+        if problem.cost(after, weights) <= before:
+            return after
         share /= 2
     return at
-
-
-def _moved(end: Settled, share: float) -> Estimate:
-    """Return the estimate after a share of the step."""
-    at, step = end.estimate, end.solution.step
-    further = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
-    further.path[:, 2] = wrap(further.path[:, 2])
-    return further

@@ -27,7 +27,7 @@ class PoseOrder:
 
     @cached_property
     def place(self) -> np.ndarray:
-        """Return the place of each pose in the order, shape (T,); the known first pose is first."""
+        """Place of each pose in the order, shape (T,); the known first pose is first."""
         place, later = np.zeros(self.n_poses, dtype=np.int64), self.frame > 0
         unknown = self.frame[later] - 1
         place[1:] = 1 + envelope_order(self.landmark[later], unknown, self.n_poses - 1)
@@ -35,7 +35,7 @@ class PoseOrder:
 
     @cached_property
     def envelope(self) -> Envelope:
-        """Return the envelope of the unknown poses' matrix, with three rows per pose."""
+        """Envelope of the unknown poses' matrix, with three rows per pose."""
         later = self.frame > 0
         chosen = (self.landmark[later], self.frame[later] - 1, self.place[1:] - 1)
         return Envelope(np.repeat(3 * first_entries(*chosen), 3))
@@ -52,23 +52,23 @@ class PoseOrder:
 
     @cached_property
     def _products(self) -> float:
-        """Return the number of multiplications of the poses' Cholesky factor."""
+        """Number of multiplications of the poses' Cholesky factor."""
         lengths = np.arange(len(self.envelope)) - self.envelope.first
         return float(np.sum(lengths.astype(np.float64) ** 2) / 2)
 
     @cached_property
     def _least_products(self) -> float:
-        """Return a lower bound of `_products` for any order.
+        """Lower bound of `_products` for any order.
 
-        All poses of a landmark are related. If the bound is too large no order has to be found.
+        All poses of a landmark are related. If the bound is too large no order has to be computed.
         """
         pairs = np.unique(self.landmark * np.int64(self.n_poses) + self.frame)
-        most = np.bincount(pairs // self.n_poses).max(initial=0)
-        return (3.0 * most) ** 3 / 6
+        most_poses = np.bincount(pairs // self.n_poses).max(initial=0)
+        return (3.0 * most_poses) ** 3 / 6
 
 
 @dataclass(frozen=True)
-class Sightings:
+class OrderedObservations:
     """N observations of L landmarks from T poses, ordered by landmark, track and frame.
 
     All observations of a track are of one point, which has an offset from the landmark. A track
@@ -78,7 +78,7 @@ class Sightings:
     Attributes:
         starts: row of each landmark's first observation, shape (L + 1,).
         track_starts: row of each track's first observation, shape (B + 1,).
-        strays: true for tracks with an offset, shape (B,).
+        has_offset: true for tracks with an offset, shape (B,).
         frame: frame of each observation, shape (N,).
         position_m: observed positions in the robot frame, shape (N, 3).
         information: inverses of the stated covariances, in 1/m^2, shape (N, 3, 3); zero in z if
@@ -90,7 +90,7 @@ class Sightings:
 
     starts: np.ndarray
     track_starts: np.ndarray
-    strays: np.ndarray
+    has_offset: np.ndarray
     frame: np.ndarray
     position_m: Float
     information: Float
@@ -126,11 +126,11 @@ class Sightings:
         """Arrays for kernels: first row and track of each landmark, first row of each track."""
         return self.starts, self.first_track, self.track_starts
 
-    def on_level(self, level: float) -> "Sightings":
-        """Multiply the stated covariances of observations on tracks with offsets by `level`."""
-        if level == 1:
+    def with_covariance_scale(self, scale: float) -> "OrderedObservations":
+        """Multiply the stated covariances of observations on tracks with offsets by `scale`."""
+        if scale == 1:
             return self
-        share = np.where(self.strays[self.track], 1 / level, 1.0)
+        share = np.where(self.has_offset[self.track], 1 / scale, 1.0)
         return replace(self, information=self.information * share[:, None, None])
 
     @cached_property
@@ -141,7 +141,7 @@ class Sightings:
     @cached_property
     def track(self) -> np.ndarray:
         """Track of each observation, from 0, shape (N,)."""
-        return np.repeat(np.arange(len(self.strays)), np.diff(self.track_starts))
+        return np.repeat(np.arange(len(self.has_offset)), np.diff(self.track_starts))
 
     @cached_property
     def landmark_of_track(self) -> np.ndarray:
@@ -167,7 +167,9 @@ def _sums(values: Float, starts: np.ndarray) -> Float:
     return np.add.reduceat(values, starts[:-1])
 
 
-def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: bool) -> Sightings:
+def order_observations(
+    log: RobotLog, landmark: np.ndarray, min_count: int, *, with_offsets: bool
+) -> OrderedObservations:
     """Order the observations of landmarks that were seen at least `min_count` times.
 
     Args:
@@ -175,7 +177,7 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
         landmark: number of each observation's landmark, any integers, shape (N,); negative for
             none.
         min_count: number of observations that a landmark needs.
-        stray: true if tracks have offsets from their landmarks.
+        with_offsets: true if tracks have offsets from their landmarks.
 
     Raises:
         ValueError: the length of `landmark` differs from the log's.
@@ -185,13 +187,13 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
     names, inverse, count = np.unique(landmark, return_inverse=True, return_counts=True)
     taken = np.flatnonzero(((names >= 0) & (count >= min_count))[inverse])
     track = log.observations.track
-    track = track if stray and track is not None else np.full(len(landmark), NO_TRACK)
+    track = track if with_offsets and track is not None else np.full(len(landmark), NO_TRACK)
     row = taken[np.lexsort((track[taken], inverse[taken]))]
-    another = np.diff(inverse[row], prepend=-1) != 0
-    starts = np.append(np.flatnonzero(another), len(row))
-    another |= np.diff(track[row], prepend=NO_TRACK) != 0
-    first = np.flatnonzero(another)
-    strays, track_starts = track[row[first]] != NO_TRACK, np.append(first, len(row))
+    begins = np.diff(inverse[row], prepend=-1) != 0
+    starts = np.append(np.flatnonzero(begins), len(row))
+    begins |= np.diff(track[row], prepend=NO_TRACK) != 0
+    first = np.flatnonzero(begins)
+    has_offset, track_starts = track[row[first]] != NO_TRACK, np.append(first, len(row))
     n = 2 if log.planar else 3
     information = np.zeros((len(row), 3, 3))
     information[:, :n, :n] = inverses(log.observations.covariance_m2[row, :n, :n])
@@ -200,4 +202,6 @@ def sightings_of(log: RobotLog, landmark: np.ndarray, min_count: int, *, stray: 
         position[:, 2] = 0.0
     frame = log.iteration[row].astype(np.int64)
     order = PoseOrder(np.repeat(np.arange(len(starts) - 1), np.diff(starts)), frame, len(log))
-    return Sightings(starts, track_starts, strays, frame, position, information, row, n, order)
+    return OrderedObservations(
+        starts, track_starts, has_offset, frame, position, information, row, n, order
+    )

@@ -21,15 +21,15 @@ from scipy.special import fdtri, gammaln, psi
 from mapfusion.geometry.numerics import Float
 from mapfusion.smoother.normal_equations import (
     Estimate,
-    Shares,
+    InformationShares,
     Weights,
-    known_dimensions,
+    determined_dimensions,
+    expected_point_squares,
     offset_squares,
     squared_distances,
-    squares_of_points,
 )
-from mapfusion.smoother.problem import Sightings
-from mapfusion.smoother.schur_complement import Points
+from mapfusion.smoother.problem import OrderedObservations
+from mapfusion.smoother.schur_complement import PointCovariances
 
 # Limits of the degrees of freedom. A Cauchy distribution has 1; no sensor has heavier tails than
 # the lower limit. Above the upper limit the distribution is Gaussian for all purposes.
@@ -84,7 +84,11 @@ def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> floa
     n, dims = len(squares), np.asarray(n_dimensions, dtype=np.float64)
     beside = squares * (1 / dof)
     beside += 1
-    of_tails = dof * _sum_of_logs(beside)
+    # sum of logarithms by logarithms of products, which is faster; values are from 1 to 10^38
+    n_multiplied = n // _MULTIPLIED * _MULTIPLIED
+    products = np.multiply.reduce(beside[:n_multiplied].reshape(_MULTIPLIED, -1), axis=0)
+    sum_of_logs = float(np.sum(np.log(products)) + np.sum(np.log(beside[n_multiplied:])))
+    of_tails = dof * sum_of_logs
     np.reciprocal(beside, out=beside)
     of_weights = np.sum((dof + dims) * (1 - beside))
     of_normal = dof * (psi((dof + dims) / 2) - psi(dof / 2)) - dims
@@ -92,14 +96,7 @@ def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> floa
     return float(of_tails - of_weights - share * np.sum(of_normal))
 
 
-def _sum_of_logs(values: Float) -> float:
-    """Sum the logarithms of values from 1 to 10^38, by logarithms of products, which is faster."""
-    n = len(values) // _MULTIPLIED * _MULTIPLIED
-    products = np.multiply.reduce(values[:n].reshape(_MULTIPLIED, -1), axis=0)
-    return float(np.sum(np.log(products)) + np.sum(np.log(values[n:])))
-
-
-def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
+def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
     """Return the maximum likelihood degrees of freedom of squared distances.
 
     Args:
@@ -114,7 +111,7 @@ def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF
 
     low, high = float(np.log(LEAST_DOF)), float(np.log(MOST_DOF))
     if near < MOST_DOF:
-        found = _root_nearby(slope, float(np.log(near)), low, high)
+        found = _secant_root(slope, float(np.log(near)), low, high)
         if found is not None:
             return float(np.exp(found))
     if slope(high) <= 0:
@@ -125,12 +122,12 @@ def fitted_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF
     return float(np.exp(found.root))
 
 
-def _root_nearby(
+def _secant_root(
     slope: Callable[[float], float], start: float, low: float, high: float
 ) -> float | None:
-    """Where a slope rises through zero, by secants from `start`; None where they do not lead there.
+    """Find a root of an increasing slope by the secant method; None if it does not converge.
 
-    A secant's end is off by about the product of how far off the two places were that it is of.
+    The error of a secant step is about the product of the errors of its two points.
     """
     before, slope_before = start, slope(start)
     at, off_before = before + np.copysign(_ASIDE, -slope_before), 1.0
@@ -156,26 +153,26 @@ class Tails(NamedTuple):
     offset: float
 
 
-NO_TAILS = Tails(MOST_DOF, MOST_DOF)
+GAUSSIAN_TAILS = Tails(MOST_DOF, MOST_DOF)
 
 
-def informative(tails: Tails, n_dimensions: int) -> Shares:
-    """Return the shares of the weighted information that are expected (`information_share`)."""
-    return Shares(*(float(information_share(dof, n_dimensions)) for dof in tails))
+def information_shares(tails: Tails, n_dimensions: int) -> InformationShares:
+    """Return the expected shares of the weighted information (`information_share`)."""
+    return InformationShares(*(float(information_share(dof, n_dimensions)) for dof in tails))
 
 
-def unweighted(seen: Sightings) -> Weights:
+def unit_weights(obs: OrderedObservations) -> Weights:
     """Return weights of one; tracks without an offset have the offset weight zero."""
-    return Weights(np.ones(len(seen)), seen.strays.astype(np.float64))
+    return Weights(np.ones(len(obs)), obs.has_offset.astype(np.float64))
 
 
-def reweighted(
-    seen: Sightings,
+def update_weights(
+    obs: OrderedObservations,
     at: Estimate,
     weights: Weights,
     tails: Tails,
-    known: Points,
-    stray_information: float,
+    known: PointCovariances,
+    offset_prior: float,
 ) -> tuple[Weights, Tails]:
     """Compute new weights and tails from the current estimate.
 
@@ -185,22 +182,22 @@ def reweighted(
     tails of the other tracks.
 
     Args:
-        seen: the observations.
+        obs: the observations.
         at: the estimate.
         weights: the current weights.
         tails: the current tails.
         known: covariances of the points under the current weights.
-        stray_information: information of an offset along each axis, in 1/m^2.
+        offset_prior: information of an offset along each axis, in 1/m^2.
     """
-    n, new = seen.n_dimensions, unweighted(seen)
-    squares = squared_distances(seen, at)
-    squares += squares_of_points(seen, at.path, known.track_m2)
-    of_offset = offset_squares(seen, at, stray_information)
-    dimensions = known_dimensions(seen, known.offset_m2, weights.offset * stray_information)
+    n, new = obs.n_dimensions, unit_weights(obs)
+    squares = squared_distances(obs, at)
+    squares += expected_point_squares(obs, at.path, known.track_m2)
+    of_offset = offset_squares(obs, at, offset_prior)
+    dimensions = determined_dimensions(obs, known.offset_m2, weights.offset * offset_prior)
     tails = Tails(
-        fitted_dof(squares, n, tails.observation),
-        fitted_dof(of_offset, dimensions, tails.offset),
+        fit_dof(squares, n, tails.observation),
+        fit_dof(of_offset, dimensions, tails.offset),
     )
     new.observation[:] = student_weights(squares, tails.observation, n)
-    new.offset[seen.strays] = student_weights(of_offset, tails.offset, dimensions)
+    new.offset[obs.has_offset] = student_weights(of_offset, tails.offset, dimensions)
     return new, tails

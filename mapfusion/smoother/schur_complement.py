@@ -30,67 +30,75 @@ from mapfusion.geometry.numerics import (
     times_vectors,
 )
 from mapfusion.smoother.normal_equations import NormalEquations, PointEquations
-from mapfusion.smoother.problem import Sightings
+from mapfusion.smoother.problem import OrderedObservations
 
 
-class Reduced(NamedTuple):
+class ReducedEquations(NamedTuple):
     """Equations after the offsets are eliminated, without the blocks of two poses.
 
     Attributes:
         own_m2: G of each track, shape (B, 3, 3).
-        pull: gradient of each offset, shape (B, 3).
-        kept: 1 - G S, the derivative of the track's point by the landmark, shape (B, 3, 3).
+        offset_gradient: gradient of each offset, shape (B, 3).
+        point_by_landmark: 1 - G S, derivative of the track's point by the landmark, shape
+            (B, 3, 3).
         point_gradient: shape (L, 3).
         landmark_m2: covariance of each landmark for a known path, shape (L, 3, 3); in planar data z
             is not observed and has variance 1.
     """
 
     own_m2: Float
-    pull: Float
-    kept: Float
+    offset_gradient: Float
+    point_by_landmark: Float
     point_gradient: Float
     landmark_m2: Float
 
 
-def without_offsets(seen: Sightings, equations: PointEquations) -> Reduced:
+def eliminate_offsets(obs: OrderedObservations, equations: PointEquations) -> ReducedEquations:
     """Eliminate the offsets.
 
     Raises:
         LinAlgError: the information of a point is singular.
     """
-    S, strays, P = equations.track_block, seen.strays, equations.offset_information[seen.strays]
-    own_m2, kept = np.zeros(S.shape), np.tile(np.eye(3), (len(S), 1, 1))
-    own_m2[strays] = inverses(S[strays] + P[:, None, None] * np.eye(3))
-    kept[strays] = P[:, None, None] * own_m2[strays]
-    pull = equations.track_gradient + equations.offset_gradient
-    gradient = equations.track_gradient - times_vectors(S, times_vectors(own_m2, pull))
-    owner, n = seen.landmark_of_track, seen.n_landmarks
-    block = sums_by(owner, times_blocks(S, kept), n)
-    if seen.n_dimensions == 2:
+    S, has_offset = equations.track_block, obs.has_offset
+    P = equations.offset_information[has_offset]
+    own_m2, point_by_landmark = np.zeros(S.shape), np.tile(np.eye(3), (len(S), 1, 1))
+    own_m2[has_offset] = inverses(S[has_offset] + P[:, None, None] * np.eye(3))
+    point_by_landmark[has_offset] = P[:, None, None] * own_m2[has_offset]
+    offset_gradient = equations.track_gradient + equations.offset_gradient
+    gradient = equations.track_gradient - times_vectors(S, times_vectors(own_m2, offset_gradient))
+    owner, n = obs.landmark_of_track, obs.n_landmarks
+    block = sums_by(owner, times_blocks(S, point_by_landmark), n)
+    if obs.n_dimensions == 2:
         block[:, 2, 2] = 1.0
-    return Reduced(own_m2, pull, kept, sums_by(owner, gradient, n), inverses(block))
+    return ReducedEquations(
+        own_m2, offset_gradient, point_by_landmark, sums_by(owner, gradient, n), inverses(block)
+    )
 
 
-def moved_points(
-    seen: Sightings, equations: PointEquations, left: Reduced, along: Float
+def substitute_points(
+    obs: OrderedObservations, equations: PointEquations, reduced: ReducedEquations, path_term: Float
 ) -> tuple[Float, Float]:
     """Return the steps of landmarks (L, 3) and offsets (B, 3).
 
     Args:
-        seen: the observations.
+        obs: the observations.
         equations: the equations of the points.
-        left: the equations after the offsets are eliminated.
-        along: sum of coupling' dx for each track, where dx is the step of the path, shape (B, 3).
+        reduced: the equations after the offsets are eliminated.
+        path_term: sum of coupling' dx over each track, with the step dx of the path, shape
+            (B, 3).
     """
-    owner, n = seen.landmark_of_track, seen.n_landmarks
-    asked = np.concatenate([left.point_gradient, times_vectors(left.kept, along)])
-    asked = sums_by(np.concatenate([np.arange(n), owner]), asked, n)
-    points = -times_vectors(left.landmark_m2, asked)
-    asked = left.pull + along + times_vectors(equations.track_block, points[owner])
-    return points, -times_vectors(left.own_m2, asked)
+    owner, n = obs.landmark_of_track, obs.n_landmarks
+    right = np.concatenate(
+        [reduced.point_gradient, times_vectors(reduced.point_by_landmark, path_term)]
+    )
+    right = sums_by(np.concatenate([np.arange(n), owner]), right, n)
+    points = -times_vectors(reduced.landmark_m2, right)
+    right = reduced.offset_gradient + path_term
+    right = right + times_vectors(equations.track_block, points[owner])
+    return points, -times_vectors(reduced.own_m2, right)
 
 
-class Points(NamedTuple):
+class PointCovariances(NamedTuple):
     """Covariances for a known path.
 
     Attributes:
@@ -102,28 +110,30 @@ class Points(NamedTuple):
     track_m2: Float
 
 
-def known_points(seen: Sightings, left: Reduced) -> Points:
-    """What is known of offsets and tracks' points, their landmark's own covariance in it."""
-    of_landmark = left.landmark_m2[seen.landmark_of_track]
-    made = [
-        left.own_m2 + times_blocks(times_blocks(follows, of_landmark), follows)
-        for follows in (np.eye(3) - left.kept, left.kept)  # -db / dl, and that of the point
-    ]
-    return Points(*made)
+def point_covariances(obs: OrderedObservations, reduced: ReducedEquations) -> PointCovariances:
+    """Return the covariances of offsets and tracks' points for a known path."""
+    of_landmark = reduced.landmark_m2[obs.landmark_of_track]
+    # derivatives of the (negative) offset and of the point by the landmark
+    jacobians = np.eye(3) - reduced.point_by_landmark, reduced.point_by_landmark
+    return PointCovariances(
+        *(reduced.own_m2 + times_blocks(times_blocks(J, of_landmark), J) for J in jacobians)
+    )
 
 
-def subtract_points(seen: Sightings, equations: NormalEquations, left: Reduced, S: Float) -> None:
+def subtract_point_terms(
+    obs: OrderedObservations, equations: NormalEquations, reduced: ReducedEquations, S: Float
+) -> None:
     """Subtract the terms of offsets and landmarks from the matrix of the poses.
 
     Args:
-        seen: the observations.
+        obs: the observations.
         equations: the normal equations.
-        left: the equations after the offsets are eliminated.
-        S: entries of the matrix of the unknown poses, in `seen.order.envelope`.
+        reduced: the equations after the offsets are eliminated.
+        S: entries of the matrix of the unknown poses, in `obs.order.envelope`.
     """
-    coupling, offset = equations.coupling, seen.order.envelope.offset
-    couplings = coupling, left_couplings(seen, coupling, left)
-    _subtract(seen.by_landmark, seen.unknown_place, couplings, left, offset, S)
+    coupling, offset = equations.coupling, obs.order.envelope.offset
+    couplings = coupling, reduced_couplings(obs, coupling, reduced)
+    _subtract(obs.by_landmark, obs.unknown_place, couplings, reduced, offset, S)
 
 
 @kernel
@@ -131,10 +141,11 @@ def _subtract(
     rows: tuple[np.ndarray, np.ndarray, np.ndarray],
     place: np.ndarray,
     couplings: tuple[Float, Float],
-    left: Reduced,
+    reduced: ReducedEquations,
     offset: np.ndarray,
     S: Float,
 ) -> None:
+    """Subtract the terms of each pair of observations; see `subtract_point_terms`."""
     (starts, first_track, track_starts), (coupling, coupling_left) = rows, couplings
     by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
     for j in range(len(starts) - 1):
@@ -143,7 +154,7 @@ def _subtract(
             for i in range(own, track_starts[t + 1]):
                 if place[i] < 0:
                     continue
-                A, G = left.landmark_m2, left.own_m2
+                A, G = reduced.landmark_m2, reduced.own_m2
                 for r in range(3):
                     x, y, z = coupling_left[i, r, 0], coupling_left[i, r, 1], coupling_left[i, r, 2]
                     for q in range(3):
@@ -151,7 +162,7 @@ def _subtract(
                     x, y, z = coupling[i, r, 0], coupling[i, r, 1], coupling[i, r, 2]
                     for q in range(3):
                         by_track[r, q] = x * G[t, 0, q] + y * G[t, 1, q] + z * G[t, 2, q]
-                B = left.kept
+                B = reduced.point_by_landmark
                 for r in range(3):
                     for q in range(3):
                         by_track[r, q] += (
@@ -181,7 +192,7 @@ def _subtract_rows(
     S: Float,
 ) -> None:
     """Subtract X coupling' from the blocks of observation i with rows `begin` to `end`."""
-    x00, x01, x02 = X[0, 0], X[0, 1], X[0, 2]  # `S` may not be where `X` is, no compiler knows
+    x00, x01, x02 = X[0, 0], X[0, 1], X[0, 2]  # local, because X and S may overlap for the compiler
     x10, x11, x12 = X[1, 0], X[1, 1], X[1, 2]
     x20, x21, x22 = X[2, 0], X[2, 1], X[2, 2]
     row = 3 * place[i]
@@ -199,44 +210,54 @@ def _subtract_rows(
                 S[at0 + column + q] -= v0
                 S[at1 + column + q] -= v1
                 S[at2 + column + q] -= v2
-            if column >= row:  # rows are not in the order of places, and one pose may have several
+            if column >= row:  # one pose may have several observations, in any order
                 at = offset[column + q] + row
                 S[at] -= v0
                 S[at + 1] -= v1
                 S[at + 2] -= v2
 
 
-def left_couplings(seen: Sightings, coupling: Float, left: Reduced) -> Float:
-    """(N, 3, 3) a pose's block with a landmark once offsets are eliminated, by observation."""
-    return times_blocks(coupling, left.kept[seen.track])
+def reduced_couplings(
+    obs: OrderedObservations, coupling: Float, reduced: ReducedEquations
+) -> Float:
+    """Return the blocks of pose and landmark (N, 3, 3) after the offsets are eliminated."""
+    return times_blocks(coupling, reduced.point_by_landmark[obs.track])
 
 
-def along_way(seen: Sightings, coupling: Float, way: Float) -> Float:
-    """(B, 3) sum of coupling' way over the observations of each track; `way` (T, 3) by frame."""
-    moved, turned = way[seen.frame, :2, None], way[seen.frame, 2, None]
+def coupling_times_poses(obs: OrderedObservations, coupling: Float, path_step: Float) -> Float:
+    """Sum coupling' path_step over the observations of each track, shape (B, 3).
+
+    Args:
+        obs: the observations.
+        coupling: blocks of pose and landmark, shape (N, 3, 3).
+        path_step: step of each pose, shape (T, 3).
+    """
+    moved, turned = path_step[obs.frame, :2, None], path_step[obs.frame, 2, None]
     parts = coupling[:, 0] * moved[:, 0] + coupling[:, 1] * moved[:, 1], coupling[:, 2] * turned
     both = np.stack(parts, axis=1).reshape(-1, 3)
-    return sums_by(np.repeat(seen.track, 2), both, len(seen.strays))
+    return sums_by(np.repeat(obs.track, 2), both, len(obs.has_offset))
 
 
-def along_points(seen: Sightings, coupling: Float, point: Float, offset: Float) -> Float:
+def coupling_times_points(
+    obs: OrderedObservations, coupling: Float, point: Float, offset: Float
+) -> Float:
     """Sum coupling (point + offset) over the observations of each frame, shape (T, 3).
 
     Args:
-        seen: the observations.
+        obs: the observations.
         coupling: blocks of pose and landmark, shape (N, 3, 3).
         point: step of each landmark, shape (L, 3).
         offset: step of each track's offset, shape (B, 3).
     """
-    total = np.zeros((seen.order.n_poses, 3))
-    _add_along_points(
-        seen.track_starts, seen.landmark_of_track, seen.frame, coupling, point, offset, total
+    total = np.zeros((obs.order.n_poses, 3))
+    _add_coupling_times_points(
+        obs.track_starts, obs.landmark_of_track, obs.frame, coupling, point, offset, total
     )
     return total
 
 
 @kernel
-def _add_along_points(
+def _add_coupling_times_points(
     track_starts: np.ndarray,
     owner: np.ndarray,
     frame: np.ndarray,
@@ -245,6 +266,7 @@ def _add_along_points(
     offset: Float,
     total: Float,
 ) -> None:
+    """Add coupling (point + offset) of each observation to the total of its frame."""
     for t in range(len(owner)):
         j = owner[t]
         x, y, z = point[j, 0] + offset[t, 0], point[j, 1] + offset[t, 1], point[j, 2] + offset[t, 2]

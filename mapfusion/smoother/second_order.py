@@ -24,15 +24,18 @@ from mapfusion.geometry.se2 import rotation, wrap
 from mapfusion.smoother.elimination import ReducedPoses
 from mapfusion.smoother.normal_equations import (
     Estimate,
-    NormalEquations,
     Weights,
     disturbance_jacobians,
     disturbances,
     normal_equations,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, solved
-from mapfusion.smoother.robust_loss import informative
-from mapfusion.smoother.schur_complement import along_way, moved_points, without_offsets
+from mapfusion.smoother.optimizer import OptimizerState, Problem, linearize_and_solve
+from mapfusion.smoother.robust_loss import information_shares
+from mapfusion.smoother.schur_complement import (
+    coupling_times_poses,
+    eliminate_offsets,
+    substitute_points,
+)
 
 # Number of draws. The relative error of the mean square is a third in the worst case, the square of
 # one normal variable. Usually several directions contribute and it is smaller.
@@ -60,7 +63,7 @@ class SecondOrder(NamedTuple):
         return np.einsum("sni,snj->nij", chosen, chosen)
 
 
-def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
+def second_order_errors(problem: Problem, state: OptimizerState) -> SecondOrder | None:
     """Return the second-order errors of an estimate; None if they are negligible.
 
     If the poses are eliminated first (`elimination.py`), all poses see the same few landmarks,
@@ -68,153 +71,140 @@ def second_order_errors(problem: Problem, end: Settled) -> SecondOrder | None:
 
     Args:
         problem: the problem with the final noise levels.
-        end: the smoothed state.
+        state: the smoothed state.
     """
-    if not end.solution.landmarks_first or len(end.estimate.path) < 2:
+    if not state.solution.landmarks_first or len(state.estimate.path) < 2:
         return None
-    problem = problem._replace(seen=end.seen)
-    covariance = _pose_covariances(end)
-    if np.max(_bound(end.estimate.path, covariance)) < _NEGLIGIBLE:
+    problem = problem._replace(obs=state.obs)
+    factor, place = state.solution.factor, state.obs.pose_place[1:] - 1
+    covariance = factor.envelope.between(factor.inverse, place, place)
+
+    # Bound: suppose that every error of the heading shortens its part of the path, and that no
+    # observation corrects it. The error b of a pose is then the sum of length * variance / 2. Its
+    # mean square is at most 3 b^2, as for the square of one normal variable.
+    estimate = state.estimate.path
+    length_m = np.linalg.norm(np.diff(estimate[:, :2], axis=0), axis=1)
+    error_m = np.cumsum(length_m * covariance[:, 2, 2]) / 2
+    xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
+    largest_m2 = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+    # the squared error over the smallest variance in any direction
+    if np.max(error_m**2 * largest_m2 / (xx * yy - xy**2)) < _NEGLIGIBLE:
         return None
-    path, _ = _Drawing.of(problem, end).errors(np.random.default_rng(_SEED), _FIRST_DRAWS)
-    if np.max(_squared_sigmas(path, covariance)) < _NEGLIGIBLE:
+    path, _ = _Drawing.of(problem, state).errors(np.random.default_rng(_SEED), _FIRST_DRAWS)
+    squares = np.einsum("ski,skj->kij", path[:, 1:], path[:, 1:]) / len(path)
+    squared_sigmas = np.trace(np.linalg.solve(covariance, squares), axis1=1, axis2=2) / 3
+    if np.max(squared_sigmas) < _NEGLIGIBLE:
         return None
-    # Equations of the step before differ little, but a little of what stiff directions hold moves
-    # weak ones far: matrix and gradient are of the same estimate.
-    end = solved(problem, end.estimate, end.weights, end.tails)
-    path, point_m = _Drawing.of(problem, end).errors(np.random.default_rng(_SEED), _DRAWS)
+    # Matrix and gradient have to be of the same estimate, because small differences in stiff
+    # directions cause large errors in weak ones.
+    state = linearize_and_solve(problem, state.estimate, state.weights, state.tails)
+    path, point_m = _Drawing.of(problem, state).errors(np.random.default_rng(_SEED), _DRAWS)
     share = 1 / np.sqrt(_DRAWS)
     return SecondOrder(share * path, share * point_m)
 
 
-def _pose_covariances(end: Settled) -> Float:
-    """Return the linearised covariances (T - 1, 3, 3) of the poses after the first."""
-    factor, place = end.solution.factor, end.seen.pose_place[1:] - 1
-    return factor.envelope.between(factor.inverse, place, place)
-
-
-def _bound(path: Float, covariance: Float) -> Float:
-    """Return an upper bound of `_squared_sigmas`, shape (T - 1,).
-
-    If every error of the heading shortened its part of the way, and none of it were mended by
-    observations, a pose would be off by b, the sum of length * variance / 2. The mean square of
-    that is at most 3 b^2, as of the square of one normal variable.
-    """
-    length_m = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
-    off_m = np.cumsum(length_m * covariance[:, 2, 2]) / 2
-    xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
-    most_m2 = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
-    return off_m**2 * most_m2 / (xx * yy - xy**2)  # over the least variance in any direction
-
-
-def _squared_sigmas(path: Float, covariance: Float) -> Float:
-    """Return the mean square of errors (S, T, 3) in sigmas a coordinate, shape (T - 1,)."""
-    squares = np.einsum("ski,skj->kij", path[:, 1:], path[:, 1:]) / len(path)
-    return np.trace(np.linalg.solve(covariance, squares), axis1=1, axis2=2) / 3
-
-
 class _Drawing(NamedTuple):
-    """Quantities that all draws share.
+    """Random errors of an estimate; the attributes are common to all draws.
 
     Attributes:
-        problem: what is explained.
-        end: where steps ended.
-        at: the estimate there.
-        weights: that the matrix of the equations is of.
+        problem: the least-squares problem.
+        state: the smoothed state.
+        at: its estimate.
+        weights: weights of the matrix of the equations.
         poses: the equations of the poses.
-        to_robot: (N, 2, 2) from the map's frame to that of each observation's pose.
-        seen_m: (N, 3) where each observation should be, in the robot's frame.
+        to_robot: rotations from the map frame to the robot frame of each observation, shape
+            (N, 2, 2).
+        predicted_m: predicted observations in the robot frame, shape (N, 3).
     """
 
     problem: Problem
-    end: Settled
+    state: OptimizerState
     at: Estimate
     weights: Weights
     poses: ReducedPoses
     to_robot: Float
-    seen_m: Float
+    predicted_m: Float
 
     @classmethod
-    def of(cls, problem: Problem, end: Settled) -> "_Drawing":
-        """Return it for where steps ended."""
-        seen, at = end.seen, end.estimate
-        shares = informative(end.tails, seen.n_dimensions)
+    def of(cls, problem: Problem, state: OptimizerState) -> "_Drawing":
+        """Return the common quantities of a smoothed state."""
+        obs, at = state.obs, state.estimate
+        shares = information_shares(state.tails, obs.n_dimensions)
         weights = Weights(
-            shares.observation * end.weights.observation, shares.offset * end.weights.offset
+            shares.observation * state.weights.observation, shares.offset * state.weights.offset
         )
-        poses = ReducedPoses(seen, end.equations, without_offsets(seen, end.equations.points))
-        to_robot = np.swapaxes(rotation(at.path[seen.frame, 2]), 1, 2)
-        seen_m = _from_poses(end, at)
-        return cls(problem, end, at, weights, poses, to_robot, seen_m)
+        poses = ReducedPoses(obs, state.equations, eliminate_offsets(obs, state.equations.points))
+        to_robot = np.swapaxes(rotation(at.path[obs.frame, 2]), 1, 2)
+        predicted_m = _predicted_observations(state, at)
+        return cls(problem, state, at, weights, poses, to_robot, predicted_m)
 
     def errors(self, rng: np.random.Generator, n: int) -> tuple[Float, Float]:
-        """Return the further errors q (n, T, 3) of the path and (n, L, 3) of the landmarks."""
+        """Return n draws of q: errors (n, T, 3) of the path and (n, L, 3) of the landmarks."""
         path = np.empty((n, *self.at.path.shape))
         point_m = np.empty((n, *self.at.point_m.shape))
         for k in range(n):
-            path[k], point_m[k] = self._further(self._drawn(rng))
+            path[k], point_m[k] = self._second_order(self._draw(rng))
         return path, point_m
 
-    def _drawn(self, rng: np.random.Generator) -> Estimate:
-        """Return an error d: of the path, and of the points that follow it.
+    def _draw(self, rng: np.random.Generator) -> Estimate:
+        """Draw an error d of the path and of the points, given the path.
 
-        The points' own errors if the path were known turn no lever and are left out.
+        The points' errors for a known path have no second-order effect and are left out.
         """
-        factor, left = self.end.solution.factor, self.poses.left
+        factor, reduced = self.state.solution.factor, self.poses.reduced
         normal = rng.standard_normal(len(factor))
-        way = self.poses.by_frame(factor.solve_transposed(normal))
-        still = left._replace(
-            pull=np.zeros_like(left.pull), point_gradient=np.zeros_like(left.point_gradient)
+        path_step = self.poses.by_frame(factor.solve_transposed(normal))
+        still = reduced._replace(
+            offset_gradient=np.zeros_like(reduced.offset_gradient),
+            point_gradient=np.zeros_like(reduced.point_gradient),
         )
-        equations = self.end.equations
-        along = along_way(self.end.seen, equations.coupling, way)
-        return Estimate(way, *moved_points(self.end.seen, equations.points, still, along))
+        equations = self.state.equations
+        path_term = coupling_times_poses(self.state.obs, equations.coupling, path_step)
+        return Estimate(
+            path_step, *substitute_points(self.state.obs, equations.points, still, path_term)
+        )
 
-    def _further(self, error: Estimate) -> tuple[Float, Float]:
-        """Return q of path and landmarks for an error d."""
-        equations, seen, factor = self._equations(error), self.end.seen, self.end.solution.factor
-        left = without_offsets(seen, equations.points)
-        gradient = ReducedPoses(seen, equations, left).gradient()
-        way = self.poses.solved(factor, -gradient)
-        along = along_way(seen, equations.coupling, way)
-        return way, moved_points(seen, equations.points, left, along)[0]
+    def _second_order(self, error: Estimate) -> tuple[Float, Float]:
+        """Return q of path and landmarks for an error d.
 
-    def _equations(self, error: Estimate) -> NormalEquations:
-        """Return the equations whose residuals are rho(d): the data are what leaves no others.
-
-        Offsets are residuals themselves and have none of second order.
+        The equations get data whose residuals are rho(d). Offsets are residuals themselves and have
+        no second-order part.
         """
-        seen, at, way = self.end.seen, self.at, error.path
+        obs, at, path_step = self.state.obs, self.at, error.path
         moved = Estimate(*(old + off for old, off in zip(at, error, strict=True)))
         before, after = disturbance_jacobians(at.path)
         found = disturbances(at.path, self.problem.odometry)
-        linear = np.einsum("kij,kj->ki", before, way[:-1])
-        linear += np.einsum("kij,kj->ki", after, way[1:])
+        linear = np.einsum("kij,kj->ki", before, path_step[:-1])
+        linear += np.einsum("kij,kj->ki", after, path_step[1:])
         of_motion = disturbances(moved.path, self.problem.odometry) - found - linear
         of_motion[:, 2] = wrap(of_motion[:, 2])
         odometry = self.problem.odometry.copy()
         odometry[1:] += found - of_motion
 
-        off = error.point_m[seen.landmark] + error.offset_m[seen.track]
-        off[:, :2] -= way[seen.frame, :2]
+        off = error.point_m[obs.landmark] + error.offset_m[obs.track]
+        off[:, :2] -= path_step[obs.frame, :2]
         off[:, :2] = np.einsum("nij,nj->ni", self.to_robot, off[:, :2])
-        turned = way[seen.frame, 2]
-        off[:, 0] += turned * self.seen_m[:, 1]
-        off[:, 1] -= turned * self.seen_m[:, 0]
-        of_points = _from_poses(self.end, moved) - self.seen_m - off
-        explained = replace(seen, position_m=self.seen_m - of_points)
-        stray_information, information = self.problem.stray_information, self.problem.information
-        made = normal_equations(
-            explained, at, self.weights, stray_information, odometry, information
+        turned = path_step[obs.frame, 2]
+        off[:, 0] += turned * self.predicted_m[:, 1]
+        off[:, 1] -= turned * self.predicted_m[:, 0]
+        of_points = _predicted_observations(self.state, moved) - self.predicted_m - off
+        explained = replace(obs, position_m=self.predicted_m - of_points)
+        offset_prior, information = self.problem.offset_prior, self.problem.information
+        equations = normal_equations(
+            explained, at, self.weights, offset_prior, odometry, information
         )
-        made.points.offset_gradient[:] = 0
-        return made
+        equations.points.offset_gradient[:] = 0
+        reduced = eliminate_offsets(obs, equations.points)
+        gradient = ReducedPoses(obs, equations, reduced).gradient()
+        path_q = self.poses.solve(self.state.solution.factor, -gradient)
+        path_term = coupling_times_poses(obs, equations.coupling, path_q)
+        return path_q, substitute_points(obs, equations.points, reduced, path_term)[0]
 
 
-def _from_poses(end: Settled, at: Estimate) -> Float:
-    """Return (N, 3) where the point of each observation is, in the robot's frame."""
-    seen = end.seen
-    point, pose = at.point_m[seen.landmark] + at.offset_m[seen.track], at.path[seen.frame]
+def _predicted_observations(state: OptimizerState, at: Estimate) -> Float:
+    """Return the point of each observation in the robot frame, shape (N, 3)."""
+    obs = state.obs
+    point, pose = at.point_m[obs.landmark] + at.offset_m[obs.track], at.path[obs.frame]
     offset = point[:, :2] - pose[:, :2]
     point[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), offset)
     return point

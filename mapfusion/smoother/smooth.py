@@ -1,8 +1,9 @@
 """Batch smoother: most probable path and landmarks of a whole log.
 
 The filter associates observations while its path is uncertain, and neighbouring corners of a
-textured wall are often closer than that. On the smoothed path two tracks i, j of one corner, with
-points p and covariances W from their own observations, have the squared distance
+textured wall are often closer than that uncertainty. So landmarks are split on the smoothed path.
+Two tracks i, j of the same corner, with points p and covariances W from their own observations,
+have the squared distance
 
     (p_i - p_j)' (W_i + W_j + 2 s^2)^-1 (p_i - p_j),
 
@@ -31,30 +32,38 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Range, require_in_range, require_shape
 from mapfusion.robot_log import STRAY_M, RobotLog
 from mapfusion.smoother.elimination import require_memory, shared_errors
-from mapfusion.smoother.noise_estimation import AS_STATED, Levels, settled_with_levels
+from mapfusion.smoother.noise_estimation import UNIT_SCALES, NoiseScales, optimize_with_noise
 from mapfusion.smoother.normal_equations import (
     Estimate,
     Weights,
-    first_points,
-    information_of,
-    information_under,
+    bounded_information,
+    initial_landmarks,
     odometry_information,
+    scaled_information,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, finished, followed, settled
-from mapfusion.smoother.problem import Sightings, sightings_of
+from mapfusion.smoother.optimizer import (
+    OptimizerState,
+    Problem,
+    optimize,
+    take_final_step,
+    update_points_and_weights,
+)
+from mapfusion.smoother.problem import OrderedObservations, order_observations
 from mapfusion.smoother.robust_loss import MOST_DOF, Tails
 from mapfusion.smoother.second_order import SecondOrder, second_order_errors
 from mapfusion.viewing import viewing_of
 
 # Probability that two tracks of one corner are not split.
-_TOGETHER = 0.999
+_SAME_CORNER = 0.999
 _SINGULAR = 1e-12  # pivot over diagonal element that is a rounding error
 # Number of pairs of tracks that are compared at the same time, to limit the memory: a landmark may
 # have thousands of tracks.
 _PAIRS_AT_ONCE = 100_000
 
 
-def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -> np.ndarray:
+def split_landmarks(
+    obs: OrderedObservations, landmark: np.ndarray, path: Float, stray_m: float
+) -> np.ndarray:
     """Split landmarks of several corners; return the landmark of each observation, shape (N,).
 
     The corner with the observation after which a landmark is numbered keeps the number. Without it
@@ -62,24 +71,34 @@ def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -
     observation that is not the number of another landmark.
 
     Args:
-        seen: the observations.
+        obs: the observations.
         landmark: landmark of each observation of the log, shape (N,).
         path: path of the robot, shape (T, 3).
         stray_m: s.
     """
     made = landmark.copy()
-    if not seen.strays.any():
+    if not obs.has_offset.any():
         return made
-    point, covariance = _track_points(seen, path)
-    covariance[seen.strays] += stray_m**2 * np.eye(3)
-    first = np.searchsorted(seen.track_starts, seen.starts)
-    counts, n = np.diff(seen.track_starts), seen.n_dimensions
-    bound = chi_square_bound(_TOGETHER, n)
-    corner = _corners(first, counts, point[:, :n], covariance[:, :n, :n], bound)
+    # points of the tracks from their own observations, and covariances
+    pose, R = path[obs.frame], np.zeros((len(obs), 3, 3))
+    R[:, :2, :2], R[:, 2, 2] = rotation(pose[:, 2]), 1.0
+    point = np.einsum("nij,nj->ni", R, obs.position_m)
+    point[:, :2] += pose[:, :2]
+    W = R @ obs.information @ np.swapaxes(R, 1, 2)
+    total, n = obs.sum_by_track(W), obs.n_dimensions
+    covariance = np.zeros_like(total)
+    covariance[:, :n, :n] = np.linalg.inv(total[:, :n, :n])
+    point = np.einsum("tij,tj->ti", covariance, obs.sum_by_track(np.einsum("nij,nj->ni", W, point)))
+    covariance[obs.has_offset] += stray_m**2 * np.eye(3)
+
+    first = np.searchsorted(obs.track_starts, obs.starts)
+    counts, bound = np.diff(obs.track_starts), chi_square_bound(_SAME_CORNER, n)
+    pairs = _inconsistent_pairs(first, point[:, :n], covariance[:, :n, :n], bound)
+    corner = _corners(first, counts, pairs)
     names = set(landmark.tolist())
     for own in np.flatnonzero(np.maximum.reduceat(corner, first[:-1])):
         track = np.repeat(corner[first[own] : first[own + 1]], counts[first[own] : first[own + 1]])
-        rows = seen.row[seen.starts[own] : seen.starts[own + 1]]
+        rows = obs.row[obs.starts[own] : obs.starts[own + 1]]
         home = track[rows == landmark[rows[0]]]
         keeps = home[0] if len(home) else 0
         for k in np.setdiff1d(track, keeps):
@@ -89,34 +108,22 @@ def parted(seen: Sightings, landmark: np.ndarray, path: Float, stray_m: float) -
     return made
 
 
-def _track_points(seen: Sightings, path: Float) -> tuple[Float, Float]:
-    """Return the points (B, 3) of the tracks from their own observations, and covariances."""
-    pose, R = path[seen.frame], np.zeros((len(seen), 3, 3))
-    R[:, :2, :2], R[:, 2, 2] = rotation(pose[:, 2]), 1.0
-    point = np.einsum("nij,nj->ni", R, seen.position_m)
-    point[:, :2] += pose[:, :2]
-    W = R @ seen.information @ np.swapaxes(R, 1, 2)
-    total, n = seen.sum_by_track(W), seen.n_dimensions
-    covariance = np.zeros_like(total)
-    covariance[:, :n, :n] = np.linalg.inv(total[:, :n, :n])
-    weighted = seen.sum_by_track(np.einsum("nij,nj->ni", W, point))
-    return np.einsum("tij,tj->ti", covariance, weighted), covariance
-
-
-def _corners(
-    first: np.ndarray, counts: np.ndarray, point: Float, covariance: Float, bound: float
-) -> np.ndarray:
+def _corners(first: np.ndarray, counts: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Return the corner of each track within its landmark, from 0, shape (B,).
 
-    Repeatedly the track with the most agreeing observations forms a corner with the tracks that
-    agree with it.
+    Repeatedly the track with the most consistent observations forms a corner with the tracks that
+    are consistent with it.
+
+    Args:
+        first: first track of each landmark, shape (L + 1,).
+        counts: number of observations of each track, shape (B,).
+        pairs: inconsistent tracks of one landmark, shape (2, A).
     """
-    corner, of = np.zeros(len(point), dtype=np.int64), _landmarks(first)
-    i, j = _apart(first, point, covariance, bound)
-    of_apart = of[i]
-    for own in np.unique(of_apart):
+    corner, (i, j) = np.zeros(len(counts), dtype=np.int64), pairs
+    of_pair = _landmark_of_tracks(first)[i]
+    for own in np.unique(of_pair):
         begin, size = first[own], first[own + 1] - first[own]
-        here = slice(*np.searchsorted(of_apart, [own, own + 1]))
+        here = slice(*np.searchsorted(of_pair, [own, own + 1]))
         near, one, other = np.ones((size, size), dtype=bool), i[here] - begin, j[here] - begin
         near[one, other] = near[other, one] = False
         left, k = np.ones(size, dtype=bool), 0
@@ -128,14 +135,16 @@ def _corners(
     return corner
 
 
-def _landmarks(first: np.ndarray) -> np.ndarray:
+def _landmark_of_tracks(first: np.ndarray) -> np.ndarray:
     """Return the landmark of each track (B,); `first` (L + 1,) are the landmarks' first tracks."""
     return np.repeat(np.arange(len(first) - 1), np.diff(first))
 
 
-def _apart(first: np.ndarray, point: Float, covariance: Float, bound: float) -> np.ndarray:
-    """Return pairs (2, A) of tracks of one landmark that disagree, ordered by the first track."""
-    begin = first[_landmarks(first)]
+def _inconsistent_pairs(
+    first: np.ndarray, point: Float, covariance: Float, bound: float
+) -> np.ndarray:
+    """Return inconsistent pairs (2, A) of tracks of one landmark, ordered by the first track."""
+    begin = first[_landmark_of_tracks(first)]
     before = np.arange(len(point)) - begin  # tracks of the same landmark before each
     part = np.cumsum(before) // _PAIRS_AT_ONCE
     S, off = (np.ascontiguousarray(values.T) for values in (covariance, point))
@@ -144,12 +153,12 @@ def _apart(first: np.ndarray, point: Float, covariance: Float, bound: float) -> 
         n = before[own]
         i = np.repeat(own, n)
         j = np.arange(len(i)) - np.repeat(np.cumsum(n) - n - begin[own], n)
-        away = _squares(S[..., i] + S[..., j], off[..., i] - off[..., j]) > bound
-        found.append(np.stack([i[away], j[away]]))
+        apart = _squared_distances(S[..., i] + S[..., j], off[..., i] - off[..., j]) > bound
+        found.append(np.stack([i[apart], j[apart]]))
     return np.concatenate(found, axis=1)
 
 
-def _squares(S: Float, off: Float) -> Float:
+def _squared_distances(S: Float, off: Float) -> Float:
     """Return squared Mahalanobis distances (P,) of `off` (n, P); 0 for singular S (n, n, P).
 
     Uses S = L D L' and overwrites both arguments.
@@ -167,15 +176,15 @@ def _squares(S: Float, off: Float) -> Float:
 
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity). With a
-# poor initial path most observations look gross and would lose their weights. The second value is
-# the tolerance of this round, in squared sigmas a coordinate.
-_THOUGHT_WORSE, _CLOSE = 4.0, 3e-2
-# If the odometry's variances exceed the stated ones by this factor, good observations look gross
-# until the level is known. The weights are then computed again with the level.
-_FAR_WORSE = 4.0
+# poor initial path most observations look like outliers and would lose their weights.
+_INFLATION = 4.0
+_FIRST_TOLERANCE = 3e-2  # tolerance of this round, in squared sigmas a coordinate
+# If the odometry's variances exceed the stated ones by this factor, good observations look like
+# outliers until the noise scale is known. The weights are then computed again with the scale.
+_LARGE_SCALE = 4.0
 # Standard deviations of an unknown motion between two frames.
-_UNTOLD_M, _UNTOLD_RAD = 10.0, 1.0
-_LEAST_SEEN = 3  # two observations determine a pose; one is redundant
+_UNKNOWN_M, _UNKNOWN_RAD = 10.0, 1.0
+_LEAST_OBSERVATIONS = 3  # two observations determine a pose; one is redundant
 
 
 @dataclass(frozen=True)
@@ -183,7 +192,7 @@ class SmootherParameters:
     """Settings of the smoother.
 
     Attributes:
-        motion: stated noise of the odometry; the smoother estimates its level.
+        motion: stated noise of the odometry; the smoother estimates its scale.
         stray_m: standard deviation, along each axis, of the offset between a track's point and its
             landmark; 0: no offset.
         min_count: number of observations that a landmark needs.
@@ -202,7 +211,7 @@ class SmootherParameters:
         require_in_range(self)
 
     @property
-    def stray_information(self) -> float:
+    def offset_prior(self) -> float:
         """Information of a track's offset along each axis, in 1/m^2; 0 without offsets."""
         return 1 / self.stray_m**2 if self.stray_m else 0.0
 
@@ -216,13 +225,13 @@ class SmootherParameters:
         """Return the inverse variances of the increments after the first, shape (T - 1, 3)."""
         if self.odometry_covariance is None:
             return odometry_information(log.odometry, self.motion)
-        blind = np.diff(log.frame_starts()) < _LEAST_SEEN
+        blind = np.diff(log.frame_starts()) < _LEAST_OBSERVATIONS
         needed = blind[:-1] | blind[1:]
-        told = self.odometry_covariance[1 : len(log)]
-        sigma = np.array([self.motion.with_floor(own) for own in told]).reshape(-1, 3)
-        sigma[~needed] = [_UNTOLD_M, _UNTOLD_M, _UNTOLD_RAD]
-        own = np.isnan(told).any(axis=(1, 2))
-        information = information_of(sigma)
+        stated = self.odometry_covariance[1 : len(log)]
+        sigma = np.array([self.motion.with_floor(own) for own in stated]).reshape(-1, 3)
+        sigma[~needed] = [_UNKNOWN_M, _UNKNOWN_M, _UNKNOWN_RAD]
+        own = np.isnan(stated).any(axis=(1, 2))
+        information = bounded_information(sigma)
         information[own] = odometry_information(log.odometry, self.motion)[own]
         return information
 
@@ -234,11 +243,11 @@ class Smoothed:
     Attributes:
         landmark: landmark of each observation of the log, shape (N,); negative for none.
         estimate: path, landmarks and tracks' offsets.
-        seen: the observations, with information scaled by the level.
+        obs: the observations, with information divided by `observation_scale`.
         weights: weights of observations and offsets.
         tails: tails of their Student-t distributions.
-        observation_level: estimated factor on the stated covariances of observations on tracks.
-        odometry_level: estimated factors on the odometry's stated variances along, across and in
+        observation_scale: estimated factor on the stated covariances of observations on tracks.
+        odometry_scales: estimated factors on the odometry's stated variances along, across and in
             the heading, shape (3,).
         n_steps: number of Gauss-Newton steps.
         own_m2: see `common`, shape (L, 3, 3).
@@ -248,11 +257,11 @@ class Smoothed:
 
     landmark: np.ndarray
     estimate: Estimate
-    seen: Sightings
+    obs: OrderedObservations
     weights: Weights
     tails: Tails
-    observation_level: float
-    odometry_level: Float
+    observation_scale: float
+    odometry_scales: Float
     n_steps: int
     own_m2: Float
     common: SharedErrors
@@ -262,29 +271,29 @@ class Smoothed:
     def of(
         cls,
         problem: Problem,
-        end: Settled,
+        state: OptimizerState,
         landmark: np.ndarray,
-        levels: Levels = AS_STATED,
+        scales: NoiseScales = UNIT_SCALES,
         steps_before: int = 0,
     ) -> "Smoothed":
         """Return the result for the final state of the steps.
 
         Args:
             problem: the problem with the stated odometry.
-            end: the final state.
+            state: the final state.
             landmark: landmark of each observation of the log, shape (N,).
-            levels: the estimated levels.
+            scales: the estimated noise scales.
             steps_before: number of steps in earlier rounds.
         """
-        common = shared_errors(end.seen, end.equations, end.solution)
-        information = information_under(problem.information, levels.odometry)
-        further = second_order_errors(problem._replace(information=information), end)
+        common = shared_errors(state.obs, state.equations, state.solution)
+        information = scaled_information(problem.information, scales.odometry)
+        further = second_order_errors(problem._replace(information=information), state)
         if further is not None:
             rows = further.point_m.reshape(len(further.point_m), -1)
             common = StackedErrors(common, KnownErrors(rows))
-        of_levels = levels.observation, levels.odometry
-        found = (end.estimate, end.seen, end.weights, end.tails, *of_levels)
-        n_steps, own_m2 = steps_before + end.n_steps, end.solution.own_m2
+        of_noise = scales.observation, scales.odometry
+        found = (state.estimate, state.obs, state.weights, state.tails, *of_noise)
+        n_steps, own_m2 = steps_before + state.n_steps, state.solution.own_m2
         return cls(landmark, *found, n_steps, own_m2, common, further)
 
     def joint_covariance(self) -> Float:
@@ -306,7 +315,7 @@ def smooth(
 ) -> Smoothed:
     """Compute the most probable path and landmarks.
 
-    Landmarks whose tracks are of several corners are split (`one_corner.py`).
+    Landmarks with tracks of several corners are split (`split_landmarks`).
 
     Args:
         log: the log.
@@ -323,47 +332,51 @@ def smooth(
     require_shape("path", path, (len(log), 3))
     information, path = parameters.odometry_information(log), between(path[0], path)
     known = _problem(log, landmark, parameters, information)
-    require_memory(known.seen, max_memory_gb)
-    start, n_steps = _without_gross(known, path)
+    require_memory(known.obs, max_memory_gb)
+    start, n_steps = _robust_start(known, path)
     path = start[0].path
-    parts = parted(known.seen, landmark, path, parameters.stray_m)
+    parts = split_landmarks(known.obs, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
         known = _problem(log, parts, parameters, information)
-        start = followed(known, _start(known, path))
+        start = update_points_and_weights(known, _start(known, path))
     if parameters.has_own_odometry:
-        end, levels = settled_with_levels(known, *start)
-        if levels.odometry.max() > _FAR_WORSE and end.tails.observation < MOST_DOF:
-            path, n_steps = end.estimate.path, n_steps + end.n_steps
-            del end  # frees the memory of its factors
-            under = information_under(information, levels.odometry)
-            start, n_again = _without_gross(known._replace(information=under), path)
+        state, scales = optimize_with_noise(known, *start)
+        if scales.odometry.max() > _LARGE_SCALE and state.tails.observation < MOST_DOF:
+            path, n_steps = state.estimate.path, n_steps + state.n_steps
+            del state  # frees the memory of its factors
+            under = scaled_information(information, scales.odometry)
+            start, n_again = _robust_start(known._replace(information=under), path)
             n_steps += n_again
-            end, levels = settled_with_levels(known, *start, levels.odometry)
-    else:  # visual odometry has no level of its own
+            state, scales = optimize_with_noise(known, *start, scales.odometry)
+    else:  # the noise of visual odometry is not estimated
         at, weights, tails = start
-        end, levels = settled(known, at, weights=weights, tails=tails), AS_STATED
-    return Smoothed.of(known, end, parts, levels, n_steps)
+        state, scales = optimize(known, at, weights=weights, tails=tails), UNIT_SCALES
+    return Smoothed.of(known, state, parts, scales, n_steps)
 
 
-def _without_gross(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:
-    """Return the start of the next round after a round with larger errors, and its steps."""
-    seen = problem.seen
-    worse = replace(seen, information=seen.information / _THOUGHT_WORSE**2)
-    blurred = problem._replace(seen=worse)
-    end = finished(blurred, settled(blurred, _start(problem, path), _CLOSE))
-    return (end.estimate, end.weights, end.tails), end.n_steps
+def _robust_start(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:
+    """Return the result of a round with inflated covariances, and its number of steps."""
+    obs = problem.obs
+    inflated = replace(obs, information=obs.information / _INFLATION**2)
+    first_problem = problem._replace(obs=inflated)
+    state = take_final_step(
+        first_problem, optimize(first_problem, _start(problem, path), _FIRST_TOLERANCE)
+    )
+    return (state.estimate, state.weights, state.tails), state.n_steps
 
 
 def _problem(
     log: RobotLog, landmark: np.ndarray, parameters: SmootherParameters, information: Float
 ) -> Problem:
-    seen = sightings_of(log, landmark, parameters.min_count, stray=parameters.stray_m > 0)
-    return Problem(seen, log.odometry, information, parameters.stray_information)
+    obs = order_observations(
+        log, landmark, parameters.min_count, with_offsets=parameters.stray_m > 0
+    )
+    return Problem(obs, log.odometry, information, parameters.offset_prior)
 
 
 def _start(problem: Problem, path: Float) -> Estimate:
-    seen = problem.seen
-    return Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    obs = problem.obs
+    return Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
 
 
 def smoothed_map(
@@ -378,16 +391,30 @@ def smoothed_map(
         log: the smoothed log.
         smoothed: the result of the smoother, with landmarks numbered by rows of the log.
         rank: number of shared variables of the joint covariance.
-        attitude: attitude that the observations were levelled with; None for a level body.
+        attitude: attitude that the observations were corrected with; None for a level body.
     """
-    seen, landmark = smoothed.seen, smoothed.landmark
-    if attitude is not None and seen.n_dimensions > 2:
-        smoothed = _with_attitude(smoothed, attitude)
+    obs, landmark = smoothed.obs, smoothed.landmark
+    if attitude is not None and obs.n_dimensions > 2:
+        # add the errors of the attitude to the landmarks' shared errors
+        estimate, common = smoothed.estimate, smoothed.common
+        heights = shared_heights(attitude, estimate.path, obs.frame, obs.landmark, estimate.point_m)
+        by_attitude = np.zeros((*heights.shape, 3))
+        by_attitude[..., 2] = heights
+        by_path = common.spread(np.eye(len(common))).T
+        both = np.vstack([by_path, by_attitude.reshape(len(by_attitude), -1)])
+        smoothed = replace(smoothed, common=KnownErrors(both))
     point, joint = condensed_points(smoothed, rank)
-    source = landmark[seen.row[seen.starts[:-1]]].astype(np.int64)
-    look = log.observations[source]
-    count = np.diff(seen.starts).astype(np.int32)
-    about = (count, source, look.descriptor, look.label, log.planar, log.robot)
+    source = landmark[obs.row[obs.starts[:-1]]].astype(np.int64)
+    source_observation = log.observations[source]
+    count = np.diff(obs.starts).astype(np.int32)
+    about = (
+        count,
+        source,
+        source_observation.descriptor,
+        source_observation.label,
+        log.planar,
+        log.robot,
+    )
     viewing = viewing_of(log, landmark, smoothed.estimate.path, source)
     return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
 
@@ -397,18 +424,7 @@ def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, Joint
     """Return the landmarks (L, 3) and their condensed joint covariance; planar z is zero."""
     point = smoothed.estimate.point_m.copy()
     joint = reduce_rank(smoothed.own_m2, smoothed.common, rank)
-    if smoothed.seen.n_dimensions == 2:
+    if smoothed.obs.n_dimensions == 2:
         point[:, 2] = 0.0
         joint.own_m2[:, 2, :] = joint.own_m2[:, :, 2] = joint.common_m[:, :, 2] = 0.0
     return point, joint
-
-
-def _with_attitude(smoothed: Smoothed, attitude: Attitude) -> Smoothed:
-    """Add the errors of the attitude to the landmarks' shared errors."""
-    seen, estimate = smoothed.seen, smoothed.estimate
-    lifted = shared_heights(attitude, estimate.path, seen.frame, seen.landmark, estimate.point_m)
-    moved = np.zeros((*lifted.shape, 3))
-    moved[..., 2] = lifted
-    by_path = smoothed.common.spread(np.eye(len(smoothed.common))).T
-    both = np.vstack([by_path, moved.reshape(len(moved), -1)])
-    return replace(smoothed, common=KnownErrors(both))

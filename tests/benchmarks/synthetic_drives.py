@@ -17,8 +17,8 @@ import numpy as np
 from mapfusion.geometry.numerics import Float, one_blas_thread
 from mapfusion.geometry.se2 import compose, wrap
 from mapfusion.smoother.elimination import memory_bytes, pose_covariances
-from mapfusion.smoother.normal_equations import information_under
-from mapfusion.smoother.optimizer import Problem, solved
+from mapfusion.smoother.normal_equations import scaled_information
+from mapfusion.smoother.optimizer import Problem, linearize_and_solve
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from tests.helpers.synthetic_drives import SHAPES, Drive, drive
 
@@ -56,7 +56,7 @@ def nees(driven: Drive, found: Smoothed) -> Nees:
     """Return how the errors compare with the covariances, in the frame of the first pose."""
     label = driven.log.observations.label
     assert label is not None
-    true = driven.point_m[label[found.seen.row[found.seen.starts[:-1]]]]
+    true = driven.point_m[label[found.obs.row[found.obs.starts[:-1]]]]
     off = found.estimate.point_m - true
     of_landmarks = _mean_square(off, found.own_m2 + found.common.squares())
     frames = np.unique(np.linspace(1, len(driven.path) - 1, MOST_POSES).round().astype(int))
@@ -68,10 +68,10 @@ def nees(driven: Drive, found: Smoothed) -> Nees:
 def _pose_covariances(driven: Drive, found: Smoothed, frames: np.ndarray) -> Float:
     """Return (n, 3, 3) of the equations where the smoother ended."""
     parameters, log = SmootherParameters(stray_m=STRAY_M), driven.log
-    information = information_under(parameters.odometry_information(log), found.odometry_level)
-    problem = Problem(found.seen, log.odometry, information, parameters.stray_information)
-    end = solved(problem, found.estimate, found.weights, found.tails)
-    covariance = pose_covariances(end.seen, end.equations, end.solution, frames)
+    information = scaled_information(parameters.odometry_information(log), found.odometry_scales)
+    problem = Problem(found.obs, log.odometry, information, parameters.offset_prior)
+    end = linearize_and_solve(problem, found.estimate, found.weights, found.tails)
+    covariance = pose_covariances(end.obs, end.equations, end.solution, frames)
     further = found.second_order
     return covariance if further is None else covariance + further.pose_covariances(frames)
 
@@ -114,7 +114,7 @@ def _row(shape: str, n_frames: int, noise: float, asked: argparse.Namespace) -> 
             sys.stdout.write(f"{shape} {n_frames} {noise:g} seed {seed}: {error}\n")
             continue
         seconds += time.perf_counter() - began
-        most_bytes = max(most_bytes, memory_bytes(found.seen))
+        most_bytes = max(most_bytes, memory_bytes(found.obs))
         known.append(nees(driven, found))
     landmark, path = np.mean(known, axis=0) if known else (np.nan, np.nan)
     sys.stdout.write(

@@ -59,7 +59,7 @@ class Team(Robots):
         pairs = [replace(pair, a=at[pair.a], b=at[pair.b]) for pair in self.pairs]
         turned = [*pairs[order[0] :], *pairs[: order[0]]]
         fusion = merge([self.maps[k] for k in order], turned, parameters, fuser)
-        place = dict(zip(((pair.a, pair.b) for pair in turned), fusion.place, strict=True))
+        place = dict(zip(((pair.a, pair.b) for pair in turned), fusion.edge_status, strict=True))
         told = {(p.a, p.b): place[at[p.a], at[p.b]] for p in self.pairs}
         return fusion, told
 

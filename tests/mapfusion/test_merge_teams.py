@@ -8,7 +8,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.fusion.fused_map import AlignedPair, MergeParameters
 from mapfusion.fusion.kalman import KalmanDrift
 from mapfusion.fusion.merge import merge
-from mapfusion.fusion.team_graph import Place, TeamParameters, Unconfirmed
+from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters, Unconfirmed
 from mapfusion.geometry import se2
 from tests.mapfusion.robots_of_one_world import Robots
 
@@ -38,7 +38,7 @@ def test_maps_are_reached_through_others():
     team = Team()
     fusion = fused_by_kalman(team.maps, team.pairs)
     (fused,) = fusion.fused
-    assert fusion.place == (Place.BRIDGE,) * 4
+    assert fusion.edge_status == (EdgeStatus.BRIDGE,) * 4
     assert fused.left_out == ()
     points = team.point_of(fused)
     assert len(np.unique(points)) == len(points) == 180
@@ -81,7 +81,10 @@ def test_a_false_alignment_that_a_loop_speaks_against_moves_nothing():
     pairs = [*team.pairs[:2], team.pair(0, 2), team.pair(1, 3), *team.pairs[2:]]
     pairs.append(team.pair(0, 3, false=True))
     fusion = fused_by_kalman(team.maps, pairs)
-    assert fusion.place == (Place.CONFIRMED,) * 5 + (Place.BRIDGE, Place.CONTRADICTED)
+    assert fusion.edge_status == (EdgeStatus.CONFIRMED,) * 5 + (
+        EdgeStatus.BRIDGE,
+        EdgeStatus.CONTRADICTED,
+    )
     assert np.abs(team.errors(fusion.fused[0])).max() < 0.3
     cautious = MergeParameters(team=TeamParameters(Unconfirmed.DROP))
     dropped = fused_by_kalman(team.maps, pairs, cautious).fused[0]

@@ -54,7 +54,7 @@ from mapfusion.fusion.fused_map import AlignedPair, FusedMap, MergeParameters
 from mapfusion.fusion.fusers import make_fuser
 from mapfusion.fusion.merge import ConnectedMaps, connect
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
-from mapfusion.smoother.joint_smoothing import Recording
+from mapfusion.smoother.joint_smoothing import AssociatedLog
 from mapfusion.smoother.smooth import SmootherParameters
 
 LABEL = "fuse the maps"
@@ -105,7 +105,7 @@ class GivenTeam:
     maps: Sequence[LandmarkMap]
     pairs: Sequence[AlignedPair]
     smoothed: Sequence[LandmarkMap]
-    recordings: Sequence[Recording | None]
+    recordings: Sequence[AssociatedLog | None]
 
     def connected(self, settings: FuseSettings) -> ConnectedMaps:
         """The maps placed by the alignments that the team believes."""
@@ -143,7 +143,7 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
     robots = {name: _read_robot(job, name, takes, viewing) for name in settings.robots}
     alignments = _alignments(settings, job)
     for k in settings.iterations:
-        given, recordings = [], list[Recording | None]()
+        given, recordings = [], list[AssociatedLog | None]()
         for name, robot in robots.items():
             known = {i: own for i, own in robot.smoothed.items() if i <= k}
             given.append(_at(known, k) if known else _at(robot.filtered, k))
@@ -170,7 +170,7 @@ def _recording(
     job: Job,
     name: str,
     smoothed: Mapping[int, LandmarkMap],
-) -> Recording | None:
+) -> AssociatedLog | None:
     """What the last smoothed map was made of, and the path that was found; None without a map."""
     if not smoothed:
         return None
@@ -181,7 +181,7 @@ def _recording(
     landmark = smoothed_owners(smooth, slam, k, len(log.observations))
     path = read_smoothed_path(smooth)[k]
     smoother = replace(settings.smoother, odometry_covariance=covariance)
-    return Recording(log, landmark, path, smoother)
+    return AssociatedLog(log, landmark, path, smoother)
 
 
 class _Alignments:

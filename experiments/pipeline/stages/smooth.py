@@ -134,7 +134,7 @@ def smoothed_anew(
     """
     found = _smoothed(log, landmark, path, settings)
     if not isinstance(found, str):
-        ended = (found.n_steps, *found.tails, found.observation_level, "")
+        ended = (found.n_steps, *found.tails, found.observation_scale, "")
         try:
             made = smoothed_map(log, found, attitude=attitude)
             return made, found.estimate.path, found.landmark, ended

@@ -22,7 +22,7 @@ from experiments.evaluation.team_errors import (
 from experiments.evaluation.truth import PathTruth
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.fusion.fused_map import FusedMap, Fusion
-from mapfusion.fusion.team_graph import Place
+from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from tests.helpers.made_up_maps import ITERATION, NO_RIVALS, landmark_map
@@ -32,7 +32,7 @@ STARTS = np.array([[1.0, 2.0, 0.3], [4.0, -1.0, 3.0], [-2.0, 0.5, -1.2]])
 
 
 def team_of(
-    T_first_map: Float, starts: Float = STARTS, places: tuple[Place, ...] = ()
+    T_first_map: Float, starts: Float = STARTS, places: tuple[EdgeStatus, ...] = ()
 ) -> FusedTeam:
     """Robots that start at these places, and the motions that put their maps into one frame.
 
@@ -59,7 +59,9 @@ def team_of(
         FusedMap(robots[0].at(0)[0], np.zeros((0, len(robots))), T, none_m2, none_m, 0.0, ())
         for T in np.asarray(T_first_map).reshape(-1, len(robots), 3)
     )
-    return FusedTeam(robots, met, ITERATION, Fusion(fused, places or (Place.BRIDGE,) * len(met)))
+    return FusedTeam(
+        robots, met, ITERATION, Fusion(fused, places or (EdgeStatus.BRIDGE,) * len(met))
+    )
 
 
 def paths_of(each: list[tuple[Float, Float]]) -> pd.DataFrame:
@@ -195,7 +197,7 @@ def test_each_set_of_robots_has_its_row_and_poses_without_truth_none() -> None:
 def test_nothing_merged_has_no_team_error() -> None:
     alone = np.full((3, 3), np.nan)
     alone[0] = 0.0
-    team = team_of(alone, places=(Place.REFUSED,) * 3)
+    team = team_of(alone, places=(EdgeStatus.REFUSED,) * 3)
     assert team_rows(team, paths_of([driven(np.random.default_rng(2), 9)] * 3)) == []
 
 
@@ -220,7 +222,7 @@ def test_a_wrong_edge_is_told_before_and_what_the_team_makes_of_it_after() -> No
     """R0-R1 and R0-R2 are right; R1-R2 is 3 m off, and the others contradict it."""
     T = se2.between(STARTS[0], STARTS)
     T[1] = se2.compose(T[1], [0.03, 0.04, 0.01])
-    places = (Place.CONFIRMED, Place.CONFIRMED, Place.CONTRADICTED)
+    places = (EdgeStatus.CONFIRMED, EdgeStatus.CONFIRMED, EdgeStatus.CONTRADICTED)
     errors = errors_of([0.05, 0.0, 3.0], [40, 30, 20], [True, True, True])
     rows = team_pair_rows(team_of(T, places=places), errors, "ransac")
     assert rows["refined_translation_error_m"].tolist() == [0.05, 0.0, 3.0]
@@ -234,14 +236,14 @@ def test_a_wrong_edge_is_told_before_and_what_the_team_makes_of_it_after() -> No
     assert rows["team_rotation_error_rad"].tolist() == pytest.approx([0.01, 0.0, -0.01])
     assert edge_precision(rows) == 1.0
     assert edge_recall(rows) == pytest.approx(2 / 3)
-    rows.loc[2, "place"] = str(Place.CONFIRMED)  # had it been believed
+    rows.loc[2, "place"] = str(EdgeStatus.CONFIRMED)  # had it been believed
     assert edge_precision(rows) == pytest.approx(2 / 3)
     assert edge_recall(rows) == pytest.approx(2 / 3)
 
 
 def test_recall_is_of_those_that_met_and_an_edge_without_common_ground_is_false() -> None:
     """R0-R1 met and were refused, R0-R2 are right by chance at best, R1-R2 met and are right."""
-    places = (Place.REFUSED, Place.BRIDGE, Place.BRIDGE)
+    places = (EdgeStatus.REFUSED, EdgeStatus.BRIDGE, EdgeStatus.BRIDGE)
     errors = errors_of([0.1, 0.1, 0.1], [3, 2, 50], [False, True, True])
     rows = team_pair_rows(team_of(se2.between(STARTS[0], STARTS), places=places), errors, "ransac")
     assert edge_precision(rows) == 0.5
@@ -253,6 +255,6 @@ def test_robots_in_no_map_together_have_no_error() -> None:
     T[:2] = se2.between(STARTS[0], STARTS[:2])
     rows = team_pair_rows(team_of(T), errors_of([0.1] * 3, [9] * 3, [True] * 3), "ransac")
     assert rows["team_translation_error_m"].isna().tolist() == [False, True, True]
-    nothing = rows.assign(place=str(Place.REFUSED), n_common=0)
+    nothing = rows.assign(place=str(EdgeStatus.REFUSED), n_common=0)
     assert math.isnan(edge_precision(nothing))
     assert math.isnan(edge_recall(nothing))

@@ -10,7 +10,7 @@ from experiments.evaluation.path_errors import STATISTICS
 from experiments.studies.comparison import compare
 from experiments.studies.intervals import wilson
 from experiments.studies.statistics import team_alignments, team_paths
-from mapfusion.fusion.team_graph import Place
+from mapfusion.fusion.team_graph import EdgeStatus
 from tests.helpers import made_up_runs
 from tests.helpers.made_up_runs import Tables, two_sweeps
 from tests.helpers.tiny_scenario import command
@@ -28,10 +28,10 @@ def pairs_of(seed: int, off_m: float = 0.1) -> pd.DataFrame:
     """A table `team_pairs`: right, right and not believed, wrong and believed, and apart."""
     value = off_m * np.exp(0.1 * np.random.default_rng(seed).normal())
     rows = [
-        ("A", "B", Place.CONFIRMED, True, 40, 2 * value, value),
-        ("A", "C", Place.UNCONFIRMED, True, 40, 2 * value, np.nan),
-        ("B", "C", Place.BRIDGE, True, 40, 3.0, 3.0),
-        ("A", "D", Place.REFUSED, False, 0, np.nan, np.nan),
+        ("A", "B", EdgeStatus.CONFIRMED, True, 40, 2 * value, value),
+        ("A", "C", EdgeStatus.UNCONFIRMED, True, 40, 2 * value, np.nan),
+        ("B", "C", EdgeStatus.BRIDGE, True, 40, 3.0, 3.0),
+        ("A", "D", EdgeStatus.REFUSED, False, 0, np.nan, np.nan),
     ]
     names = ["robot_a", "robot_b", "place", "accepted", "n_common"]
     names += ["refined_translation_error_m", "team_translation_error_m"]
@@ -70,7 +70,7 @@ def test_shares_of_alignments_are_those_counted_by_hand() -> None:
 
 
 def test_nothing_believed_and_nobody_met_is_unknown() -> None:
-    rows = pairs_of(0).assign(place=str(Place.REFUSED), n_common=0, run_id="w")
+    rows = pairs_of(0).assign(place=str(EdgeStatus.REFUSED), n_common=0, run_id="w")
     rows["team_translation_error_m"] = np.nan
     (row,) = team_alignments(rows, np.random.default_rng(0)).to_dict("records")
     assert np.isnan([row["precision"], row["recall"], row["team_m"]]).all()
@@ -80,7 +80,7 @@ def worse(seed: int, made: Tables) -> Tables:
     """The team is three times as far off, and believes one more alignment, which is right."""
     made["team"] = team_of(seed, 0.3)
     made["team_pairs"] = pairs_of(seed, 0.15)
-    made["team_pairs"].loc[1, "place"] = str(Place.BRIDGE)
+    made["team_pairs"].loc[1, "place"] = str(EdgeStatus.BRIDGE)
     return made
 
 

@@ -12,7 +12,7 @@ from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
-from mapfusion.smoother.joint_smoothing import Recording
+from mapfusion.smoother.joint_smoothing import AssociatedLog
 from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 from tests.mapfusion.smoother.white_noise_logs import (
     Known,
@@ -121,10 +121,10 @@ def log_labels(log: RobotLog) -> np.ndarray:
     return log.observations.label
 
 
-def _recorded(known: Known) -> Recording:
+def _recorded(known: Known) -> AssociatedLog:
     """With dead reckoning for a path."""
     log = known.log
     _, first, inverse = np.unique(log_labels(log), return_index=True, return_inverse=True)
     has_tracks = log.observations.track is not None
     parameters = SmootherParameters(stray_m=STRAY_M if has_tracks else 0.0)
-    return Recording(log, first[inverse], dead_reckoned(log), parameters)
+    return AssociatedLog(log, first[inverse], dead_reckoned(log), parameters)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.fusion.pose_graph import Relations
+from mapfusion.fusion.pose_graph import AlignmentEdges
 from mapfusion.fusion.team_graph import TeamGraph
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, compose, wrap
@@ -20,7 +20,7 @@ class Met(NamedTuple):
 
     T_world_robot: Float  # (N, 3)
     false: np.ndarray  # (E,)
-    relations: Relations
+    relations: AlignmentEdges
 
 
 def poses(n: int, rng: np.random.Generator) -> Float:
@@ -33,12 +33,12 @@ def all_pairs(n: int) -> np.ndarray:
     return np.stack(np.triu_indices(n, 1), axis=1)
 
 
-def measured(robots: np.ndarray, T_a_b: Float, n: int, rng: np.random.Generator) -> Relations:
+def measured(robots: np.ndarray, T_a_b: Float, n: int, rng: np.random.Generator) -> AlignmentEdges:
     """Relations with noise, each as sure of itself as any."""
     T = T_a_b + rng.normal(0, SIGMA, T_a_b.shape)
     T[:, 2] = wrap(T[:, 2])
     covariance = np.tile(np.diag(SIGMA**2), (len(robots), 1, 1))
-    return Relations(n, robots, T, covariance, rng.uniform(-30, -5, len(robots)))
+    return AlignmentEdges(n, robots, T, covariance, rng.uniform(-30, -5, len(robots)))
 
 
 def team(seed: int, kind: str, n: int = 10, n_groups: int = 3) -> Met:

@@ -7,18 +7,24 @@ import pytest
 from scipy.stats import chi2
 
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.fusion.aligned_landmarks import ABSENT, AlignedLandmarks, Pair, SamePoint, joined
-from mapfusion.fusion.kalman import kalman_fused
+from mapfusion.fusion.aligned_landmarks import (
+    ABSENT,
+    AlignedLandmarks,
+    AssociationTest,
+    CandidatePairs,
+    cluster_landmarks,
+)
+from mapfusion.fusion.kalman import kalman_update
 from mapfusion.tables import NO_LABEL
 
 SIZES = [12, 9, 11]
 
 
-def _pairs(seed: int) -> list[Pair]:
+def _pairs(seed: int) -> list[CandidatePairs]:
     rng, pairs = np.random.default_rng(seed), []
     for a, b in itertools.combinations(range(3), 2):
         rows = rng.integers(0, SIZES[a], 10), rng.integers(0, SIZES[b], 10)
-        pairs.append(Pair(a, b, *rows, rng.random(10)))
+        pairs.append(CandidatePairs(a, b, *rows, rng.random(10)))
     return pairs
 
 
@@ -29,13 +35,13 @@ def _as_sets(points: np.ndarray, order: tuple[int, ...] = (0, 1, 2)) -> set[froz
     }
 
 
-def _one_by_one(pairs: list[Pair]) -> set[frozenset]:
+def _one_by_one(pairs: list[CandidatePairs]) -> set[frozenset]:
     """The slow obvious version: sets of landmarks, united while no map is in both."""
     points = [{(k, row)} for k, size in enumerate(SIZES) for row in range(size)]
     every = [
-        (unlike, (pair.a, int(i)), (pair.b, int(j)))
+        (dissimilarity, (pair.a, int(i)), (pair.b, int(j)))
         for pair in pairs
-        for i, j, unlike in zip(pair.row_a, pair.row_b, pair.unlike, strict=True)
+        for i, j, dissimilarity in zip(pair.row_a, pair.row_b, pair.dissimilarity, strict=True)
     ]
     for _, i, j in sorted(every):
         one, other = (next(own for own in points if which in own) for which in (i, j))
@@ -48,7 +54,7 @@ def _one_by_one(pairs: list[Pair]) -> set[frozenset]:
 def test_equals_sets_united_one_by_one() -> None:
     for seed in range(20):
         pairs = _pairs(seed)
-        points = joined(pairs, SIZES)
+        points = cluster_landmarks(pairs, SIZES)
         assert _as_sets(points) == _one_by_one(pairs)
         several = np.count_nonzero(points >= 0, axis=1) > 1
         assert not np.any(np.diff(several.astype(int)) > 0)  # those of one map come last
@@ -56,15 +62,15 @@ def test_equals_sets_united_one_by_one() -> None:
 
 def test_the_order_of_maps_makes_no_difference() -> None:
     pairs = _pairs(0)
-    expected = _as_sets(joined(pairs, SIZES))
+    expected = _as_sets(cluster_landmarks(pairs, SIZES))
     for order in itertools.permutations(range(3)):
         place = {k: at for at, k in enumerate(order)}
         turned = [pair._replace(a=place[pair.a], b=place[pair.b]) for pair in reversed(pairs)]
-        assert _as_sets(joined(turned, [SIZES[k] for k in order]), order) == expected
+        assert _as_sets(cluster_landmarks(turned, [SIZES[k] for k in order]), order) == expected
 
 
 def test_without_pairs_each_landmark_is_a_point() -> None:
-    assert len(joined([], SIZES)) == sum(SIZES)
+    assert len(cluster_landmarks([], SIZES)) == sum(SIZES)
 
 
 def drawn(seed: int, n: int, n_labels: int) -> AlignedLandmarks:
@@ -91,7 +97,7 @@ def drawn(seed: int, n: int, n_labels: int) -> AlignedLandmarks:
 
 
 def slow_candidates(
-    test: SamePoint, a: AlignedLandmarks, b: AlignedLandmarks
+    test: AssociationTest, a: AlignedLandmarks, b: AlignedLandmarks
 ) -> dict[tuple[int, int], float]:
     """Return the pairs that pass, with the distances of their descriptors."""
     found = {}
@@ -112,9 +118,9 @@ def slow_candidates(
             variance += test.height.floor_m**2
             if not test.planar and up**2 > most_up * variance:
                 continue
-            unlike = float(np.linalg.norm(a.descriptor[i] - b.descriptor[j]))
-            if unlike <= test.max_descriptor_distance:
-                found[i, j] = unlike
+            dissimilarity = float(np.linalg.norm(a.descriptor[i] - b.descriptor[j]))
+            if dissimilarity <= test.max_descriptor_distance:
+                found[i, j] = dissimilarity
     return found
 
 
@@ -122,9 +128,9 @@ def slow_candidates(
 @pytest.mark.parametrize("seed", range(3))
 def test_candidates_are_those_of_all_pairs(seed: int, planar: bool) -> None:
     a, b = drawn(2 * seed, 40, 15), drawn(2 * seed + 1, 50, 20)
-    test = SamePoint(0.3, 0.99, HeightGate(0.99, 0.1), planar)
-    i, j, unlike = test.candidates(a, b)
-    found = dict(zip(zip(i.tolist(), j.tolist(), strict=True), unlike.tolist(), strict=True))
+    test = AssociationTest(0.3, 0.99, HeightGate(0.99, 0.1), planar)
+    i, j, dissimilarity = test.candidates(a, b)
+    found = dict(zip(zip(i.tolist(), j.tolist(), strict=True), dissimilarity.tolist(), strict=True))
     expected = slow_candidates(test, a, b)
     assert found.keys() == expected.keys()
     assert len(found) == len(i)
@@ -136,7 +142,7 @@ def test_candidates_are_those_of_all_pairs(seed: int, planar: bool) -> None:
 @pytest.mark.parametrize("planar", [False, True])
 def test_the_test_does_not_ask_who_comes_first(planar: bool) -> None:
     a, b = drawn(10, 60, 10), drawn(11, 50, 30)
-    test = SamePoint(0.3, 0.99, HeightGate(0.99, 0.1), planar)
+    test = AssociationTest(0.3, 0.99, HeightGate(0.99, 0.1), planar)
     there, back = test.candidates(a, b), test.candidates(b, a)
     assert set(zip(there[0], there[1], strict=True)) == set(zip(back[1], back[0], strict=True))
 
@@ -153,8 +159,8 @@ def test_a_fused_landmark_drifts_as_the_better_parent_whichever_comes_first() ->
         for own, order in ((a, 1), (b, -1))
     )
     rows, others = np.arange(0, 20), np.arange(10, 30)[::-1]
-    one = a.joined(b, rows, others, 3, kalman_fused)
-    two = b.joined(a, others, rows, 3, kalman_fused)
+    one = a.fuse_with(b, rows, others, 3, kalman_update)
+    two = b.fuse_with(a, others, rows, 3, kalman_update)
     by_parents = {
         tuple(parents): drift for parents, drift in zip(two.parents, two.drift_m2, strict=True)
     }

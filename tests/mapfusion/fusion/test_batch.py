@@ -15,7 +15,7 @@ from mapfusion.fusion.merge import connect
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, compose, rotation, wrap
 from mapfusion.robot_log import NO_TRACK
-from mapfusion.smoother.joint_smoothing import SmoothedTogether, smooth_together
+from mapfusion.smoother.joint_smoothing import JointlySmoothed, smooth_jointly
 from tests.mapfusion.fusion.logged_team import STRAY_M, LoggedTeam, labels, log_labels
 from tests.mapfusion.smoother.white_noise_logs import NOISE, Known
 
@@ -28,10 +28,10 @@ def _fused(team: LoggedTeam, *members: int) -> FusedMap:
     return fused
 
 
-def _together(team: LoggedTeam) -> SmoothedTogether:
+def _together(team: LoggedTeam) -> JointlySmoothed:
     points = [log_labels(each.log) for each in team.known]
     start = [team.motion(0, k) for k in range(len(points))]
-    return smooth_together(team.recordings, points, np.array(start), ROOM)
+    return smooth_jointly(team.recordings, points, np.array(start), ROOM)
 
 
 def _n_strays(known: Known) -> int:
@@ -49,32 +49,32 @@ class Twin:
     Weights and the observations' level are those that were found.
     """
 
-    def __init__(self, team: LoggedTeam, found: SmoothedTogether, dimensions: int) -> None:
+    def __init__(self, team: LoggedTeam, found: JointlySmoothed, dimensions: int) -> None:
         self.d, smoothed = dimensions, found.smoothed
-        seen, logs = smoothed.seen, [each.log for each in team.known]
-        self.seen, self.weights, self.strays = seen, smoothed.weights, seen.strays
-        position = np.concatenate([log.observations.position_m for log in logs])[seen.row]
-        covariance = np.concatenate([log.observations.covariance_m2 for log in logs])[seen.row]
+        obs, logs = smoothed.obs, [each.log for each in team.known]
+        self.obs, self.weights, self.has_offset = obs, smoothed.weights, obs.has_offset
+        position = np.concatenate([log.observations.position_m for log in logs])[obs.row]
+        covariance = np.concatenate([log.observations.covariance_m2 for log in logs])[obs.row]
         self.position = position[:, : self.d]
-        level = np.where(self.strays[seen.track], smoothed.observation_level, 1.0)
+        level = np.where(self.has_offset[obs.track], smoothed.observation_scale, 1.0)
         scaled = (level / self.weights.observation)[:, None, None] * covariance
         self.root = np.linalg.inv(np.linalg.cholesky(scaled[:, : self.d, : self.d]))
         self.ends = np.cumsum([len(log) for log in logs])
-        self.odometry, self.levels = [log.odometry for log in logs], smoothed.odometry_level
+        self.odometry, self.levels = [log.odometry for log in logs], smoothed.odometry_scales
         at = smoothed.estimate
         self.n = 3 * (len(at.path) - 1), self.d * len(at.point_m)
-        parts = at.path[1:], at.point_m[:, : self.d], at.offset_m[self.strays, : self.d]
+        parts = at.path[1:], at.point_m[:, : self.d], at.offset_m[self.has_offset, : self.d]
         self.found = np.concatenate([part.ravel() for part in parts])
 
     def residuals(self, x: Float) -> Float:
         n, m = self.n
         path = np.concatenate([np.zeros((1, 3)), x[:n].reshape(-1, 3)])
-        points, offsets = x[n : n + m].reshape(-1, self.d), np.zeros((len(self.strays), self.d))
-        offsets[self.strays] = x[n + m :].reshape(-1, self.d)
-        pose, at = path[self.seen.frame], points[self.seen.landmark] + offsets[self.seen.track]
+        points, offsets = x[n : n + m].reshape(-1, self.d), np.zeros((len(self.has_offset), self.d))
+        offsets[self.has_offset] = x[n + m :].reshape(-1, self.d)
+        pose, at = path[self.obs.frame], points[self.obs.landmark] + offsets[self.obs.track]
         at[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), at[:, :2] - pose[:, :2])
         parts = [np.einsum("nij,nj->ni", self.root, at - self.position)]
-        parts.append((offsets * np.sqrt(self.weights.offset)[:, None] / STRAY_M)[self.strays])
+        parts.append((offsets * np.sqrt(self.weights.offset)[:, None] / STRAY_M)[self.has_offset])
         for odometry, way in zip(self.odometry, np.split(path, self.ends[:-1]), strict=True):
             d = between(way[:-1], way[1:]) - odometry[1:]
             d[:, 2] = wrap(d[:, 2])
@@ -92,7 +92,7 @@ def test_equals_a_dense_solver_that_knows_of_no_robots(
     """Few poses among many points, and many among few: either is eliminated first."""
     team = LoggedTeam(1, 2, n_frames, 14, planar, tracks)
     found, d = _together(team), 2 + (not planar)
-    assert np.count_nonzero(found.smoothed.seen.strays) == sum(map(_n_strays, team.known))
+    assert np.count_nonzero(found.smoothed.obs.has_offset) == sum(map(_n_strays, team.known))
     twin = Twin(team, found, d)
     solved = least_squares(twin.residuals, twin.found, xtol=1e-14, ftol=1e-14, gtol=1e-12)
     covariance = np.linalg.inv(solved.jac.T @ solved.jac)
@@ -196,11 +196,11 @@ def test_what_hinders_it_is_said_and_joint_fusion_takes_its_place() -> None:
     team = LoggedTeam(5)
     component = team.component(0, 1)
     one, other = team.recordings
-    strays = replace(other, parameters=replace(other.parameters, stray_m=0.1))
+    other_offset = replace(other, parameters=replace(other.parameters, stray_m=0.1))
     for fuser, recordings, said in (
-        (Batch(), (), "the log that R1's map was smoothed from is not known"),
-        (Batch(), (one, None), "the log that R1's map was smoothed from is not known"),
-        (Batch(), (one, strays), "the logs' tracks stray by different amounts"),
+        (Batch(), (), "the log of R1's smoothed map is not known"),
+        (Batch(), (one, None), "the log of R1's smoothed map is not known"),
+        (Batch(), (one, other_offset), "the logs have different values of stray_m"),
         (Batch(1e-6), (one, other), "smoothing all logs at once: may take "),
     ):
         given = replace(component, recordings=recordings)

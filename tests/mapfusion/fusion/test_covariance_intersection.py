@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapfusion.fusion.covariance_intersection import intersected
+from mapfusion.fusion.covariance_intersection import intersect_covariances
 from tests.mapfusion.align.map_pairs import covariances
 
 
@@ -15,7 +15,7 @@ def _pairs(n: int = 40) -> tuple[np.ndarray, ...]:
 def test_no_weight_gives_a_smaller_determinant() -> None:
     p_i, S_i, p_j, S_j = _pairs()
     A, B = np.linalg.inv(S_i), np.linalg.inv(S_j)
-    position, covariance = intersected(p_i, S_i, p_j, S_j)
+    position, covariance = intersect_covariances(p_i, S_i, p_j, S_j)
     w = np.linspace(0, 1, 2001)[:, None, None, None]
     tried = np.linalg.inv(w * A + (1 - w) * B)
     best = np.argmin(np.linalg.det(tried), axis=0)
@@ -32,7 +32,10 @@ def test_no_weight_gives_a_smaller_determinant() -> None:
 
 def test_who_is_first_makes_no_difference() -> None:
     p_i, S_i, p_j, S_j = _pairs()
-    one, other = intersected(p_i, S_i, p_j, S_j), intersected(p_j, S_j, p_i, S_i)
+    one, other = (
+        intersect_covariances(p_i, S_i, p_j, S_j),
+        intersect_covariances(p_j, S_j, p_i, S_i),
+    )
     np.testing.assert_allclose(one[0], other[0], atol=1e-9)
     np.testing.assert_allclose(one[1], other[1], atol=1e-12)
 
@@ -40,4 +43,4 @@ def test_who_is_first_makes_no_difference() -> None:
 def test_errors_that_are_the_same_are_not_halved() -> None:
     """Where a Kalman filter is sure by a factor of two in variance too much."""
     p, S, _, _ = _pairs()
-    np.testing.assert_allclose(intersected(p, S, p, S)[1], S, rtol=1e-9)
+    np.testing.assert_allclose(intersect_covariances(p, S, p, S)[1], S, rtol=1e-9)

@@ -275,7 +275,7 @@ def test_maps_that_no_landmarks_tie_are_fused_by_what_stands_in(n_left: int) -> 
     pairs = [replace(pair, alignment=few)]
     found, instead = _fused(team, pairs), _fused(team, pairs, KalmanDrift())
     np.testing.assert_array_equal(found.landmarks.position_m, instead.landmarks.position_m)
-    assert "tie some map to the others" in found.fallback
+    assert "landmarks in common with the others" in found.fallback
 
 
 def test_covariances_that_cannot_be_computed_with_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,7 +286,7 @@ def test_covariances_that_cannot_be_computed_with_are_told(monkeypatch: pytest.M
     team = DrawnTeam([slice(0, 40), slice(20, 60)], 4)
     found, instead = _fused(team), _fused(team, team.pairs, KalmanDrift())
     np.testing.assert_array_equal(found.landmarks.position_m, instead.landmarks.position_m)
-    assert "sizes too different" in found.fallback
+    assert "differ too much in size" in found.fallback
 
 
 def test_a_wrong_alignment_whose_pairs_pass_no_gate_breaks_nothing() -> None:
@@ -367,15 +367,15 @@ def test_drift_counts_as_a_landmark_s_own_where_nothing_is_shared() -> None:
 def test_pairs_keep_their_distances_where_other_maps_of_the_robots_lack_landmarks() -> None:
     team = DrawnTeam([slice(0, 30), slice(10, 40)], 7)
     (pair,) = team.pairs
-    unlike = np.linspace(0.1, 0.2, len(pair.inliers))
-    pair = replace(pair, correspondences=replace(pair.correspondences, distance=unlike))
+    dissimilarity = np.linspace(0.1, 0.2, len(pair.inliers))
+    pair = replace(pair, correspondences=replace(pair.correspondences, distance=dissimilarity))
     (component,) = connect(team.maps, [pair], MergeParameters().team).components
     others = [team.maps[0][np.arange(29, 3, -1)], team.maps[1][np.array([3, 0, 19, 7, 25])]]
     found = component.on(others).pairs[0].inliers
     origin = [own.source_observation for own in others]
     rows = zip(found.index_a, found.index_b, found.distance, strict=True)
-    got = {(int(origin[0][a]), int(origin[1][b])): unlike for a, b, unlike in rows}
-    rows = zip(pair.inliers.index_a, pair.inliers.index_b, unlike, strict=True)
-    expected = {(int(a), int(b)): unlike for a, b, unlike in rows}
+    got = {(int(origin[0][a]), int(origin[1][b])): dissimilarity for a, b, dissimilarity in rows}
+    rows = zip(pair.inliers.index_a, pair.inliers.index_b, dissimilarity, strict=True)
+    expected = {(int(a), int(b)): dissimilarity for a, b, dissimilarity in rows}
     assert len(got) == 4  # the fifth of map b is not in map a
     assert got.items() <= expected.items()

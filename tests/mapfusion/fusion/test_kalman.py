@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapfusion.fusion.kalman import kalman_fused as fuse
+from mapfusion.fusion.kalman import kalman_update as fuse
 from tests.mapfusion.align.map_pairs import covariances
 
 

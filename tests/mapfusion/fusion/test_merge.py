@@ -134,8 +134,12 @@ def test_second_pass_keeps_the_share_its_gate_promises(fuser):
 
 
 def test_one_to_one_takes_the_most_alike_first():
-    i, j, unlike = np.array([0, 0, 1, 1, 2]), np.array([5, 6, 5, 6, 6]), np.array([3, 2, 1, 4, 0.5])
-    rows, others = one_to_one(i, j, unlike)
+    i, j, dissimilarity = (
+        np.array([0, 0, 1, 1, 2]),
+        np.array([5, 6, 5, 6, 6]),
+        np.array([3, 2, 1, 4, 0.5]),
+    )
+    rows, others = one_to_one(i, j, dissimilarity)
     assert set(zip(rows, others, strict=True)) == {(2, 6), (1, 5)}
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapfusion.align.drift import whole_map_covariance
-from mapfusion.fusion.pose_graph import Motions, Relations, placed
+from mapfusion.fusion.pose_graph import AlignmentEdges, Motions, optimize_poses
 from mapfusion.geometry.se2 import between, compose, inverse, wrap
 from tests.mapfusion.fusion.teams import SIGMA, all_pairs, measured, poses
 
@@ -13,7 +13,7 @@ def test_a_chain_is_what_its_motions_say() -> None:
     rng = np.random.default_rng(0)
     robots = np.array([[2, 0], [2, 4], [1, 4]])
     relations = measured(robots, poses(3, rng), 5, rng)
-    found = placed(relations, np.arange(3))
+    found = optimize_poses(relations, np.arange(3))
     T_2_0, T_2_4, T_1_4 = relations.T_a_b
     T_0_4 = compose(between(T_2_0, np.zeros(3)), T_2_4)
     np.testing.assert_array_equal(found.row, [0, 1, 2, -1, 3])
@@ -22,7 +22,7 @@ def test_a_chain_is_what_its_motions_say() -> None:
         found.T_root_robot[1], compose(T_0_4, between(T_1_4, np.zeros(3))), atol=1e-12
     )
     there = Motions(relations.T_a_b, relations.covariance)
-    along = there[np.array([0])].inverse().then(there[np.array([1])])
+    along = there[np.array([0])].inverse().compose_independent(there[np.array([1])])
     np.testing.assert_allclose(found.covariance[3, 3], along.covariance[0], rtol=1e-9)
 
 
@@ -33,7 +33,7 @@ def test_as_sure_as_many_tries_show() -> None:
     robots, true = all_pairs(n), poses(n, rng)
     T_a_b, squares = between(true[robots[:, 0]], true[robots[:, 1]]), []
     for _ in range(tries):
-        found = placed(measured(robots, T_a_b, n, rng), np.arange(len(robots)))
+        found = optimize_poses(measured(robots, T_a_b, n, rng), np.arange(len(robots)))
         off = found.T_root_robot - between(true[0], true)
         off[:, 2] = wrap(off[:, 2])
         joint = found.covariance[1:, 1:].swapaxes(1, 2).reshape(3 * (n - 1), -1)
@@ -48,7 +48,7 @@ def test_a_motion_s_distance_counts_both_covariances() -> None:
     rng = np.random.default_rng(2)
     robots = np.array([[0, 1], [1, 2]])
     relations = measured(robots, poses(2, rng), 3, rng)
-    found = placed(relations, np.arange(2))
+    found = optimize_poses(relations, np.arange(2))
     pair = np.array([[0, 2]])
     exact = found.relative(pair)
     # what both poses share, the first step of the chain, is no error between them
@@ -67,7 +67,7 @@ def test_robots_that_nothing_connects() -> None:
     rng = np.random.default_rng(3)
     relations = measured(np.array([[0, 1], [2, 3]]), poses(2, rng), 4, rng)
     with pytest.raises(ValueError, match="do not connect"):
-        placed(relations, np.arange(2))
+        optimize_poses(relations, np.arange(2))
 
 
 T = np.array([[1.0, -2.0, 0.7], [-3.0, 0.5, -2.5]])
@@ -100,7 +100,7 @@ def test_the_way_back() -> None:
 
 def test_one_after_the_other() -> None:
     first, second = Motions(T[:1], C[:1]), Motions(T[1:], C[1:])
-    both = first.then(second)
+    both = first.compose_independent(second)
     np.testing.assert_allclose(both.T, compose(T[:1], T[1:]))
     np.testing.assert_allclose(both.covariance[0], spread(compose, first, second), rtol=1e-6)
 
@@ -131,6 +131,6 @@ def test_a_bent_map_shifts_and_turns_as_a_whole() -> None:
 )
 def test_what_is_no_relation_is_refused(change: dict, told: str) -> None:
     good = {"robots": np.array([[0, 1]]), "T_a_b": T[:1], "covariance": C[:1]}
-    Relations(3, **good, log10_false_alarms=np.zeros(1))
+    AlignmentEdges(3, **good, log10_false_alarms=np.zeros(1))
     with pytest.raises(ValueError, match=told):
-        Relations(3, **(good | change), log10_false_alarms=np.zeros(1))
+        AlignmentEdges(3, **(good | change), log10_false_alarms=np.zeros(1))

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapfusion.fusion.pose_graph import Relations
+from mapfusion.fusion.pose_graph import AlignmentEdges
 from mapfusion.fusion.team_graph import (
+    EdgeStatus,
+    LoopSearch,
     LoopTest,
-    Place,
-    Team,
     TeamParameters,
     Unconfirmed,
+    resolve_alternatives,
     team_graph,
-    told_apart,
 )
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, compose
@@ -32,12 +32,12 @@ BOTH = [TeamParameters(each) for each in Unconfirmed]
 DROP, KEEP = (TeamParameters(each) for each in (Unconfirmed.DROP, Unconfirmed.KEEP))
 
 
-def true_of(robots: list[tuple[int, int]], true: Float, rng: np.random.Generator) -> Relations:
+def true_of(robots: list[tuple[int, int]], true: Float, rng: np.random.Generator) -> AlignmentEdges:
     pairs = np.array(robots).reshape(-1, 2)
     return measured(pairs, between(true[pairs[:, 0]], true[pairs[:, 1]]), len(true), rng)
 
 
-def wrong(robots: list[tuple[int, int]], n: int, rng: np.random.Generator) -> Relations:
+def wrong(robots: list[tuple[int, int]], n: int, rng: np.random.Generator) -> AlignmentEdges:
     pairs = np.array(robots).reshape(-1, 2)
     T = poses(len(pairs), rng) - [SIDE_M / 2, SIDE_M / 2, 0.0]
     return measured(pairs, T, n, rng)
@@ -49,9 +49,11 @@ def test_the_right_one_among_rivals_is_chosen(parameters: TeamParameters, seed: 
     rng = np.random.default_rng(seed)
     true = poses(3, rng)
     accepted = true_of([(0, 1), (1, 2)], true, rng)
-    alternatives = wrong([(2, 0)] * 2, 3, rng).joined(true_of([(0, 2)], true, rng))
+    alternatives = wrong([(2, 0)] * 2, 3, rng).concatenated(true_of([(0, 2)], true, rng))
     found = team_graph(accepted, parameters, None, alternatives)
-    assert found.place.tolist() == [Place.CONFIRMED] * 2 + [Place.REFUSED] * 2 + [Place.CONFIRMED]
+    assert found.edge_status.tolist() == [EdgeStatus.CONFIRMED] * 2 + [EdgeStatus.REFUSED] * 2 + [
+        EdgeStatus.CONFIRMED
+    ]
     assert found.component.tolist() == [0, 0, 0]
     assert len(falsely_placed(found, true)) == 0
 
@@ -71,10 +73,10 @@ def test_without_a_loop_of_accepted_ones_none_is_chosen(parameters: TeamParamete
     true = poses(3, rng)
     accepted, alternatives = true_of([(0, 1)], true, rng), true_of([(1, 2), (0, 2)], true, rng)
     found = team_graph(accepted, parameters, None, alternatives)
-    assert found.place[1:].tolist() == [Place.REFUSED] * 2
+    assert found.edge_status[1:].tolist() == [EdgeStatus.REFUSED] * 2
     assert found.component[2] != found.component[0]
     nothing = team_graph(accepted[np.arange(0)], parameters, None, alternatives)
-    assert nothing.place.tolist() == [Place.REFUSED] * 2
+    assert nothing.edge_status.tolist() == [EdgeStatus.REFUSED] * 2
 
 
 def test_of_two_that_close_the_loop_alike_none_is_chosen() -> None:
@@ -82,7 +84,7 @@ def test_of_two_that_close_the_loop_alike_none_is_chosen() -> None:
     true = poses(3, rng)
     accepted, alternatives = (true_of(e, true, rng) for e in ([(0, 1), (1, 2)], [(0, 2)] * 2))
     found = team_graph(accepted, KEEP, None, alternatives)
-    assert found.place[2:].tolist() == [Place.REFUSED] * 2
+    assert found.edge_status[2:].tolist() == [EdgeStatus.REFUSED] * 2
 
 
 def test_no_false_merge_in_many_teams() -> None:
@@ -99,14 +101,14 @@ def test_no_false_merge_in_many_teams() -> None:
         accepted = true_of(pairs[met].tolist(), true, rng)
         alternatives = wrong(np.repeat(pairs[~met], 3, axis=0).tolist(), 6, rng)
         right = true_of(pairs[~met][::2].tolist(), true, rng)
-        found = team_graph(accepted, KEEP, None, alternatives.joined(right))
+        found = team_graph(accepted, KEEP, None, alternatives.concatenated(right))
         n_wrong = len(accepted) + len(alternatives)
-        assert not np.any(found.place[len(accepted) : n_wrong] == Place.CONFIRMED), seed
+        assert not np.any(found.edge_status[len(accepted) : n_wrong] == EdgeStatus.CONFIRMED), seed
         assert len(falsely_placed(found, true)) == 0, seed
         linked = found.component[right.robots[:, 0]] == found.component[right.robots[:, 1]]
         n_right += np.count_nonzero(linked)
-        n_found += np.count_nonzero(found.place[n_wrong:] == Place.CONFIRMED)
-        dropped = team_graph(accepted, DROP, None, alternatives.joined(right))
+        n_found += np.count_nonzero(found.edge_status[n_wrong:] == EdgeStatus.CONFIRMED)
+        dropped = team_graph(accepted, DROP, None, alternatives.concatenated(right))
         assert len(falsely_placed(dropped, true)) == 0, seed
     assert n_found > 0.9 * n_right > 15
 
@@ -130,28 +132,30 @@ def test_chance_closes_a_loop_as_far_as_any_alignment_reaches(
     rival = np.array([-rival_m, 0.0, -2.0])
     covariance = np.diag([0.5, 0.5, 0.05]) ** 2
 
-    def relations(robots: list[tuple[int, int]], T: list[Float]) -> Relations:
+    def relations(robots: list[tuple[int, int]], T: list[Float]) -> AlignmentEdges:
         n = len(robots)
-        return Relations(
+        return AlignmentEdges(
             3, np.array(robots), np.array(T), np.tile(covariance, (n, 1, 1)), -np.ones(n)
         )
 
     accepted = relations([(0, 1), (1, 2)], [out, between(out, right)])
     alternatives = relations([(0, 2), (0, 2)], [rival, right])
     kept, component = np.ones(2, dtype=bool), np.zeros(3, dtype=np.int64)
-    found = told_apart(accepted, kept, component, alternatives, LoopTest())
+    found = resolve_alternatives(accepted, kept, component, alternatives, LoopTest())
     assert found.tolist() == ([1] if told else [])
 
 
 def test_chance_is_the_gate_s_share_of_all_motions() -> None:
-    rng, test, reach_m = np.random.default_rng(0), LoopTest(), 3.0
+    rng, test, max_distance_m = np.random.default_rng(0), LoopTest(), 3.0
     S = np.diag([0.2, 0.3, 0.1]) ** 2
     n = 400_000
-    drawn = rng.uniform([-reach_m, -reach_m, -np.pi], [reach_m, reach_m, np.pi], (n, 3))
-    drawn = drawn[np.hypot(drawn[:, 0], drawn[:, 1]) <= reach_m]
+    drawn = rng.uniform(
+        [-max_distance_m, -max_distance_m, -np.pi], [max_distance_m, max_distance_m, np.pi], (n, 3)
+    )
+    drawn = drawn[np.hypot(drawn[:, 0], drawn[:, 1]) <= max_distance_m]
     inside = np.mean(np.sum(drawn**2 / np.diag(S), axis=1) <= test.gate)
-    assert test.chance(S[None], reach_m)[0] == pytest.approx(inside, rel=0.05)
-    assert test.chance(1e6 * S[None], reach_m)[0] == 1.0
+    assert test.chance(S[None], max_distance_m)[0] == pytest.approx(inside, rel=0.05)
+    assert test.chance(1e6 * S[None], max_distance_m)[0] == 1.0
 
 
 @pytest.mark.parametrize("n", [3, 4, 6])
@@ -161,10 +165,10 @@ def test_a_ring_is_a_loop_of_all_its_robots(n: int) -> None:
     robots = np.stack([each, (each + 1) % n], axis=1)
     relations = measured(robots, between(true[robots[:, 0]], true[robots[:, 1]]), n, rng)
     everything = np.ones(n, dtype=bool)
-    (found,) = Team(relations, LoopTest()).readings(everything)
-    np.testing.assert_array_equal(found.which, each)
+    (found,) = LoopSearch(relations, LoopTest()).consistent_sets(everything)
+    np.testing.assert_array_equal(found.rows, each)
     relations.T_a_b[1] += 12 * SIGMA * np.sqrt(n)
-    assert Team(relations, LoopTest()).readings(everything) == []
+    assert LoopSearch(relations, LoopTest()).consistent_sets(everything) == []
 
 
 def test_what_chance_would_close_is_no_loop() -> None:
@@ -173,9 +177,9 @@ def test_what_chance_would_close_is_no_loop() -> None:
     true, robots = poses(3, rng), np.array([[0, 1], [1, 2], [0, 2]])
     relations = measured(robots, between(true[robots[:, 0]], true[robots[:, 1]]), 3, rng)
     everything = np.ones(3, dtype=bool)
-    assert len(Team(relations, LoopTest()).readings(everything)) == 1
+    assert len(LoopSearch(relations, LoopTest()).consistent_sets(everything)) == 1
     relations.covariance[:] = np.diag([5.0, 5.0, 1.0]) ** 2
-    assert Team(relations, LoopTest()).readings(everything) == []
+    assert LoopSearch(relations, LoopTest()).consistent_sets(everything) == []
 
 
 def test_the_gate_keeps_true_loops_with_its_probability() -> None:
@@ -196,11 +200,11 @@ def test_half_of_the_alignments_are_false(kind: str, seed: int) -> None:
     met = team(seed, kind, 8 if kind == "shifts" else 10)
     found = team_graph(met.relations, TEAM_GRAPH_DROP)
     assert len(falsely_placed(found, met.T_world_robot)) == 0
-    assert not np.any(met.false & (found.place == Place.CONFIRMED))
+    assert not np.any(met.false & (found.edge_status == EdgeStatus.CONFIRMED))
     if kind == "independent":
         placed = np.bincount(met.relations.robots[~met.false].ravel(), minlength=10) > 1
         np.testing.assert_array_equal(found.component[placed], 0)
-        assert np.all(found.place[met.false] == Place.CONTRADICTED)
+        assert np.all(found.edge_status[met.false] == EdgeStatus.CONTRADICTED)
 
 
 @pytest.mark.parametrize("parameters", [TEAM_GRAPH_DROP, TEAM_GRAPH_KEEP])
@@ -209,7 +213,7 @@ def test_the_order_changes_nothing_but_the_frame(kind: str, parameters: TeamPara
     met, rng = team(4, kind), np.random.default_rng(0)
     relations, new = met.relations, rng.permutation(10)  # robot i is called new[i]
     order = rng.permutation(len(relations))
-    other = Relations(
+    other = AlignmentEdges(
         10,
         new[relations.robots][order],
         relations.T_a_b[order],
@@ -217,7 +221,7 @@ def test_the_order_changes_nothing_but_the_frame(kind: str, parameters: TeamPara
         relations.log10_false_alarms[order],
     )
     one, two = team_graph(relations, parameters), team_graph(other, parameters)
-    np.testing.assert_array_equal(one.place[order], two.place)
+    np.testing.assert_array_equal(one.edge_status[order], two.edge_status)
     together = one.component[:, None] == one.component
     np.testing.assert_array_equal(together, (two.component[:, None] == two.component)[new][:, new])
     i, j = np.nonzero(together)
@@ -233,8 +237,8 @@ def test_an_alignment_that_no_loop_confirms() -> None:
     true, robots = poses(4, rng), np.array([[0, 1], [1, 2], [0, 2], [2, 3]])
     relations = measured(robots, between(true[robots[:, 0]], true[robots[:, 1]]), 4, rng)
     kept, dropped = team_graph(relations, TEAM_GRAPH_KEEP), team_graph(relations, TEAM_GRAPH_DROP)
-    assert kept.place.tolist() == [Place.CONFIRMED] * 3 + [Place.BRIDGE]
-    assert dropped.place.tolist() == [Place.CONFIRMED] * 3 + [Place.UNCONFIRMED]
+    assert kept.edge_status.tolist() == [EdgeStatus.CONFIRMED] * 3 + [EdgeStatus.BRIDGE]
+    assert dropped.edge_status.tolist() == [EdgeStatus.CONFIRMED] * 3 + [EdgeStatus.UNCONFIRMED]
     np.testing.assert_array_equal(kept.component, 0)
     np.testing.assert_array_equal(dropped.component, [0, 0, 0, 1])
     assert len(falsely_placed(kept, true)) == 0
@@ -247,7 +251,11 @@ def test_of_bridges_that_contradict_each_other_the_surest() -> None:
     relations = measured(all_pairs(3), poses(3, rng), 3, rng)  # a triangle that does not close
     sure = replace(relations, log10_false_alarms=np.array([-20.0, -6.0, -9.0]))
     found = team_graph(sure, TEAM_GRAPH_KEEP)
-    assert found.place.tolist() == [Place.BRIDGE, Place.CONTRADICTED, Place.BRIDGE]
+    assert found.edge_status.tolist() == [
+        EdgeStatus.BRIDGE,
+        EdgeStatus.CONTRADICTED,
+        EdgeStatus.BRIDGE,
+    ]
     np.testing.assert_array_equal(team_graph(sure, TEAM_GRAPH_DROP).component, [0, 1, 2])
 
 
@@ -263,9 +271,9 @@ def test_two_readings_of_one_cut_leave_both_sides_whole() -> None:
     relations = measured(robots, T, 8, rng)
     kept, dropped = team_graph(relations, TEAM_GRAPH_KEEP), team_graph(relations, TEAM_GRAPH_DROP)
     np.testing.assert_array_equal(kept.component, [0, 0, 0, 0, 1, 1, 1, 1])
-    assert np.all(kept.place[across] == Place.AMBIGUOUS)
-    assert np.all(kept.place[~across] == Place.CONFIRMED)
-    assert not np.any(dropped.place[across] == Place.CONFIRMED)
+    assert np.all(kept.edge_status[across] == EdgeStatus.AMBIGUOUS)
+    assert np.all(kept.edge_status[~across] == EdgeStatus.CONFIRMED)
+    assert not np.any(dropped.edge_status[across] == EdgeStatus.CONFIRMED)
     assert len(falsely_placed(dropped, true)) == 0
 
 
@@ -279,13 +287,13 @@ def test_a_small_reading_loses_or_warns() -> None:
     relations = measured(robots, T, 7, rng)
     kept, dropped = team_graph(relations, TEAM_GRAPH_KEEP), team_graph(relations, TEAM_GRAPH_DROP)
     np.testing.assert_array_equal(kept.component, 0)
-    assert np.all(kept.place[false] == Place.CONTRADICTED)
+    assert np.all(kept.edge_status[false] == EdgeStatus.CONTRADICTED)
     assert len(falsely_placed(kept, true)) == 0
     np.testing.assert_array_equal(dropped.component, [1, 2, 3, 0, 0, 0, 0])
 
 
 def test_no_alignments_at_all() -> None:
-    nothing = Relations(
+    nothing = AlignmentEdges(
         3, np.empty((0, 2), int), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0)
     )
     found = team_graph(nothing)

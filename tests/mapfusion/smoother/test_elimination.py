@@ -15,21 +15,21 @@ from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.robot_log import RobotLog
 from mapfusion.smoother.elimination import (
     Solution,
-    _landmarks_first,
-    _poses_first,
+    _eliminate_landmarks_first,
+    _eliminate_poses_first,
     shared_errors,
     solve_points,
 )
 from mapfusion.smoother.normal_equations import (
     Estimate,
+    InformationShares,
     NormalEquations,
-    Shares,
     Weights,
-    first_points,
+    initial_landmarks,
     normal_equations,
     odometry_information,
 )
-from mapfusion.smoother.problem import Sightings, sightings_of
+from mapfusion.smoother.problem import OrderedObservations, order_observations
 from tests.mapfusion.smoother.white_noise_logs import (
     NOISE,
     dead_reckoned,
@@ -38,30 +38,30 @@ from tests.mapfusion.smoother.white_noise_logs import (
 )
 
 STRAY_M = 0.05
-Eliminate = Callable[[Sightings, NormalEquations], Solution]
+Eliminate = Callable[[OrderedObservations, NormalEquations], Solution]
 
 
-def common_part(seen: Sightings, equations: NormalEquations, solution: Solution) -> Float:
+def common_part(obs: OrderedObservations, equations: NormalEquations, solution: Solution) -> Float:
     """(R, 3L) Y of what landmarks share, dense."""
-    errors = shared_errors(seen, equations, solution)
+    errors = shared_errors(obs, equations, solution)
     return errors.spread(np.eye(len(errors))).T
 
 
-def dense_residuals(log: RobotLog, seen: Sightings, weights: Weights, x: Float) -> Float:
+def dense_residuals(log: RobotLog, obs: OrderedObservations, weights: Weights, x: Float) -> Float:
     """All residuals over their sigmas, written down one by one; unknowns as in `dense_unknowns`."""
-    n, dimensions = 3 * (len(log) - 1), seen.n_dimensions
-    n_points, n_strays = dimensions * seen.n_landmarks, np.count_nonzero(seen.strays)
+    n, dimensions = 3 * (len(log) - 1), obs.n_dimensions
+    n_points, n_strays = dimensions * obs.n_landmarks, np.count_nonzero(obs.has_offset)
     path = np.concatenate([np.zeros((1, 3)), x[:n].reshape(-1, 3)])
     points = x[n : n + n_points].reshape(-1, dimensions)
-    offsets = np.zeros((len(seen.strays), dimensions))
-    offsets[seen.strays] = x[n + n_points :].reshape(n_strays, dimensions)
-    found = [(offsets * np.sqrt(weights.offset[:, None]))[seen.strays].ravel() / STRAY_M]
+    offsets = np.zeros((len(obs.has_offset), dimensions))
+    offsets[obs.has_offset] = x[n + n_points :].reshape(n_strays, dimensions)
+    found = [(offsets * np.sqrt(weights.offset[:, None]))[obs.has_offset].ravel() / STRAY_M]
     for k in range(1, len(log)):
         d = between(path[k - 1], path[k]) - log.odometry[k]
         d[2] = wrap(d[2])
         variance = NOISE.standard_deviations(log.odometry[k]) ** 2 + [1e-8, 1e-8, 1e-10]
         found.append(d / np.sqrt(variance))
-    rows = zip(seen.row, seen.landmark, seen.track, weights.observation, strict=True)
+    rows = zip(obs.row, obs.landmark, obs.track, weights.observation, strict=True)
     for row, landmark, track, weight in rows:
         pose = path[log.iteration[row]]
         at = points[landmark] + offsets[track]
@@ -72,10 +72,10 @@ def dense_residuals(log: RobotLog, seen: Sightings, weights: Weights, x: Float) 
     return np.concatenate(found)
 
 
-def dense_unknowns(seen: Sightings, at: Estimate) -> Float:
+def dense_unknowns(obs: OrderedObservations, at: Estimate) -> Float:
     """Poses but for the first, landmarks, and offsets of the tracks that stray."""
-    d = seen.n_dimensions
-    parts = (at.path[1:], at.point_m[:, :d], at.offset_m[seen.strays, :d])
+    d = obs.n_dimensions
+    parts = (at.path[1:], at.point_m[:, :d], at.offset_m[obs.has_offset, :d])
     return np.concatenate([part.ravel() for part in parts])
 
 
@@ -83,13 +83,13 @@ def some_twice(log: RobotLog) -> RobotLog:
     """Every third observation once more in its frame, by another track and somewhere else."""
     again = np.arange(0, len(log.iteration), 3)
     row = np.sort(np.concatenate([np.arange(len(log.iteration)), again]))
-    seen, second = log.observations[row], np.diff(row, prepend=-1) == 0
-    position = seen.position_m + 0.02 * second[:, None] * [1.0, 1.0, not log.planar]
-    track = seen.track
+    obs, second = log.observations[row], np.diff(row, prepend=-1) == 0
+    position = obs.position_m + 0.02 * second[:, None] * [1.0, 1.0, not log.planar]
+    track = obs.track
     if track is not None:
         track = np.where(second & (track >= 0), track.max() + 1, track).astype(np.int32)
-    seen = replace(seen, position_m=position, track=track)
-    return replace(log, iteration=log.iteration[row], observations=seen)
+    obs = replace(obs, position_m=position, track=track)
+    return replace(log, iteration=log.iteration[row], observations=obs)
 
 
 class Problem(NamedTuple):
@@ -98,14 +98,14 @@ class Problem(NamedTuple):
 
     Attributes:
         log: what was seen, some of it twice in a frame.
-        seen: the same by landmark.
+        obs: the same by landmark.
         weights: of observations and offsets.
         unknowns: (U,) as in `dense_unknowns`.
         covariance: (U, U) theirs.
     """
 
     log: RobotLog
-    seen: Sightings
+    obs: OrderedObservations
     weights: Weights
     unknowns: Float
     covariance: Float
@@ -118,37 +118,37 @@ def solved_densely(planar: bool, tracks: bool) -> Problem:
     known = white_noise_log(rng, 12, 16, planar)
     log = some_twice(with_tracks(known, rng, STRAY_M).log if tracks else known.log)
     assert log.observations.label is not None
-    seen = sightings_of(log, log.observations.label, 3, stray=True)
-    assert np.any(seen.strays) == tracks
-    n_tracks = len(seen.strays)
-    weights = Weights(rng.uniform(0.3, 1, len(seen)), rng.uniform(0.3, 1, n_tracks) * seen.strays)
-    start = Estimate(known.path, first_points(seen, known.path), np.zeros((n_tracks, 3)))
+    obs = order_observations(log, log.observations.label, 3, with_offsets=True)
+    assert np.any(obs.has_offset) == tracks
+    n_tracks = len(obs.has_offset)
+    weights = Weights(rng.uniform(0.3, 1, len(obs)), rng.uniform(0.3, 1, n_tracks) * obs.has_offset)
+    start = Estimate(known.path, initial_landmarks(obs, known.path), np.zeros((n_tracks, 3)))
     twin = least_squares(
-        lambda x: dense_residuals(log, seen, weights, x),
-        dense_unknowns(seen, start),
+        lambda x: dense_residuals(log, obs, weights, x),
+        dense_unknowns(obs, start),
         xtol=1e-14,
         ftol=1e-14,
         gtol=1e-14,
     )
-    return Problem(log, seen, weights, twin.x, np.linalg.inv(twin.jac.T @ twin.jac))
+    return Problem(log, obs, weights, twin.x, np.linalg.inv(twin.jac.T @ twin.jac))
 
 
-@pytest.mark.parametrize("eliminate", [_landmarks_first, _poses_first])
+@pytest.mark.parametrize("eliminate", [_eliminate_landmarks_first, _eliminate_poses_first])
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("tracks", [False, True])
 def test_equals_the_dense_twin(eliminate: Eliminate, planar: bool, tracks: bool) -> None:
     """Estimate and joint covariance."""
-    log, seen, weights, unknowns, covariance = solved_densely(planar, tracks)
-    d, n = seen.n_dimensions, 3 * (len(log) - 1)
+    log, obs, weights, unknowns, covariance = solved_densely(planar, tracks)
+    d, n = obs.n_dimensions, 3 * (len(log) - 1)
     path, information = dead_reckoned(log), odometry_information(log.odometry, NOISE)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    at = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
     for _ in range(12):
-        equations = normal_equations(seen, at, weights, STRAY_M**-2, log.odometry, information)
-        solution = eliminate(seen, equations)
+        equations = normal_equations(obs, at, weights, STRAY_M**-2, log.odometry, information)
+        solution = eliminate(obs, equations)
         at = Estimate(*(old + new for old, new in zip(at, solution.step, strict=True)))
-    np.testing.assert_allclose(dense_unknowns(seen, at), unknowns, atol=1e-6)
-    assert solution.moved < 1e-12
-    joint = dense_covariance(common_part(seen, equations, solution), solution.own_m2, d)
+    np.testing.assert_allclose(dense_unknowns(obs, at), unknowns, atol=1e-6)
+    assert solution.squared_step < 1e-12
+    joint = dense_covariance(common_part(obs, equations, solution), solution.own_m2, d)
     own = covariance[n:, n:][: len(joint), : len(joint)]
     np.testing.assert_allclose(joint, own, rtol=1e-3, atol=1e-4 * joint.max())
 
@@ -157,22 +157,22 @@ def dense_covariance(common: Float, own_m2: Float, d: int) -> Float:
     """(dL, dL) joint covariance of landmarks in d dimensions."""
     joint, each = common.T @ common, np.arange(len(own_m2))
     joint.reshape(len(own_m2), 3, len(own_m2), 3)[each, :, each, :] += own_m2
-    kept = (3 * each[:, None] + np.arange(d)).ravel()
-    return joint[np.ix_(kept, kept)]
+    point_by_landmark = (3 * each[:, None] + np.arange(d)).ravel()
+    return joint[np.ix_(point_by_landmark, point_by_landmark)]
 
 
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("tracks", [False, True])
 def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks: bool) -> None:
     """What is asked of Y without it, against Y as landmarks' covariances say that it is."""
-    log, seen, weights, _, _ = solved_densely(planar, tracks)
+    log, obs, weights, _, _ = solved_densely(planar, tracks)
     information = odometry_information(log.odometry, NOISE)
     path = dead_reckoned(log)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    equations = normal_equations(seen, at, weights, STRAY_M**-2, log.odometry, information)
-    solution = _landmarks_first(seen, equations)
-    errors = shared_errors(seen, equations, solution)
-    Y = common_part(seen, equations, solution)
+    at = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
+    equations = normal_equations(obs, at, weights, STRAY_M**-2, log.odometry, information)
+    solution = _eliminate_landmarks_first(obs, equations)
+    errors = shared_errors(obs, equations, solution)
+    Y = common_part(obs, equations, solution)
     n = 3 * (len(log) - 1)
     assert len(errors) == len(Y) == n
     gram = Y @ Y.T
@@ -192,24 +192,24 @@ def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks
 
 @pytest.mark.parametrize("planar", [False, True])
 def test_points_on_a_path_that_stays_equal_the_dense_twin(planar: bool) -> None:
-    log, seen, weights, _, _ = solved_densely(planar, tracks=True)
-    path, d = dead_reckoned(log), seen.n_dimensions
-    at = Estimate(path, first_points(seen, path), np.full((len(seen.strays), 3), 0.01))
-    at.offset_m[~seen.strays] = at.offset_m[:, d:] = 0.0
-    step, known = solve_points(seen, at, weights, STRAY_M**-2)
-    n, x = 3 * (len(log) - 1), dense_unknowns(seen, at)
+    log, obs, weights, _, _ = solved_densely(planar, tracks=True)
+    path, d = dead_reckoned(log), obs.n_dimensions
+    at = Estimate(path, initial_landmarks(obs, path), np.full((len(obs.has_offset), 3), 0.01))
+    at.offset_m[~obs.has_offset] = at.offset_m[:, d:] = 0.0
+    step, known = solve_points(obs, at, weights, STRAY_M**-2)
+    n, x = 3 * (len(log) - 1), dense_unknowns(obs, at)
 
     def residuals(points: Float) -> Float:
-        return dense_residuals(log, seen, weights, np.concatenate([x[:n], points]))
+        return dense_residuals(log, obs, weights, np.concatenate([x[:n], points]))
 
     twin = least_squares(residuals, x[n:], xtol=1e-14, ftol=1e-14, gtol=1e-14)
     moved = Estimate(path, at.point_m + step.point_m, at.offset_m + step.offset_m)
-    np.testing.assert_allclose(dense_unknowns(seen, moved)[n:], twin.x, atol=1e-8)
+    np.testing.assert_allclose(dense_unknowns(obs, moved)[n:], twin.x, atol=1e-8)
     assert not step.path.any()
     covariance = np.linalg.inv(twin.jac.T @ twin.jac)
-    n_points, strays = d * seen.n_landmarks, np.flatnonzero(seen.strays)
-    for k, track in enumerate(strays):
-        own = d * seen.landmark_of_track[track] + np.arange(d)
+    n_points, has_offset = d * obs.n_landmarks, np.flatnonzero(obs.has_offset)
+    for k, track in enumerate(has_offset):
+        own = d * obs.landmark_of_track[track] + np.arange(d)
         its = n_points + d * k + np.arange(d)
         of_offset = covariance[np.ix_(its, its)]
         both = covariance[np.ix_(own, own)] + of_offset
@@ -220,14 +220,14 @@ def test_points_on_a_path_that_stays_equal_the_dense_twin(planar: bool) -> None:
 
 def test_shares_are_of_the_matrix_alone() -> None:
     """As if all weights were less, but for the gradient."""
-    log, seen, weights, _, _ = solved_densely(planar=False, tracks=True)
+    log, obs, weights, _, _ = solved_densely(planar=False, tracks=True)
     path, information = dead_reckoned(log), odometry_information(log.odometry, NOISE)
-    at = Estimate(path, first_points(seen, path), np.full((len(seen.strays), 3), 0.01))
+    at = Estimate(path, initial_landmarks(obs, path), np.full((len(obs.has_offset), 3), 0.01))
     given = STRAY_M**-2, log.odometry, information
     less = Weights(0.8 * weights.observation, 0.6 * weights.offset)
-    shared = normal_equations(seen, at, weights, *given, Shares(0.8, 0.6))
-    whole = normal_equations(seen, at, weights, *given)
-    scaled = normal_equations(seen, at, less, *given)
+    shared = normal_equations(obs, at, weights, *given, InformationShares(0.8, 0.6))
+    whole = normal_equations(obs, at, weights, *given)
+    scaled = normal_equations(obs, at, less, *given)
     for name in ("pose_block", "link", "coupling"):
         np.testing.assert_allclose(getattr(shared, name), getattr(scaled, name), rtol=1e-12)
     for name in ("track_block", "offset_information"):

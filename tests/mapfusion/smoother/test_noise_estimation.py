@@ -14,22 +14,22 @@ from mapfusion.smoother.elimination import pose_covariances, solve_points
 from mapfusion.smoother.noise_estimation import (
     _LEAST_M,
     LEAST_DISTURBANCES,
-    Levels,
-    Untold,
-    settled_with_levels,
+    NoiseScales,
+    PosteriorShares,
+    optimize_with_noise,
 )
 from mapfusion.smoother.normal_equations import (
     Estimate,
-    first_points,
-    information_under,
-    least_levels,
+    expected_point_squares,
+    initial_landmarks,
     odometry_information,
+    scaled_information,
+    smallest_scales,
     squared_distances,
-    squares_of_points,
 )
-from mapfusion.smoother.optimizer import Problem, Settled, followed
-from mapfusion.smoother.problem import sightings_of
-from mapfusion.smoother.robust_loss import NO_TAILS, fitted_dof, student_weights, unweighted
+from mapfusion.smoother.optimizer import OptimizerState, Problem, update_points_and_weights
+from mapfusion.smoother.problem import order_observations
+from mapfusion.smoother.robust_loss import GAUSSIAN_TAILS, fit_dof, student_weights, unit_weights
 from tests.mapfusion.smoother.white_noise_logs import (
     NOISE,
     Known,
@@ -42,14 +42,16 @@ from tests.mapfusion.smoother.white_noise_logs import (
 STRAY_M = 0.05
 
 
-def settled_from(log: RobotLog, path: Float, stray_m: float = STRAY_M) -> tuple[Settled, Levels]:
+def settled_from(
+    log: RobotLog, path: Float, stray_m: float = STRAY_M
+) -> tuple[OptimizerState, NoiseScales]:
     label = log.observations.label
     assert label is not None
-    seen = sightings_of(log, label, 1, stray=True)
+    obs = order_observations(log, label, 1, with_offsets=True)
     information = odometry_information(log.odometry, NOISE)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    problem = Problem(seen, log.odometry, information, stray_m**-2)
-    return settled_with_levels(problem, at)
+    at = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
+    problem = Problem(obs, log.odometry, information, stray_m**-2)
+    return optimize_with_noise(problem, at)
 
 
 def level_of(log: RobotLog, stray_m: float = STRAY_M) -> float:
@@ -58,8 +60,8 @@ def level_of(log: RobotLog, stray_m: float = STRAY_M) -> float:
 
 def stated(log: RobotLog, factor: float) -> RobotLog:
     """The log with covariances that are so many times the true ones."""
-    seen = log.observations
-    return replace(log, observations=replace(seen, covariance_m2=factor * seen.covariance_m2))
+    obs = log.observations
+    return replace(log, observations=replace(obs, covariance_m2=factor * obs.covariance_m2))
 
 
 def tracked_log(seed: int) -> RobotLog:
@@ -95,16 +97,16 @@ def test_gross_observations_are_not_in_it() -> None:
 
 def test_without_tracks_what_is_stated_holds() -> None:
     log = stated(tracked_log(3), 4.0)
-    seen = replace(log.observations, track=None)
-    assert level_of(replace(log, observations=seen)) == 1.0
+    obs = replace(log.observations, track=None)
+    assert level_of(replace(log, observations=obs)) == 1.0
 
 
 def test_a_log_that_tells_nothing_stays_as_stated() -> None:
     """Each track is of one observation: nothing is there to differ along it."""
     log = stated(tracked_log(4), 4.0)
     alone = np.arange(len(log.observations), dtype=np.int32)
-    seen = replace(log.observations, track=alone, label=alone)
-    assert level_of(replace(log, observations=seen)) == 1.0
+    obs = replace(log.observations, track=alone, label=alone)
+    assert level_of(replace(log, observations=obs)) == 1.0
 
 
 def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,7 +121,7 @@ def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.undo()
     again, told_again = settled_from(log, end.estimate.path)
     frames = np.arange(1, len(log))
-    covariance = pose_covariances(end.seen, end.equations, end.solution, frames)
+    covariance = pose_covariances(end.obs, end.equations, end.solution, frames)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     for each, its in ((found, told), (again, told_again)):
         assert its.observation == pytest.approx(at_end.observation, rel=3e-3)
@@ -135,13 +137,13 @@ def test_the_level_is_known_before_the_first_step(factor: float) -> None:
     log = stated(tracked_log(0), factor)
     end, _ = settled_from(log, dead_reckoned(log))
     problem = Problem(
-        sightings_of(log, log.observations.label, 1, stray=True),
+        order_observations(log, log.observations.label, 1, with_offsets=True),
         log.odometry,
         odometry_information(log.odometry, NOISE),
         STRAY_M**-2,
     )
-    at, weights, tails = followed(problem, end.estimate)
-    first = noise_estimation.first_observation_level(problem, at, weights, tails)
+    at, weights, tails = update_points_and_weights(problem, end.estimate)
+    first = noise_estimation.initial_observation_scale(problem, at, weights, tails)
     assert first * factor == pytest.approx(1, abs=0.15)
 
 
@@ -154,19 +156,19 @@ def test_what_weights_leave_of_a_track_tells_its_point() -> None:
     log = tracked_log(5)
     label, loose_m = log.observations.label, 1e4
     assert label is not None
-    seen = sightings_of(log, label, 1, stray=True)
-    problem = Problem(seen, log.odometry, odometry_information(log.odometry, NOISE), loose_m**-2)
+    obs = order_observations(log, label, 1, with_offsets=True)
+    problem = Problem(obs, log.odometry, odometry_information(log.odometry, NOISE), loose_m**-2)
     path = dead_reckoned(log)
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    weights = unweighted(seen)
+    at = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
+    weights = unit_weights(obs)
     weights.observation[::2] = 0.1
-    found = noise_estimation.first_observation_level(problem, at, weights, NO_TAILS)
-    rows = seen.strays[seen.track]
-    known = seen.n_dimensions * (rows.sum() - seen.strays.sum())
-    _, points = solve_points(seen, at, weights, problem.stray_information)
-    square = squared_distances(seen, at)[rows]
-    beside = square + squares_of_points(seen, path, points.track_m2)[rows]
-    own = student_weights(beside, fitted_dof(beside, seen.n_dimensions), seen.n_dimensions)
+    found = noise_estimation.initial_observation_scale(problem, at, weights, GAUSSIAN_TAILS)
+    rows = obs.has_offset[obs.track]
+    known = obs.n_dimensions * (rows.sum() - obs.has_offset.sum())
+    _, points = solve_points(obs, at, weights, problem.offset_prior)
+    square = squared_distances(obs, at)[rows]
+    beside = square + expected_point_squares(obs, path, points.track_m2)[rows]
+    own = student_weights(beside, fit_dof(beside, obs.n_dimensions), obs.n_dimensions)
     assert found == pytest.approx(np.sum(own * square) / known, rel=1e-3)
 
 
@@ -180,8 +182,8 @@ def test_observations_without_noise_have_a_level_that_is_not_zero() -> None:
     exact = known.point_m[log.observations.label]
     exact[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), exact[:, :2] - pose[:, :2])
     one = np.tile(0.01**2 * np.eye(3), (len(exact), 1, 1))
-    seen = replace(log.observations, position_m=exact, covariance_m2=one)
-    end, told = settled_from(replace(log, observations=seen), known.path)
+    obs = replace(log.observations, position_m=exact, covariance_m2=one)
+    end, told = settled_from(replace(log, observations=obs), known.path)
     assert told.observation == pytest.approx((_LEAST_M / 0.01) ** 2)
     assert np.isfinite(end.solution.own_m2).all()
 
@@ -192,22 +194,22 @@ STATED = np.array([3.0, 3.0, 0.5])  # how far stated deviations are from the tru
 
 def seen_well(known: Known, rng: np.random.Generator) -> RobotLog:
     """The log with observations that err by `SEEN_M`."""
-    log, seen = known.log, known.log.observations
-    assert seen.label is not None
-    pose, at = known.path[log.iteration], known.point_m[seen.label].copy()
+    log, obs = known.log, known.log.observations
+    assert obs.label is not None
+    pose, at = known.path[log.iteration], known.point_m[obs.label].copy()
     at[:, :2] = np.einsum("nji,nj->ni", rotation(pose[:, 2]), at[:, :2] - pose[:, :2])
     position = at + SEEN_M * rng.standard_normal(at.shape)
     covariance = np.tile(SEEN_M**2 * np.eye(3), (len(at), 1, 1))
-    return replace(log, observations=replace(seen, position_m=position, covariance_m2=covariance))
+    return replace(log, observations=replace(obs, position_m=position, covariance_m2=covariance))
 
 
 def levels_of(log: RobotLog) -> Float:
     label, path = log.observations.label, dead_reckoned(log)
     assert label is not None
-    seen = sightings_of(log, label, 1, stray=False)
+    obs = order_observations(log, label, 1, with_offsets=False)
     information = odometry_information(log.odometry, NOISE) / STATED**2
-    at = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    return settled_with_levels(Problem(seen, log.odometry, information, 0), at)[1].odometry
+    at = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
+    return optimize_with_noise(Problem(obs, log.odometry, information, 0), at)[1].odometry
 
 
 def test_levels_are_those_of_the_noise() -> None:
@@ -237,8 +239,8 @@ def told_by_themselves(
     J = rng.uniform(0.3, 3, (n, 3)) / stated
     measured = rng.standard_normal((n, 3)) * np.sqrt(level * stated + 1 / J)
     log = replace(white_noise_log(rng, n + 1, 1).log, odometry=odometry)
-    seen = sightings_of(log, np.full(len(log.observations), -1), 1, stray=False)
-    return Problem(seen, odometry, 1 / stated, 0), measured, J
+    obs = order_observations(log, np.full(len(log.observations), -1), 1, with_offsets=False)
+    return Problem(obs, odometry, 1 / stated, 0), measured, J
 
 
 def path_of(odometry: Float, disturbance: Float) -> Float:
@@ -253,12 +255,12 @@ def test_levels_that_follow_steps_end_where_they_are_likeliest() -> None:
     rng, true = np.random.default_rng(0), np.array([0.3, 1.0, 3.0])
     problem, measured, J = told_by_themselves(rng, true, 600)
     v, first = 1 / problem.information, np.array([1.0, 0.5, 1.5])
-    untold = Untold(1 / (1 + J * v * first), first)
+    untold = PosteriorShares(1 / (1 + J * v * first), first)
     levels = first
     for _ in range(100):
         found = measured * (levels * v) / (levels * v + 1 / J)  # means under these levels
         path = path_of(problem.odometry, found)
-        levels = untold.told_levels(problem, path, levels)
+        levels = untold.estimate_scales(problem, path, levels)
 
     def deviance(log_level: float, axis: int) -> float:
         variance = np.exp(log_level) * v[:, axis] + 1 / J[:, axis]
@@ -281,8 +283,8 @@ def test_disturbances_that_are_missing_count_as_stated() -> None:
     disturbance = measured.copy()
     disturbance[:, 1] = np.sqrt(3 / 60 / problem.information[:, 1])  # one disturbance at level 3
     path = path_of(problem.odometry, disturbance)
-    untold = Untold(share, np.ones(3))
-    levels = untold.told_levels(problem, path, np.ones(3))
+    untold = PosteriorShares(share, np.ones(3))
+    levels = untold.estimate_scales(problem, path, np.ones(3))
     told = untold.known(levels)[1]
     assert levels[1] == pytest.approx(
         (3 * told + (LEAST_DISTURBANCES - told)) / LEAST_DISTURBANCES, rel=1e-4
@@ -297,9 +299,9 @@ def test_exact_odometry_ends_where_its_noise_could_still_be_told(n: int) -> None
     problem, _, J = told_by_themselves(np.random.default_rng(2), np.ones(3), n)
     v, levels = 1 / problem.information, np.ones(3)
     path = path_of(problem.odometry, np.zeros((n, 3)))
-    untold = Untold(1 / (1 + J * v), levels)
+    untold = PosteriorShares(1 / (1 + J * v), levels)
     for _ in range(50):
-        levels = untold.told_levels(problem, path, levels)
+        levels = untold.estimate_scales(problem, path, levels)
     known = np.sum(1 - 1 / (1 + J * v * levels), axis=0)
     np.testing.assert_allclose(known, LEAST_DISTURBANCES * (1 - levels), rtol=1e-3)
     assert np.all(levels < 12 / n)
@@ -309,10 +311,10 @@ def test_what_holds_a_robot_is_no_noise_that_a_level_scales() -> None:
     """Where wheels stand still the information is bounded under any level."""
     odometry = np.array([[0, 0, 0], [0.1, 0, 0.1], [0, 0, 0]])
     stated = odometry_information(odometry, NOISE)
-    under = information_under(stated, np.full(3, 0.01))
+    under = scaled_information(stated, np.full(3, 0.01))
     np.testing.assert_allclose(under[0], 100 * stated[0])
     np.testing.assert_allclose(under[1], stated[1])
-    np.testing.assert_allclose(information_under(stated, np.full(3, 4.0)), stated / 4)
-    least = least_levels(stated)
-    np.testing.assert_allclose(information_under(stated, least), np.tile(stated[1], (2, 1)))
-    np.testing.assert_allclose(information_under(stated, 2 * least)[0], stated[1] / 2)
+    np.testing.assert_allclose(scaled_information(stated, np.full(3, 4.0)), stated / 4)
+    least = smallest_scales(stated)
+    np.testing.assert_allclose(scaled_information(stated, least), np.tile(stated[1], (2, 1)))
+    np.testing.assert_allclose(scaled_information(stated, 2 * least)[0], stated[1] / 2)

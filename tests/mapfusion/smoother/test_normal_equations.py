@@ -6,11 +6,11 @@ import pytest
 from mapfusion.geometry.se2 import rotation
 from mapfusion.smoother.normal_equations import (
     Estimate,
-    first_points,
+    expected_point_squares,
+    initial_landmarks,
     squared_distances,
-    squares_of_points,
 )
-from mapfusion.smoother.problem import sightings_of
+from mapfusion.smoother.problem import order_observations
 from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_tracks
 
 
@@ -22,22 +22,24 @@ def test_squares_are_those_of_the_rotated_residuals(planar: bool, about_true_poi
     known = with_tracks(white_noise_log(rng, 30, 20, planar), rng, 0.05)
     log, label = known.log, known.log.observations.label
     assert label is not None
-    seen = sightings_of(log, label, 3, stray=True)
-    n_tracks = len(seen.strays)
-    at = Estimate(known.path, first_points(seen, known.path), rng.normal(0, 0.05, (n_tracks, 3)))
+    obs = order_observations(log, label, 3, with_offsets=True)
+    n_tracks = len(obs.has_offset)
+    at = Estimate(
+        known.path, initial_landmarks(obs, known.path), rng.normal(0, 0.05, (n_tracks, 3))
+    )
     root = rng.normal(0, 0.03, (n_tracks, 3, 3))
     covariance = root @ np.swapaxes(root, 1, 2) if about_true_points else None
-    found = squared_distances(seen, at)
+    found = squared_distances(obs, at)
     if covariance is not None:
-        found = found + squares_of_points(seen, at.path, covariance)
-    for i in range(len(seen)):
-        t = seen.track[i]
-        R = rotation(at.path[seen.frame[i], 2])
+        found = found + expected_point_squares(obs, at.path, covariance)
+    for i in range(len(obs)):
+        t = obs.track[i]
+        R = rotation(at.path[obs.frame[i], 2])
         turn = np.eye(3)
         turn[:2, :2] = R
-        W = turn @ seen.information[i] @ turn.T
-        place = np.append(at.path[seen.frame[i], :2], 0.0)
-        e = at.point_m[seen.landmark[i]] + at.offset_m[t] - place - turn @ seen.position_m[i]
+        W = turn @ obs.information[i] @ turn.T
+        place = np.append(at.path[obs.frame[i], :2], 0.0)
+        e = at.point_m[obs.landmark[i]] + at.offset_m[t] - place - turn @ obs.position_m[i]
         expected = e @ W @ e
         if covariance is not None:
             expected += np.trace(W @ covariance[t])

@@ -12,20 +12,20 @@ from mapfusion.geometry.se2 import compose, rotation
 from mapfusion.robot_log import Observations, RobotLog
 from mapfusion.smoother.elimination import pose_point_blocks
 from mapfusion.smoother.noise_estimation import (
-    LEVELS,
+    NOISE_PARAMETERS,
     MotionPosterior,
-    Told,
+    NoiseStatistics,
     disturbance_variances,
     motion_posterior,
-    pooled,
+    noise_statistics,
     relative_errors,
-    told,
-    updated,
+    sum_statistics,
+    update_noise,
 )
 from mapfusion.smoother.normal_equations import (
     Estimate,
     disturbance_jacobians,
-    first_points,
+    initial_landmarks,
     odometry_information,
 )
 from mapfusion.smoother.odometry_calibration import (
@@ -33,10 +33,10 @@ from mapfusion.smoother.odometry_calibration import (
     Calibration,
     OdometryError,
     calibrate,
-    sensitivity,
+    increment_jacobians,
 )
-from mapfusion.smoother.optimizer import Problem, settled
-from mapfusion.smoother.problem import sightings_of
+from mapfusion.smoother.optimizer import Problem, optimize
+from mapfusion.smoother.problem import order_observations
 from mapfusion.smoother.smooth import SmootherParameters
 from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log
 
@@ -60,12 +60,12 @@ def planar_log(rng: np.random.Generator, n_frames: int = 400) -> RobotLog:
         local = (point - path[k, :2]) @ rotation(path[k, 2])
         for label in rng.permutation(np.flatnonzero(np.hypot(*local.T) < RANGE_M))[:3]:
             rows.append((k, label, *(local[label] + OBSERVED_M * rng.standard_normal(2))))
-    seen = np.array(rows)
-    position = np.column_stack([seen[:, 2:], np.zeros(len(seen))])
-    covariance = np.tile(OBSERVED_M**2 * np.eye(3), (len(seen), 1, 1))
-    observations = Observations(position, covariance, None, seen[:, 1].astype(np.int32))
+    obs = np.array(rows)
+    position = np.column_stack([obs[:, 2:], np.zeros(len(obs))])
+    covariance = np.tile(OBSERVED_M**2 * np.eye(3), (len(obs), 1, 1))
+    observations = Observations(position, covariance, None, obs[:, 1].astype(np.int32))
     time_s = np.arange(n_frames, dtype=np.float64)
-    return RobotLog("R1", True, time_s, odometry, seen[:, 0].astype(np.int64), observations)
+    return RobotLog("R1", True, time_s, odometry, obs[:, 0].astype(np.int64), observations)
 
 
 def calibrated(*logs: RobotLog) -> Calibration:
@@ -80,8 +80,8 @@ def test_constants_and_levels_are_found_within_their_errors() -> None:
     for seed in range(4):
         found = calibrated(*(planar_log(np.random.default_rng([seed, k]), 250) for k in range(2)))
         z += [(each.error.constants - TRUE) / each.standard_errors for each in found.robots]
-        true = [getattr(NOISE, name) for name in LEVELS]
-        got = np.array([getattr(found.motion, name) for name in LEVELS])
+        true = [getattr(NOISE, name) for name in NOISE_PARAMETERS]
+        got = np.array([getattr(found.motion, name) for name in NOISE_PARAMETERS])
         levels.append(np.log(got / true) / found.relative_errors)
         assert all(np.all(each.standard_errors < 0.05) for each in found.robots)
     assert 0.4 < np.mean(np.square(z)) < 1.8  # 40 values: 99.9 %
@@ -143,12 +143,12 @@ def spinning_log(rng: np.random.Generator, in_place: float) -> RobotLog:
             local = (point - path[k, :2]) @ rotation(path[k, 2])
             nearest = np.argmin(np.hypot(*local.T))
             rows.append((k, nearest, *(local[nearest] + OBSERVED_M * rng.standard_normal(2))))
-    seen = np.array(rows)
-    position = np.column_stack([seen[:, 2:], np.zeros(len(seen))])
-    covariance = np.tile(OBSERVED_M**2 * np.eye(3), (len(seen), 1, 1))
-    observations = Observations(position, covariance, None, seen[:, 1].astype(np.int32))
+    obs = np.array(rows)
+    position = np.column_stack([obs[:, 2:], np.zeros(len(obs))])
+    covariance = np.tile(OBSERVED_M**2 * np.eye(3), (len(obs), 1, 1))
+    observations = Observations(position, covariance, None, obs[:, 1].astype(np.int32))
     time_s = np.arange(n_frames, dtype=np.float64)
-    return RobotLog("R1", True, time_s, odometry, seen[:, 0].astype(np.int64), observations)
+    return RobotLog("R1", True, time_s, odometry, obs[:, 0].astype(np.int64), observations)
 
 
 @pytest.mark.parametrize(("in_place", "seed"), [(0.4, 0), (-0.4, 2), (-0.5, 0), (-0.5, 1)])
@@ -165,15 +165,15 @@ def test_the_posterior_equals_dense_algebra(n_frames: int, n_landmarks: int) -> 
     log = white_noise_log(np.random.default_rng(2), n_frames, n_landmarks, planar=True).log
     label = log.observations.label
     assert label is not None
-    seen = sightings_of(log, label, 1, stray=False)
+    obs = order_observations(log, label, 1, with_offsets=False)
     information = odometry_information(log.odometry, MotionNoise())
     path = dead_reckoned(log)
-    start = Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
-    end = settled(Problem(seen, log.odometry, information, 0.0), start)
-    by = sensitivity(log.odometry)[1:]
+    start = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
+    end = optimize(Problem(obs, log.odometry, information, 0.0), start)
+    by = increment_jacobians(log.odometry)[1:]
     found = motion_posterior(end, log.odometry, information, by)
 
-    n, (B, K, _) = len(log) - 1, pose_point_blocks(seen, end.equations)
+    n, (B, K, _) = len(log) - 1, pose_point_blocks(obs, end.equations)
     before, after = disturbance_jacobians(end.estimate.path)
     D = np.zeros((n, 3, n, 3))
     for k in range(n):
@@ -208,7 +208,7 @@ def test_what_is_told_of_levels_is_the_curvature_of_their_likelihood() -> None:
     """The expected information equals second differences of the expected cost."""
     rng = np.random.default_rng(8)
     odometry = rng.normal(0, [0.2, 0.05, 0.3], (30, 3))
-    levels = np.array([getattr(NOISE, name) for name in LEVELS])
+    levels = np.array([getattr(NOISE, name) for name in NOISE_PARAMETERS])
 
     def variances(logs: Float) -> Float:
         way, walk, turn = np.exp(logs)
@@ -230,24 +230,24 @@ def test_what_is_told_of_levels_is_the_curvature_of_their_likelihood() -> None:
         ]
         for h in step
     ]
-    seen = MotionPosterior(np.zeros((29, 3)), np.zeros((29, 3)), np.zeros((0, 0)), np.zeros(0))
-    found = told(seen, odometry, 1 / true, NOISE)
+    obs = MotionPosterior(np.zeros((29, 3)), np.zeros((29, 3)), np.zeros((0, 0)), np.zeros(0))
+    found = noise_statistics(obs, odometry, 1 / true, NOISE)
     np.testing.assert_allclose(found.information, expected, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose([found.known[0], found.known[1:].sum()], [58, 29])
+    np.testing.assert_allclose([found.determined[0], found.determined[1:].sum()], [58, 29])
 
 
 def test_a_round_multiplies_the_squares_of_levels_by_what_was_found_over_what_is_told() -> None:
     """The lateral level follows the one along the way; a level that nothing tells stays."""
-    of_all = Told(np.array([20.0, 2.5, 9.0]), np.array([10.0, 10.0, 1.0]), np.eye(3))
-    made = updated(NOISE, of_all)
-    found = [getattr(made, name) for name in (*LEVELS, "lateral_m_per_sqrt_m")]
+    statistics = NoiseStatistics(np.array([20.0, 2.5, 9.0]), np.array([10.0, 10.0, 1.0]), np.eye(3))
+    made = update_noise(NOISE, statistics)
+    found = [getattr(made, name) for name in (*NOISE_PARAMETERS, "lateral_m_per_sqrt_m")]
     way = NOISE.translation_m_per_sqrt_m * np.sqrt(2)
     expected = [way, NOISE.rotation_rad_per_sqrt_m / 2, NOISE.rotation_rad_per_sqrt_rad, way]
     assert found == pytest.approx(expected)
 
 
 def test_two_logs_tell_what_both_tell() -> None:
-    each = [Told(np.full(3, n), np.full(3, 2 * n), n * np.eye(3)) for n in (3.0, 5.0)]
-    both = pooled(each)
-    assert (both.found.tolist(), both.known.tolist()) == ([8.0] * 3, [16.0] * 3)
+    each = [NoiseStatistics(np.full(3, n), np.full(3, 2 * n), n * np.eye(3)) for n in (3.0, 5.0)]
+    both = sum_statistics(each)
+    assert (both.squares.tolist(), both.determined.tolist()) == ([8.0] * 3, [16.0] * 3)
     assert relative_errors(both) == pytest.approx(np.full(3, 1 / 3))  # and 1 was known before

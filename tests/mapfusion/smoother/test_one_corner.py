@@ -10,8 +10,8 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import rotation
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.smoother import smooth
-from mapfusion.smoother.problem import sightings_of
-from mapfusion.smoother.smooth import parted
+from mapfusion.smoother.problem import order_observations
+from mapfusion.smoother.smooth import split_landmarks
 
 STRAY_M, SIGMA_M, N_SEEN = 0.002, 0.001, 4
 
@@ -50,7 +50,9 @@ def test_two_tracks_of_a_corner_are_parted_as_seldom_as_said(planar: bool) -> No
     path = path_of(rng)
     log = seen_tracks(rng, point, path, planar)
     landmark = log.observations.track // 2
-    made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
+    made = split_landmarks(
+        order_observations(log, landmark, 1, with_offsets=True), landmark, path, STRAY_M
+    )
     n_parted = len(np.unique(landmark[made != landmark]))
     expected = 0.001 * n
     assert abs(n_parted - expected) < 4 * np.sqrt(expected)
@@ -73,7 +75,9 @@ def test_neighbours_are_parted_and_the_one_named_keeps_the_name(by_row: bool) ->
     first = np.array([row[own == k].min() for k in range(n_landmarks)])
     # numbered after its first observation, or by what is no observation of its own
     landmark = first[own] if by_row else own + len(own)
-    made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
+    made = split_landmarks(
+        order_observations(log, landmark, 1, with_offsets=True), landmark, path, STRAY_M
+    )
     is_of = which[log.observations.track % len(which)]
     keeps = 2 if by_row else 1
     np.testing.assert_array_equal(made == landmark, is_of == keeps)
@@ -91,7 +95,9 @@ def test_a_name_that_is_taken_is_not_given() -> None:
     log = seen_tracks(rng, point, path)
     track = log.observations.track
     landmark = np.where(track == 3, 2, 0)  # row 2 is the third track's first
-    made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
+    made = split_landmarks(
+        order_observations(log, landmark, 1, with_offsets=True), landmark, path, STRAY_M
+    )
     np.testing.assert_array_equal(made, np.array([0, 0, 6, 2])[track])
 
 
@@ -103,7 +109,9 @@ def test_it_takes_the_corners_that_a_slow_obvious_version_takes() -> None:
     path = path_of(rng)
     log = seen_tracks(rng, point, path)
     track, landmark = log.observations.track, log.observations.track // size
-    made = parted(sightings_of(log, landmark, 1, stray=True), landmark, path, STRAY_M)
+    made = split_landmarks(
+        order_observations(log, landmark, 1, with_offsets=True), landmark, path, STRAY_M
+    )
     pose, told = path[log.iteration], log.observations.position_m.copy()
     told[:, :2] = np.einsum("nij,nj->ni", rotation(pose[:, 2]), told[:, :2]) + pose[:, :2]
     mean = np.stack([told[track == t].mean(axis=0) for t in range(len(point))])
@@ -129,13 +137,13 @@ def test_what_has_no_tracks_stays() -> None:
     path = path_of(rng)
     log = seen_tracks(rng, rng.uniform(-3, 3, (10, 3)), path)
     landmark = np.zeros(len(log.observations), dtype=np.int64)
-    for stray in (False, True):
-        seen = sightings_of(log, landmark, 1, stray=stray)
-        made = parted(seen, landmark, path, STRAY_M)
-        assert (len(np.unique(made)) > 1) == stray
+    for with_offsets in (False, True):
+        obs = order_observations(log, landmark, 1, with_offsets=with_offsets)
+        made = split_landmarks(obs, landmark, path, STRAY_M)
+        assert (len(np.unique(made)) > 1) == with_offsets
     log.observations.track[:] = NO_TRACK
-    seen = sightings_of(log, landmark, 1, stray=True)
-    np.testing.assert_array_equal(parted(seen, landmark, path, STRAY_M), landmark)
+    obs = order_observations(log, landmark, 1, with_offsets=True)
+    np.testing.assert_array_equal(split_landmarks(obs, landmark, path, STRAY_M), landmark)
 
 
 @pytest.mark.parametrize("at_once", [1, 7, 100_000])
@@ -157,5 +165,5 @@ def test_pairs_of_tracks_that_are_apart_are_those_of_looking_at_each(
                 known = np.linalg.matrix_rank(S) == 3
                 apart += [(i, j)] if known and off @ np.linalg.solve(S, off) > 0.5 else []
     assert 20 < len(apart) < 180
-    found = smooth._apart(first, point, covariance, 0.5)
+    found = smooth._inconsistent_pairs(first, point, covariance, 0.5)
     np.testing.assert_array_equal(found.T, apart)

@@ -7,7 +7,7 @@ from scipy.optimize import minimize_scalar
 from mapfusion.smoother.robust_loss import (
     LEAST_DOF,
     MOST_DOF,
-    fitted_dof,
+    fit_dof,
     information_share,
     student_bound,
     student_cost,
@@ -24,12 +24,12 @@ def test_found_in_draws(dof: float, n_dimensions: int) -> None:
     rng = np.random.default_rng(1)
     normal = rng.standard_normal((40_000, n_dimensions))
     squares = np.sum(normal**2, axis=1) / (rng.chisquare(dof, 40_000) / dof)
-    assert fitted_dof(squares, n_dimensions) == pytest.approx(dof, rel=0.1)
+    assert fit_dof(squares, n_dimensions) == pytest.approx(dof, rel=0.1)
 
 
 def test_gaussian_draws_keep_their_weights() -> None:
     squares = np.sum(np.random.default_rng(0).standard_normal((40_000, 3)) ** 2, axis=1)
-    dof = fitted_dof(squares, 3)
+    dof = fit_dof(squares, 3)
     assert dof > 100
     np.testing.assert_allclose(student_weights(squares, dof, 3), 1, atol=0.2)
 
@@ -92,11 +92,11 @@ def test_fitted_are_the_likeliest(dof: float) -> None:
             return student_deviance(squares, float(np.exp(log_dof)), n)
 
         twin = minimize_scalar(deviance, bounds=bounds, method="bounded", options={"xatol": 1e-7})
-        found = fitted_dof(squares, n)
+        found = fit_dof(squares, n)
         assert found == pytest.approx(np.exp(twin.x), rel=1e-4)
         for near in (found, 1.05 * found, 0.5, 7.0):
-            assert fitted_dof(squares, n, near) == pytest.approx(found, rel=1e-5)
+            assert fit_dof(squares, n, near) == pytest.approx(found, rel=1e-5)
 
 
 def test_nothing_tells_no_tails() -> None:
-    assert fitted_dof(np.empty(0), np.empty(0)) == MOST_DOF
+    assert fit_dof(np.empty(0), np.empty(0)) == MOST_DOF

@@ -11,8 +11,8 @@ from mapfusion.geometry.se2 import between, compose
 from mapfusion.robot_log import Observations, RobotLog
 from mapfusion.smoother import second_order
 from mapfusion.smoother.normal_equations import Estimate
-from mapfusion.smoother.optimizer import Problem, Settled, settled, solved
-from mapfusion.smoother.problem import sightings_of
+from mapfusion.smoother.optimizer import OptimizerState, Problem, linearize_and_solve, optimize
+from mapfusion.smoother.problem import order_observations
 from mapfusion.smoother.second_order import second_order_errors
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, condensed_points, smooth
 from tests.benchmarks.synthetic_drives import reckoned
@@ -37,23 +37,21 @@ def chain(rng: np.random.Generator) -> Drive:
     position = seen_m + SIGMA_M * rng.standard_normal(seen_m.shape)
     covariance = np.tile(SIGMA_M**2 * np.eye(3), (len(path), 1, 1))
     frame = np.arange(len(path))
-    seen = Observations(position, covariance, None, frame.astype(np.int32))
-    return Drive(
-        RobotLog("R1", False, frame.astype(np.float64), motion, frame, seen), path, point_m
-    )
+    obs = Observations(position, covariance, None, frame.astype(np.int32))
+    return Drive(RobotLog("R1", False, frame.astype(np.float64), motion, frame, obs), path, point_m)
 
 
-def solved_chain() -> tuple[Problem, Settled]:
+def solved_chain() -> tuple[Problem, OptimizerState]:
     """Return a chain, whose most probable path is that of the odometry."""
     driven = chain(np.random.default_rng(0))
-    seen = sightings_of(driven.log, np.arange(N_STEPS + 1), 1, stray=False)
+    obs = order_observations(driven.log, np.arange(N_STEPS + 1), 1, with_offsets=False)
     information = SmootherParameters(NOISE).odometry_information(driven.log)
-    problem = Problem(seen, driven.log.odometry, information, 0.0)
+    problem = Problem(obs, driven.log.odometry, information, 0.0)
     path = reckoned(driven.log.odometry)
     point_m = driven.log.observations.position_m.copy()
     point_m[:, :2] = compose(path, np.c_[point_m[:, :2], np.zeros(len(path))])[:, :2]
-    at = Estimate(path, point_m, np.zeros((len(seen.strays), 3)))
-    return problem, settled(problem, at)
+    at = Estimate(path, point_m, np.zeros((len(obs.has_offset), 3)))
+    return problem, optimize(problem, at)
 
 
 def test_mean_squares_are_those_of_chains_that_are_composed() -> None:
@@ -84,22 +82,22 @@ def test_is_off_by_what_fits_the_same_data() -> None:
     assert label is not None
     found = smooth(driven.log, label, driven.path, SmootherParameters())
     assert found.second_order is None  # the path is short
-    information = SmootherParameters().odometry_information(driven.log) / found.odometry_level
-    problem = Problem(found.seen, driven.log.odometry, information, 0.0)
-    end = solved(problem, found.estimate, found.weights, found.tails)
+    information = SmootherParameters().odometry_information(driven.log) / found.odometry_scales
+    problem = Problem(found.obs, driven.log.odometry, information, 0.0)
+    end = linearize_and_solve(problem, found.estimate, found.weights, found.tails)
     drawing, at, small = second_order._Drawing.of(problem, end), end.estimate, 1e-3
-    error = drawing._drawn(np.random.default_rng(0))
-    path, point_m = drawing._further(error)
+    error = drawing._draw(np.random.default_rng(0))
+    path, point_m = drawing._second_order(error)
 
     here, ahead, behind = (_data(found, _moved(at, error, k)) for k in (0, small, -small))
     odometry, position_m = (
         now + (one - other) / (2 * small)
         for now, one, other in zip(here, ahead, behind, strict=True)
     )
-    fitted = problem._replace(odometry=odometry, seen=replace(found.seen, position_m=position_m))
+    fitted = problem._replace(odometry=odometry, obs=replace(found.obs, position_m=position_m))
     again = first = _moved(at, error, 1.0)
     for _ in range(4):
-        step = solved(fitted, again, found.weights, found.tails).solution.step
+        step = linearize_and_solve(fitted, again, found.weights, found.tails).solution.step
         again = _moved(again, step, 1.0)
     off = np.linalg.norm(again.path - first.path - path)
     assert off < 0.05 * np.linalg.norm(path)
@@ -114,7 +112,7 @@ def _data(found: Smoothed, at: Estimate) -> tuple[Float, Float]:
     """Return odometry (T, 3) and observations (N, 3) that fit an estimate exactly."""
     odometry = np.zeros_like(at.path)
     odometry[1:] = between(at.path[:-1], at.path[1:])
-    pose, point_m = at.path[found.seen.frame], at.point_m[found.seen.landmark]
+    pose, point_m = at.path[found.obs.frame], at.point_m[found.obs.landmark]
     position_m = between(pose, np.c_[point_m[:, :2], np.zeros(len(pose))])
     return odometry, np.c_[position_m[:, :2], point_m[:, 2]]
 
@@ -139,9 +137,9 @@ def test_a_path_that_is_too_short_is_in_the_covariances() -> None:
 def test_is_that_of_the_estimate_whatever_equations_led_to_it() -> None:
     """The last step goes on from the equations whose factor is known; the path may bend by it."""
     problem, end = solved_chain()
-    error = second_order._Drawing.of(problem, end)._drawn(np.random.default_rng(0))
+    error = second_order._Drawing.of(problem, end)._draw(np.random.default_rng(0))
     at = _moved(end.estimate, error, 0.1)
-    fresh = solved(problem, at, end.weights, end.tails)
+    fresh = linearize_and_solve(problem, at, end.weights, end.tails)
     found = second_order_errors(problem, end._replace(estimate=at))
     expected = second_order_errors(problem, fresh)
     assert found is not None
@@ -154,4 +152,4 @@ def test_a_path_that_turns_nowhere_has_none() -> None:
     problem, end = solved_chain()
     information = problem.information * [1, 1, 1e6]
     problem = problem._replace(information=information)
-    assert second_order_errors(problem, settled(problem, end.estimate)) is None
+    assert second_order_errors(problem, optimize(problem, end.estimate)) is None

@@ -8,9 +8,9 @@ from scipy.stats import chi2
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import RobotLog
-from mapfusion.smoother.normal_equations import Estimate, first_points
-from mapfusion.smoother.optimizer import Problem, Settled, settled
-from mapfusion.smoother.problem import sightings_of
+from mapfusion.smoother.normal_equations import Estimate, initial_landmarks
+from mapfusion.smoother.optimizer import OptimizerState, Problem, optimize
+from mapfusion.smoother.problem import order_observations
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from tests.mapfusion.smoother.white_noise_logs import (
     Known,
@@ -34,7 +34,7 @@ def smoothed(log: RobotLog, stray_m: float = STRAY_M) -> Smoothed:
 def true_points(known: Known, found: Smoothed) -> Float:
     label = known.log.observations.label
     assert label is not None
-    return known.point_m[label[found.seen.row[found.seen.starts[:-1]]]]
+    return known.point_m[label[found.obs.row[found.obs.starts[:-1]]]]
 
 
 def without_gauge(found: Smoothed, error: Float) -> tuple[Float, Float]:
@@ -99,21 +99,21 @@ def test_a_gross_error_does_not_move_the_map() -> None:
     truth = true_points(known, before)
     rms = [np.sqrt(np.mean((each.estimate.point_m - truth) ** 2)) for each in (before, after)]
     assert rms[1] < 1.3 * rms[0]
-    at, weight = np.isin(after.seen.row, rows), after.weights.observation
+    at, weight = np.isin(after.obs.row, rows), after.weights.observation
     assert weight[at].max() < 0.2 < np.median(weight[~at])
     assert after.tails.observation < 100 < before.tails.observation
 
 
-def as_given(log: RobotLog, start: Smoothed) -> Settled:
+def as_given(log: RobotLog, start: Smoothed) -> OptimizerState:
     """What the equations say where each track stays with the landmark that it is given to."""
     label = log.observations.label
     assert label is not None
     parameters = SmootherParameters(stray_m=STRAY_M)
-    seen = sightings_of(log, label, parameters.min_count, stray=True)
+    obs = order_observations(log, label, parameters.min_count, with_offsets=True)
     information, path = parameters.odometry_information(log), start.estimate.path
-    problem = Problem(seen, log.odometry, information, parameters.stray_information)
-    return settled(
-        problem, Estimate(path, first_points(seen, path), np.zeros((len(seen.strays), 3)))
+    problem = Problem(obs, log.odometry, information, parameters.offset_prior)
+    return optimize(
+        problem, Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
     )
 
 
@@ -130,14 +130,14 @@ def test_false_tracks_do_not_move_the_map() -> None:
     rms = [np.sqrt(np.mean((each.estimate.point_m - truth) ** 2)) for each in (before, after)]
     assert rms[1] < 1.3 * rms[0]
     assert after.tails.offset < 20 < before.tails.offset
-    of_track = track[after.seen.row[after.seen.track_starts[:-1]]]
+    of_track = track[after.obs.row[after.obs.track_starts[:-1]]]
     tells = (
-        after.seen.strays
-        & (np.bincount(after.seen.landmark_of_track) > 3)[after.seen.landmark_of_track]
+        after.obs.has_offset
+        & (np.bincount(after.obs.landmark_of_track) > 3)[after.obs.landmark_of_track]
     )
     at = np.isin(of_track, false) & tells
     assert np.median(after.weights.offset[at]) < 0.2 < np.median(after.weights.offset[tells & ~at])
-    views = after.weights.observation[at[after.seen.track]]
+    views = after.weights.observation[at[after.obs.track]]
     assert np.median(views) > 0.5
 
 
@@ -161,8 +161,8 @@ def test_corners_taken_for_one_landmark_are_parted() -> None:
         np.testing.assert_array_equal(found.landmark[~two], mistaken[~two])
         _, sizes = np.unique(np.stack([label, found.landmark])[:, two], axis=1, return_counts=True)
         assert sizes[sizes > 2].sum() > 0.95 * two.sum()  # a single sighting may be of either
-        seen = replace(log.observations, label=mistaken)
-        given = as_given(replace(log, observations=seen), right)
+        obs = replace(log.observations, label=mistaken)
+        given = as_given(replace(log, observations=obs), right)
         for each, apart in ((found, off), (given, off_as_given)):
             between = (each.estimate.path - right.estimate.path)[:, :2]
             apart.append(np.sqrt(np.mean(np.sum(between**2, axis=1))))
@@ -186,21 +186,21 @@ def test_landmarks_seen_too_seldom_are_left_out() -> None:
     label = log.observations.label
     assert label is not None
     for min_count in (2, 5):
-        seen = sightings_of(log, label, min_count, stray=True)
+        obs = order_observations(log, label, min_count, with_offsets=True)
         names, count = np.unique(label, return_counts=True)
-        assert len(seen.starts) - 1 == np.sum(count >= min_count)
+        assert len(obs.starts) - 1 == np.sum(count >= min_count)
         np.testing.assert_array_equal(
-            np.sort(seen.row), np.flatnonzero(np.isin(label, names[count >= min_count]))
+            np.sort(obs.row), np.flatnonzero(np.isin(label, names[count >= min_count]))
         )
-    assert len(sightings_of(log, np.full(len(label), -1), 2, stray=True)) == 0
+    assert len(order_observations(log, np.full(len(label), -1), 2, with_offsets=True)) == 0
 
 
 def test_heavy_tails_do_not_stop_the_steps_before_their_end() -> None:
     """Weights come from expected squares: judged by another cost, their steps would be undone."""
     rng = np.random.default_rng(2)
     log = with_tracks(white_noise_log(rng, 60, 40), rng, STRAY_M).log
-    seen, n = log.observations, len(log.observations)
-    sigma_m = np.sqrt(np.diagonal(seen.covariance_m2, axis1=1, axis2=2))
-    gross = seen.position_m + sigma_m * rng.standard_t(2.5, (n, 3))
-    found = smoothed(replace(log, observations=replace(seen, position_m=gross)))
+    obs, n = log.observations, len(log.observations)
+    sigma_m = np.sqrt(np.diagonal(obs.covariance_m2, axis1=1, axis2=2))
+    gross = obs.position_m + sigma_m * rng.standard_t(2.5, (n, 3))
+    found = smoothed(replace(log, observations=replace(obs, position_m=gross)))
     assert found.n_steps < 40  # of 50 in each of two rounds, at most

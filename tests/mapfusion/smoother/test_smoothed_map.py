@@ -31,16 +31,16 @@ def test_landmarks_look_as_the_observations_they_are_named_by(named_by: str, tra
     rng = np.random.default_rng(1)
     known = white_noise_log(rng, 80, 15)
     log = with_tracks(known, rng, STRAY_M).log if tracked else known.log
-    seen = log.observations
-    assert seen.label is not None
-    look = unit(rng.standard_normal((len(seen), 64))).astype(np.float32)
-    log = replace(log, observations=replace(seen, descriptor=look))
-    rows = {label: np.flatnonzero(seen.label == label) for label in np.unique(seen.label)}
-    name = np.array([rows[label][0 if named_by == "first" else -1] for label in seen.label])
+    obs = log.observations
+    assert obs.label is not None
+    look = unit(rng.standard_normal((len(obs), 64))).astype(np.float32)
+    log = replace(log, observations=replace(obs, descriptor=look))
+    rows = {label: np.flatnonzero(obs.label == label) for label in np.unique(obs.label)}
+    name = np.array([rows[label][0 if named_by == "first" else -1] for label in obs.label])
     found = smoothed_map(log, smooth(log, name, dead_reckoned(log), SmootherParameters()))
     assert found.descriptor is not None
     assert found.label is not None
     counts = {own[0 if named_by == "first" else -1]: len(own) for own in rows.values()}
     assert [counts[row] for row in found.source_observation] == found.count.tolist()
     np.testing.assert_array_equal(found.descriptor, look[found.source_observation])
-    np.testing.assert_array_equal(found.label, seen.label[found.source_observation])
+    np.testing.assert_array_equal(found.label, obs.label[found.source_observation])

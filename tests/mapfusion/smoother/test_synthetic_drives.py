@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapfusion.smoother.elimination import memory_bytes
-from mapfusion.smoother.problem import Sightings, sightings_of
+from mapfusion.smoother.problem import OrderedObservations, order_observations
 from mapfusion.smoother.smooth import condensed_points
 from tests.benchmarks.synthetic_drives import LANDMARK_LIMITS, MOST_PATH, nees, smoothed
 from tests.helpers.synthetic_drives import Drive, drive
@@ -46,7 +46,7 @@ def test_odometry_much_worse_than_stated_does_not_make_observations_gross() -> N
     driven = drive("back", 100, 5.0, seed=0)
     found = smoothed(driven)
     assert nees(driven, found).landmark < 2
-    assert found.odometry_level.min() > 5
+    assert found.odometry_scales.min() > 5
 
 
 def many_sightings(seed: int) -> Drive:
@@ -70,9 +70,9 @@ def test_memory_is_bounded_closely(driven: Callable[[], Drive], landmarks_first:
     Either the landmarks or the poses are eliminated first, whichever takes fewer products.
     """
     made = driven()
-    seen = smoothed(made).seen  # also compiles the kernels
-    n_points = seen.n_landmarks + int(seen.strays.sum())
-    assert seen.order.is_sparser_than(n_points) == landmarks_first
+    obs = smoothed(made).obs  # also compiles the kernels
+    n_points = obs.n_landmarks + int(obs.has_offset.sum())
+    assert obs.order.is_sparser_than(n_points) == landmarks_first
     tracemalloc.start()
     try:
         found = smoothed(made)
@@ -80,7 +80,7 @@ def test_memory_is_bounded_closely(driven: Callable[[], Drive], landmarks_first:
         _, used = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert used < memory_bytes(found.seen) < 3 * used
+    assert used < memory_bytes(found.obs) < 3 * used
 
 
 def test_memory_grows_with_the_log_and_not_with_its_square() -> None:
@@ -91,10 +91,10 @@ def test_memory_grows_with_the_log_and_not_with_its_square() -> None:
     assert needed[1] < 1e9
 
 
-def _seen(driven: Drive) -> Sightings:
+def _seen(driven: Drive) -> OrderedObservations:
     label = driven.log.observations.label
     assert label is not None
-    return sightings_of(driven.log, label, 3, stray=True)
+    return order_observations(driven.log, label, 3, with_offsets=True)
 
 
 def test_what_may_take_more_than_is_given_is_refused() -> None:

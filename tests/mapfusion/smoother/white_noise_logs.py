@@ -37,9 +37,9 @@ def white_noise_log(
         disturbance = rng.standard_normal(3) * NOISE.standard_deviations(odometry[k])
         path[k] = compose(path[k - 1], odometry[k] + disturbance)
     point_m = scattered(rng, n_landmarks, planar) if point_m is None else point_m
-    seen = [_sightings(rng, path[k], point_m, planar) for k in range(n_frames)]
-    iteration = np.repeat(np.arange(n_frames), [len(label) for label, _, _ in seen])
-    label, position, covariance = map(np.concatenate, zip(*seen, strict=True))
+    obs = [_sightings(rng, path[k], point_m, planar) for k in range(n_frames)]
+    iteration = np.repeat(np.arange(n_frames), [len(label) for label, _, _ in obs])
+    label, position, covariance = map(np.concatenate, zip(*obs, strict=True))
     observations = Observations(position, covariance, None, label.astype(np.int32))
     return Known(
         RobotLog("R1", planar, np.arange(n_frames) * 0.2, odometry, iteration, observations),
@@ -89,10 +89,10 @@ def with_tracks(
     A track holds a landmark's observations in consecutive frames, but no more than `most_frames`;
     every tenth observation is of the landmark itself and belongs to none.
     """
-    log, seen = known.log, known.log.observations
-    assert seen.label is not None
-    track, open_tracks, n_tracks = np.full(len(seen), -1, dtype=np.int32), {}, 0
-    for row, (label, frame) in enumerate(zip(seen.label, log.iteration, strict=True)):
+    log, obs = known.log, known.log.observations
+    assert obs.label is not None
+    track, open_tracks, n_tracks = np.full(len(obs), -1, dtype=np.int32), {}, 0
+    for row, (label, frame) in enumerate(zip(obs.label, log.iteration, strict=True)):
         if rng.uniform() < 0.1:
             continue
         own, last, count = open_tracks.get(label, (-1, -2, 0))
@@ -100,7 +100,7 @@ def with_tracks(
             own, count, n_tracks = n_tracks, 0, n_tracks + 1
         open_tracks[label], track[row] = (own, frame, count + 1), own
     offset = stray_m * rng.standard_normal((n_tracks, 3))
-    tracked = known._replace(log=replace(log, observations=replace(seen, track=track)))
+    tracked = known._replace(log=replace(log, observations=replace(obs, track=track)))
     return tracked._replace(log=_displaced(tracked, offset))
 
 
@@ -118,11 +118,11 @@ def moved_tracks(
 
 def _displaced(known: Known, offset: Float) -> RobotLog:
     """The log with the tracks' points moved by offsets (B, 3) in the frame of the truth."""
-    log, seen = known.log, known.log.observations
-    assert seen.track is not None
-    by = np.where(seen.track[:, None] >= 0, offset[seen.track], 0.0)
+    log, obs = known.log, known.log.observations
+    assert obs.track is not None
+    by = np.where(obs.track[:, None] >= 0, offset[obs.track], 0.0)
     by[:, 2] *= not log.planar
-    position, heading = seen.position_m.copy(), known.path[log.iteration, 2]
+    position, heading = obs.position_m.copy(), known.path[log.iteration, 2]
     position[:, :2] += np.einsum("nji,nj->ni", rotation(heading), by[:, :2])
     position[:, 2] += by[:, 2]
-    return replace(log, observations=replace(seen, position_m=position))
+    return replace(log, observations=replace(obs, position_m=position))
