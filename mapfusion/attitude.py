@@ -39,7 +39,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se3 import tilt
 from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import Observations
-from mapfusion.tables import told
+from mapfusion.tables import described
 
 FILE = "attitude.parquet"
 _ANGLES = ["roll_rad", "pitch_rad"]
@@ -52,15 +52,15 @@ _ABOUT = [
     "of the robot's origin above the floor that the map begins on",
 ]
 _OF_FRAMES = [
-    told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
-    *(told(f, text) for f, text in zip(float_fields(_FIELDS), _ABOUT, strict=True)),
-    *(told(f, "standard deviation of the same") for f in float_fields(_SIGMAS)),
+    described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+    *(described(f, text) for f, text in zip(float_fields(_FIELDS), _ABOUT, strict=True)),
+    *(described(f, "standard deviation of the same") for f in float_fields(_SIGMAS)),
 ]
 _ABOUT_CARRIED = "share of the error of the row before that is left in this one's, 0 to 1"
 ATTITUDE = schema(
     "robot_log.attitude",
     2,
-    [*_OF_FRAMES, *(told(f, _ABOUT_CARRIED) for f in float_fields(_CARRIED))],
+    [*_OF_FRAMES, *(described(f, _ABOUT_CARRIED) for f in float_fields(_CARRIED))],
 )
 # Of the version before: each frame's error for itself.
 _ATTITUDE_1 = schema("robot_log.attitude", 1, _OF_FRAMES)
@@ -99,7 +99,7 @@ class Attitude:
         return len(self.value)
 
 
-def moved(observed: Observations, R: Float, t: Float) -> Observations:
+def transform_observations(observed: Observations, R: Float, t: Float) -> Observations:
     """The same observations in another frame: turned by R (3, 3), then shifted by t (3,)."""
     covariance = R @ observed.covariance_m2 @ R.T
     covariance = (covariance + covariance.swapaxes(1, 2)) / 2  # as rounding left it
@@ -107,7 +107,7 @@ def moved(observed: Observations, R: Float, t: Float) -> Observations:
     return replace(observed, position_m=position, covariance_m2=covariance)
 
 
-def levelled(observed: Observations, value: Float, sigma: Float) -> Observations:
+def level_observations(observed: Observations, value: Float, sigma: Float) -> Observations:
     """One frame's observations in the level frame.
 
     Args:
@@ -117,7 +117,7 @@ def levelled(observed: Observations, value: Float, sigma: Float) -> Observations
             covariances then include (first order).
     """
     roll, pitch, height_m = value
-    made = moved(observed, tilt(roll, pitch), np.array([0.0, 0.0, height_m]))
+    made = transform_observations(observed, tilt(roll, pitch), np.array([0.0, 0.0, height_m]))
     arm = made.position_m - [0.0, 0.0, height_m]
     # a roll turns about the pitched axis ahead, a pitch about the axis to the left
     by_roll = np.cross(tilt(0.0, pitch)[:, 0], arm)
@@ -168,7 +168,7 @@ _MOST_SOURCES = 64  # of new errors along a log; frames between two of them shar
 _SIZE = 3  # of an error: tilts about the map's axes x and y, and a height
 
 
-def shared_heights(
+def attitude_height_errors(
     attitude: Attitude, path: Float, frame: np.ndarray, landmark: np.ndarray, point_m: Float
 ) -> Float:
     """How far one sigma of each shared error lifts landmarks: (R, L), in metres.

@@ -64,7 +64,7 @@ class TellingWarning(UserWarning):
     """Something a user should know, in one line; the command shows it as it is."""
 
 
-class MendedWarning(TellingWarning):
+class StoreRepairWarning(TellingWarning):
     """A damaged stage of the store is made again."""
 
 

@@ -42,16 +42,16 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import require_finite, require_no_twins, require_points, require_shape
 from mapfusion.robot_log import with_rows
 from mapfusion.tables import (
+    APPEARANCE_FIELDS,
     DESCRIPTOR_LENGTH,
     HEIGHT,
-    LOOK_FIELDS,
+    appearance_columns,
+    appearance_from,
     csv_bytes,
+    described,
     is_csv,
-    look_columns,
-    looks_from,
     read_open_table,
-    require_looks,
-    told,
+    require_appearance,
 )
 from mapfusion.viewing import Viewing, read_viewing, viewing_writes
 
@@ -64,9 +64,9 @@ _KIND = "joint_covariance"
 def joint_schema(rank: int) -> pa.Schema:
     """Schema of the file, for R shared variables."""
     cell = pa.list_(pa.float32(), 3 * rank)
-    own = (told(field, "what is the landmark's own") for field in float_fields(_OWN_FIELDS))
+    own = (described(field, "what is the landmark's own") for field in float_fields(_OWN_FIELDS))
     moved = "how far one sigma of each of R shared variables moves it: x, y, z of the first, ..."
-    return schema(_KIND, 1, [*own, told(pa.field("common_m", cell), moved)])
+    return schema(_KIND, 1, [*own, described(pa.field("common_m", cell), moved)])
 
 
 def _joint_columns(joint: JointCovariance, rank: int) -> dict[str, np.ndarray]:
@@ -139,14 +139,14 @@ LANDMARKS = schema(
     "landmark_map",
     1,
     [
-        *(told(field, "in the map's frame") for field in point_fields()),
-        told(pa.field("count", pa.int32()), "observations that went into the landmark", 1),
-        told(
+        *(described(field, "in the map's frame") for field in point_fields()),
+        described(pa.field("count", pa.int32()), "observations that went into the landmark", 1),
+        described(
             pa.field("source_observation", pa.int64()),
             "row of the log that it came from, -1 for none",
             -1,
         ),
-        *LOOK_FIELDS,
+        *APPEARANCE_FIELDS,
     ],
 )
 
@@ -232,7 +232,7 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
         **point_columns(landmarks.position_m, landmarks.covariance_m2),
         "count": landmarks.count.astype(np.int32),
         "source_observation": landmarks.source_observation.astype(np.int64),
-        **look_columns(len(landmarks), landmarks.descriptor, landmarks.label),
+        **appearance_columns(len(landmarks), landmarks.descriptor, landmarks.label),
     }
     if is_csv(path):
         _tell_left_out(path, landmarks)
@@ -276,7 +276,7 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
     require_cells(path, table, ["count"], lambda count: count >= 1, counted)
     of_log = "give -1 for none, or a row of the log: 0 and more"
     require_cells(path, table, ["source_observation"], lambda row: row >= -1, of_log)
-    require_looks(path, table)
+    require_appearance(path, table)
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
     try:
@@ -285,7 +285,7 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
             covariance,
             column(table, "count"),
             column(table, "source_observation"),
-            *looks_from(table),
+            *appearance_from(table),
             planar,
             attributes.get("name", name_in_text(path.stem)),
             calibration=calibration_from(attributes, path),

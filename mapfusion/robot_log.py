@@ -51,14 +51,14 @@ from mapfusion.parameters import (
     require_shape,
 )
 from mapfusion.tables import (
+    APPEARANCE_FIELDS,
     DESCRIPTOR_LENGTH,
-    LOOK_FIELDS,
-    look_columns,
-    looks_from,
+    appearance_columns,
+    appearance_from,
+    described,
     read_open_table,
-    require_looks,
+    require_appearance,
     table_path,
-    told,
 )
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ LARGEST_TURN = 360.0
 TRUTH_TABLES = ("truth_poses", "truth_points")
 TRUTH_FILES = tuple(f"{name}.parquet" for name in TRUTH_TABLES)
 Arrays = TypeVar("Arrays", bound="DataclassInstance")
-_ITERATION = told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
+_ITERATION = described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
 _ODOMETRY_FIELDS = ["odometry_x_m", "odometry_y_m", "odometry_theta_rad"]
 _PIXEL_FIELDS = ["u_px", "v_px", "disparity_px"]  # left image; NaN where there are no images
 
@@ -82,9 +82,9 @@ FRAMES = schema(
     1,
     [
         _ITERATION,
-        told(pa.field("time_s", pa.float64()), "when, increasing from row to row"),
+        described(pa.field("time_s", pa.float64()), "when, increasing from row to row"),
         *(
-            told(
+            described(
                 field,
                 "motion since the row before, in the robot frame of that row; row 0 is not used",
             )
@@ -96,14 +96,14 @@ OBSERVATIONS = schema(
     "robot_log.observations",
     2,  # 1 had no tracks
     [
-        told(_ITERATION, "frame of the sighting; rows are ordered by it"),
-        *(told(field, "of the sighting, in the robot frame") for field in point_fields()),
+        described(_ITERATION, "frame of the sighting; rows are ordered by it"),
+        *(described(field, "of the sighting, in the robot frame") for field in point_fields()),
         *(
-            told(pa.field(name, pa.float32()), "in the left image, NaN without images", np.nan)
+            described(pa.field(name, pa.float32()), "in the left image, NaN without images", np.nan)
             for name in _PIXEL_FIELDS
         ),
-        *LOOK_FIELDS,
-        told(pa.field("track", pa.int32()), "number of its track, -1 for none", NO_TRACK),
+        *APPEARANCE_FIELDS,
+        described(pa.field("track", pa.int32()), "number of its track, -1 for none", NO_TRACK),
     ],
 )
 TRUTH_POSES = schema(
@@ -111,14 +111,19 @@ TRUTH_POSES = schema(
     1,
     [
         _ITERATION,
-        *(told(field, "T_world_robot, NaN where unknown") for field in float_fields(POSE_FIELDS)),
+        *(
+            described(field, "T_world_robot, NaN where unknown")
+            for field in float_fields(POSE_FIELDS)
+        ),
     ],
 )
 TRUTH_POINTS = schema(
     "robot_log.truth_points",
     1,
     [
-        told(field, "point of the world that the observation of this row shows, NaN where unknown")
+        described(
+            field, "point of the world that the observation of this row shows, NaN where unknown"
+        )
         for field in float_fields(POSITION_FIELDS)
     ],
 )
@@ -234,7 +239,7 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
             "iteration": iteration.astype(np.int32),
             **point_columns(observations.position_m, observations.covariance_m2),
             **named_columns(_PIXEL_FIELDS, uvd.astype(np.float32)),
-            **look_columns(n, observations.descriptor, observations.label),
+            **appearance_columns(n, observations.descriptor, observations.label),
             "track": track.astype(np.int32),
         },
         OBSERVATIONS,
@@ -257,7 +262,7 @@ def _observations(folder: Path) -> tuple[np.ndarray, Observations, bool]:
         observations = Observations(
             position,
             covariance,
-            *looks_from(table),
+            *appearance_from(table),
             None if np.isnan(uvd).all() else uvd,
             None if np.all(track == NO_TRACK) else track,
         )
@@ -363,7 +368,7 @@ def _require_sightings(path: Path, table: pa.Table) -> None:
     require_cells(path, table, _PIXEL_FIELDS, lambda px: ~np.isinf(px), no_image)
     numbered = f"tracks are {NO_TRACK} for none, or 0 and more"
     require_cells(path, table, ["track"], lambda track: track >= NO_TRACK, numbered)
-    require_looks(path, table)
+    require_appearance(path, table)
 
 
 def _require_numbered(path: Path, table: pa.Table) -> None:
@@ -445,9 +450,9 @@ ODOMETRY_COVARIANCE = schema(
     "robot_log.odometry_covariance",
     1,
     [
-        told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+        described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
         *(
-            told(field, "of the motion since the row before: m², m rad, rad²")
+            described(field, "of the motion since the row before: m², m rad, rad²")
             for field in float_fields(_FIELDS)
         ),
     ],

@@ -35,7 +35,7 @@ _MOST_NAMED = 3  # columns of other names in one line
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
 
 
-def told(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
+def described(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
     """A field with what it means, and with its value where a file lacks it."""
     metadata = {_ABOUT: about.encode()}
     if default is not None:
@@ -43,7 +43,7 @@ def told(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
     return field.with_metadata(metadata)
 
 
-def about(field: pa.Field) -> str:
+def description_of(field: pa.Field) -> str:
     """What `told` was told of a field; empty where nothing was."""
     return (field.metadata or {}).get(_ABOUT, b"").decode()
 
@@ -286,9 +286,11 @@ def _columns_apart(path: Path, table: pa.Table, field: pa.Field) -> list[str]:
 
 DESCRIPTOR_LENGTH = 64
 NO_LABEL = -1
-LOOK_FIELDS = [
-    told(pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL),
-    told(
+APPEARANCE_FIELDS = [
+    described(
+        pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL
+    ),
+    described(
         pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
         "what it looks like (U-SURF or another), NaN for none",
         np.nan,
@@ -296,7 +298,7 @@ LOOK_FIELDS = [
 ]
 
 
-def look_columns(
+def appearance_columns(
     n: int, descriptor: np.ndarray | None, label: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """By what n points are recognised, as the columns of `LOOK_FIELDS`."""
@@ -307,7 +309,7 @@ def look_columns(
     return {"label": label.astype(np.int32), "descriptor": descriptor.astype(np.float32)}
 
 
-def looks_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
+def appearance_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Descriptors and labels of a table, None where no row has any."""
     descriptor, label = column(table, "descriptor"), column(table, "label")
     return (
@@ -316,7 +318,7 @@ def looks_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
     )
 
 
-def require_looks(path: Path, table: pa.Table) -> None:
+def require_appearance(path: Path, table: pa.Table) -> None:
     """Raise InputError for the first row whose label or descriptor is not as documented."""
     known_label = f"labels are {NO_LABEL} for none, or 0 and more"
     require_cells(path, table, ["label"], lambda label: label >= NO_LABEL, known_label)

@@ -31,7 +31,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import wrap
 from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import RobotLog
-from mapfusion.tables import told
+from mapfusion.tables import described
 
 BEARINGS = 16  # across the field of view: 4 degrees each of the STH-MDCS2's
 RANGES = 8  # steps of range up to the farthest, a metre each indoors
@@ -109,7 +109,7 @@ class Viewing:
         return replace(self, **both)
 
 
-class SightLines(NamedTuple):
+class LogSightings(NamedTuple):
     """The n sightings of a log, from which the viewing evidence of its maps is made.
 
     Attributes:
@@ -123,7 +123,7 @@ class SightLines(NamedTuple):
     height_m: Float
 
     @classmethod
-    def of(cls, log: RobotLog, n: int | None = None) -> "SightLines":
+    def of(cls, log: RobotLog, n: int | None = None) -> "LogSightings":
         """Of a log, all of them or the first n."""
         frame, (x, y, z) = log.iteration[:n], log.observations.position_m[:n].T
         return cls(frame, np.arctan2(y, x), np.hypot(x, y), z.copy())
@@ -146,14 +146,14 @@ class SightLines(NamedTuple):
             for values in (np.cos(direction), np.sin(direction), range_m)
         )
         reach = np.zeros(len(path) * BEARINGS, dtype=np.float32)
-        at = frame.astype(np.int64) * BEARINGS + part_of(bearing, field)
+        at = frame.astype(np.int64) * BEARINGS + bearing_bin(bearing, field)
         np.maximum.at(reach, at, range_m.astype(np.float32))
         mean_m, n_views = distance / np.maximum(count, 1), count.astype(np.int32)
         ways = path, reach.reshape(len(path), BEARINGS), field
         return Viewing(np.arctan2(sin, cos), mean_m, n_views, *ways)
 
 
-def viewing_of(
+def viewing_of_log(
     log: RobotLog, landmark: np.ndarray, path: Float, source_observation: np.ndarray
 ) -> Viewing:
     """The viewing evidence of a map that was made of a log.
@@ -166,10 +166,10 @@ def viewing_of(
         source_observation: (N,) of the map's landmarks.
     """
     n_seen = int(np.searchsorted(log.iteration, len(path)))
-    return SightLines.of(log, n_seen).viewing(landmark, path, source_observation)
+    return LogSightings.of(log, n_seen).viewing(landmark, path, source_observation)
 
 
-def part_of(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
+def bearing_bin(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
     """Which part of the field of view bearings (n,) lie in; those beyond it in its last ones."""
     low, high = field.bearing_rad
     part = np.floor((bearing_rad - low) / max(high - low, 1e-9) * BEARINGS)
@@ -211,18 +211,23 @@ VIEWING = schema(
     "landmark_viewing",
     1,
     [
-        told(pa.field("direction_rad", pa.float64()), "mean, from the robot to it, in map frame"),
-        told(pa.field("distance_m", pa.float64()), "mean, from the robot to it, in the plane"),
-        told(pa.field("n_views", pa.int32()), "sightings behind both"),
+        described(
+            pa.field("direction_rad", pa.float64()), "mean, from the robot to it, in map frame"
+        ),
+        described(pa.field("distance_m", pa.float64()), "mean, from the robot to it, in the plane"),
+        described(pa.field("n_views", pa.int32()), "sightings behind both"),
     ],
 )
 VIEWED_FRAMES = schema(
     "viewed_frames",
     1,
     [
-        told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
-        *(told(field, "of the robot, in the map's frame") for field in float_fields(POSE_FIELDS)),
-        told(
+        described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+        *(
+            described(field, "of the robot, in the map's frame")
+            for field in float_fields(POSE_FIELDS)
+        ),
+        described(
             pa.field("reach_m", pa.list_(pa.float32(), BEARINGS)),
             "range of the farthest landmark in each part of the field of view, least bearing first;"
             " 0 for none",

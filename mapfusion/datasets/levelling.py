@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.attitude import Attitude, moved
+from mapfusion.attitude import Attitude, transform_observations
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
 from mapfusion.datasets.formats import Level
 from mapfusion.datasets.imu import SHARED_RAD, Inertial
@@ -95,7 +95,7 @@ def levelled(observed: Observations, camera: StereoCamera, T_robot_left: Float) 
     R, t = T_robot_left[:3, :3], T_robot_left[:3, 3]
     if np.array_equal(R, np.eye(3)) and np.array_equal(t, camera.p_robot_left):
         return observed
-    return moved(observed, R, t - R @ camera.p_robot_left)
+    return transform_observations(observed, R, t - R @ camera.p_robot_left)
 
 
 def upright(T_robot_left: Float, up_left: Float) -> Float:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import Estimates, Slots, touches
-from mapfusion.fastslam.measurement import DROPPED, NEW, Sightings, innovation, quadratic_form
+from mapfusion.fastslam.landmarks import Estimates, Slots, boxes_overlap
+from mapfusion.fastslam.measurement import DROPPED, NEW, MapObservations, innovation, quadratic_form
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.geometry.numerics import Float, kernel
 
@@ -32,7 +32,7 @@ class Pairs(NamedTuple):
     slot: np.ndarray  # (P,)
 
 
-def boxes_of(seen: Sightings, gate: float) -> Float:
+def observation_boxes(seen: MapObservations, gate: float) -> Float:
     """Boxes (K, 4) of observations and their gates over all particles."""
     # by coordinate (2, K, M), since NumPy is slow along an axis before a short one
     point = np.ascontiguousarray(seen.point_m[:, :, :2].transpose(2, 0, 1))
@@ -42,9 +42,9 @@ def boxes_of(seen: Sightings, gate: float) -> Float:
     return np.ascontiguousarray(boxes.T)
 
 
-def pairs_nearby(
+def candidate_pairs(
     maps: ParticleMaps,
-    seen: Sightings,
+    seen: MapObservations,
     gate: float,
     descriptor: np.ndarray | None = None,
     descriptor_threshold: float = np.inf,
@@ -56,7 +56,7 @@ def pairs_nearby(
     """
     if descriptor is None:
         descriptor = np.empty((len(seen.point_m), 0), dtype=np.float32)
-    boxes = boxes_of(seen, gate)
+    boxes = observation_boxes(seen, gate)
     around = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
     observation, slot, distance = _touching(
         maps.slots.box_m,
@@ -70,9 +70,7 @@ def pairs_nearby(
     return Pairs(observation[order], slot[order])
 
 
-def pairs_of_labels(
-    slot_of_label: Mapping[int, int], label: np.ndarray
-) -> tuple[Pairs, np.ndarray]:
+def label_pairs(slot_of_label: Mapping[int, int], label: np.ndarray) -> tuple[Pairs, np.ndarray]:
     """Observations with the slots of their labels (K,), and which may start a landmark (K,).
 
     All particles start a label's landmark together, so one slot holds it. Only the first
@@ -100,7 +98,7 @@ def _touching(
     n = 0
     for k in range(len(boxes)):
         for s in names:
-            if not touches(box_of, s, boxes[k]):
+            if not boxes_overlap(box_of, s, boxes[k]):
                 continue
             apart = _unlikeness(descriptor, k, descriptor_of, s, threshold)
             if apart < threshold:
@@ -127,10 +125,10 @@ def _unlikeness(
     return np.sqrt(squares)
 
 
-def choose(
+def associate(
     maps: ParticleMaps,
     pairs: Pairs,
-    seen: Sightings,
+    seen: MapObservations,
     may_create: np.ndarray,
     gate: float,
     planar: bool,
@@ -174,7 +172,7 @@ def _distinct(slot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @kernel(error_model="numpy")
-def _distance(seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool) -> float:
+def _distance(seen: MapObservations, k: int, own: Estimates, r: int, m: int, planar: bool) -> float:
     difference, inverse, _ = innovation(seen, k, own, r, m, planar)
     return quadratic_form(difference, inverse)
 
@@ -186,7 +184,7 @@ def _take_in_order(
     pairs: Pairs,
     place: np.ndarray,
     taken: np.ndarray,
-    seen: Sightings,
+    seen: MapObservations,
     gate: float,
     planar: bool,
     chosen: np.ndarray,
@@ -227,7 +225,7 @@ def _take_nearest(
     pairs: Pairs,
     place: np.ndarray,
     taken: np.ndarray,
-    seen: Sightings,
+    seen: MapObservations,
     gate: float,
     planar: bool,
     chosen: np.ndarray,
@@ -248,7 +246,7 @@ def _take_nearest(
                 taken[j, m] = True
 
 
-def sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
+def observation_sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
     """(K, M) int32 source of the landmark that each observation went into, -1 if it was dropped.
 
     `first_source` is the running number of the first observation.

@@ -13,22 +13,27 @@ import numpy as np
 
 from mapfusion.fastslam.association import (
     Association,
-    choose,
-    pairs_nearby,
-    pairs_of_labels,
-    sources,
+    associate,
+    candidate_pairs,
+    label_pairs,
+    observation_sources,
 )
-from mapfusion.fastslam.landmarks import Tracked
-from mapfusion.fastslam.loop_closing import Bends, Seen, close_loops, motion_by_odometry
+from mapfusion.fastslam.landmarks import ActiveTracks
+from mapfusion.fastslam.loop_closing import (
+    DriftModel,
+    FrameAssociation,
+    close_loops,
+    odometry_noise_factor,
+)
 from mapfusion.fastslam.measurement import (
-    Sightings,
+    MapObservations,
     log_density_at_gate,
-    sightings,
+    observations_in_map,
     update_landmarks,
 )
 from mapfusion.fastslam.motion import MotionNoise, sample_motion
-from mapfusion.fastslam.particles import History, ParticleMaps
-from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
+from mapfusion.fastslam.particles import ParticleMaps, PathHistory
+from mapfusion.fastslam.proposal import Proposal, informed_disturbance, with_odometry_noise
 from mapfusion.fastslam.resampling import effective_sample_size, normalised, systematic_ancestors
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import compose
@@ -139,14 +144,14 @@ class FastSlam:
         self._poses = np.zeros((parameters.n_particles, 3))
         self._log_weights = np.full(parameters.n_particles, -np.log(parameters.n_particles))
         self._planar = bool(parameters.planar)
-        self._tracked, self._stray_m2 = Tracked(), 2 * parameters.stray_m**2
+        self._tracked, self._stray_m2 = ActiveTracks(), 2 * parameters.stray_m**2
         self._maps = ParticleMaps(parameters.n_particles, parameters.gate)
         self._best = 0
         self._n_observations = 0
         self._slot_of_label: dict[int, int] = {}
         self._has_descriptors = self._has_labels = False
-        self._history = History() if keep_history else None
-        self._bends = Bends()
+        self._history = PathHistory() if keep_history else None
+        self._bends = DriftModel()
 
     @property
     def n_slots(self) -> int:
@@ -184,7 +189,7 @@ class FastSlam:
 
         self._maps.widen(self._tracked.ended(observations.track, self._maps.slots), self._stray_m2)
         self._poses, log_ratio = self._propose(odometry, sigma, observations, noise)
-        seen = sightings(self._poses, observations.position_m, noise, planar)
+        seen = observations_in_map(self._poses, observations.position_m, noise, planar)
         chosen, changed = self._associate(seen, observations)
         slots = self._maps.slots
         log_likelihood = update_landmarks(slots.own, slots.row, chosen, seen, log_new, planar)
@@ -268,7 +273,7 @@ class FastSlam:
         # a robot that stands still is where it was, and without observations there is no news
         seeing = len(observations) and sigma.any() and not empty
         if not (settings.proposal is Proposal.INFORMED and seeing):
-            moved = motion_by_odometry(self._poses[self._best], 0.0, sigma)
+            moved = odometry_noise_factor(self._poses[self._best], 0.0, sigma)
             self._bends.went_on(moved @ moved.T)
             # Before the first landmark no draw is better than another, nor ever will be: whichever
             # particle is left would have turned the map by its own error beside the odometry's.
@@ -276,12 +281,12 @@ class FastSlam:
             poses = sample_motion(self._poses, odometry, disturbed, self._rng)
             return poses, np.zeros(settings.n_particles)
         predicted = compose(self._poses, odometry)
-        seen = sightings(predicted, observations.position_m, noise, self._planar)
-        wide = widened(seen, predicted, odometry, sigma)
+        seen = observations_in_map(predicted, observations.position_m, noise, self._planar)
+        wide = with_odometry_noise(seen, predicted, odometry, sigma)
         chosen, _ = self._associate(wide, observations)
         if settings.close_loops and self._close_loops(chosen, seen, predicted, odometry, sigma):
             predicted = compose(self._poses, odometry)
-            seen = sightings(predicted, observations.position_m, noise, self._planar)
+            seen = observations_in_map(predicted, observations.position_m, noise, self._planar)
         slots = self._maps.slots
         eta, log_ratio = informed_disturbance(
             slots.own,
@@ -298,12 +303,17 @@ class FastSlam:
         return compose(self._poses, odometry + sigma * eta), log_ratio
 
     def _close_loops(
-        self, chosen: np.ndarray, seen: Sightings, predicted: Float, odometry: Float, sigma: Float
+        self,
+        chosen: np.ndarray,
+        seen: MapObservations,
+        predicted: Float,
+        odometry: Float,
+        sigma: Float,
     ) -> bool:
         """Bend all particles' paths and maps by what the best one sees again; whether they were."""
         m, settings, bends = self._best, self.parameters, self._bends
-        frame = Seen(chosen[:, m].copy(), seen, m, settings.gate, self._planar)
-        by_odometry = motion_by_odometry(predicted[m], odometry[2], sigma)
+        frame = FrameAssociation(chosen[:, m].copy(), seen, m, settings.gate, self._planar)
+        by_odometry = odometry_noise_factor(predicted[m], odometry[2], sigma)
         slots, probability = self._maps.slots, settings.gate_probability
         drift = close_loops(bends, slots, frame, by_odometry, probability)
         bent = bends.due(predicted[m, :2])
@@ -316,7 +326,7 @@ class FastSlam:
         return bent is not None
 
     def _associate(
-        self, seen: Sightings, observations: Observations
+        self, seen: MapObservations, observations: Observations
     ) -> tuple[np.ndarray, np.ndarray]:
         """(K, M) slot of each observation in each particle, or NEW or DROPPED; the slots chosen."""
         settings = self.parameters
@@ -325,9 +335,9 @@ class FastSlam:
             return np.empty(seen.point_m.shape[:2], dtype=np.int64), np.empty(0, dtype=np.int64)
         if settings.association is Association.LABEL:
             assert observations.label is not None
-            pairs, may_create = pairs_of_labels(self._slot_of_label, observations.label)
+            pairs, may_create = label_pairs(self._slot_of_label, observations.label)
         elif settings.association is Association.DESCRIPTOR:
-            pairs = pairs_nearby(
+            pairs = candidate_pairs(
                 self._maps,
                 seen,
                 settings.gate,
@@ -335,12 +345,12 @@ class FastSlam:
                 settings.descriptor_threshold,
             )
         else:
-            pairs = pairs_nearby(self._maps, seen, settings.gate)
+            pairs = candidate_pairs(self._maps, seen, settings.gate)
         nearest = settings.association is Association.GATE
-        return choose(self._maps, pairs, seen, may_create, settings.gate, self._planar, nearest)
+        return associate(self._maps, pairs, seen, may_create, settings.gate, self._planar, nearest)
 
     def _start_landmarks(
-        self, chosen: np.ndarray, seen: Sightings, observations: Observations
+        self, chosen: np.ndarray, seen: MapObservations, observations: Observations
     ) -> np.ndarray:
         """A landmark for each observation that is NEW in some particle: rows and slots (n, 2)."""
         if len(observations) == 0:
@@ -367,7 +377,7 @@ class FastSlam:
     def _remember(self, chosen: np.ndarray) -> None:
         """Number the observations, and keep what became of them."""
         if self._history is not None:
-            source = sources(self._maps.slots, chosen, self._n_observations)
+            source = observation_sources(self._maps.slots, chosen, self._n_observations)
             self._history.add(self._poses, source)
         self._n_observations += len(chosen)
 
@@ -395,7 +405,7 @@ class FastSlam:
             self._best = int(np.searchsorted(ancestors, self._best))
         return result
 
-    def _kept_history(self) -> History:
+    def _kept_history(self) -> PathHistory:
         if self._history is None:
             raise ValueError("keep_history: is False, the path was not kept")
         return self._history

@@ -68,7 +68,7 @@ def allocate(capacity: int, n_rows: int, n_particles: int) -> Slots:
     )
 
 
-def with_room(slots: Slots, n_slots: int, n_rows: int) -> Slots:
+def grow(slots: Slots, n_slots: int, n_rows: int) -> Slots:
     """The same slots and rows, with room for at least so many; what has none is doubled."""
     n_particles = slots.own.count.shape[1]
     if n_slots > len(slots.label):
@@ -99,7 +99,7 @@ def _doubled(capacity: int, needed: int) -> int:
 _ALONG_PLANE = (0, 3)  # xx and yy among a covariance's upper entries
 
 
-def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
+def update_boxes(slots: Slots, which: np.ndarray, gate: float) -> None:
     """Write the boxes of slots (n,) that are up to date, and of their blocks."""
     is_common = slots.generation[which] == COMMON
     common, rowed = which[is_common], which[~is_common]
@@ -117,10 +117,10 @@ def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
     # the landmark's margin, the other the observation's.
     margin = np.sqrt(gate * spread)
     slots.box_m[which, :2], slots.box_m[which, 2:] = (low - margin).T, (high + margin).T
-    bound_blocks(slots, np.unique(which // BLOCK))
+    update_block_boxes(slots, np.unique(which // BLOCK))
 
 
-def bend_boxes(slots: Slots, which: np.ndarray, turn: Float, shift: Float) -> None:
+def transform_boxes(slots: Slots, which: np.ndarray, turn: Float, shift: Float) -> None:
     """Put boxes of slots (n,) around what is in them after motions of the plane.
 
     A motion turns by the cosines and sines `turn` (n, 2) and then shifts by `shift` (n, 2).
@@ -133,7 +133,7 @@ def bend_boxes(slots: Slots, which: np.ndarray, turn: Float, shift: Float) -> No
     slots.box_m[which] = np.concatenate([middle - wide, middle + wide]).T
 
 
-def bound_blocks(slots: Slots, blocks: np.ndarray) -> None:
+def update_block_boxes(slots: Slots, blocks: np.ndarray) -> None:
     """Write the boxes of blocks (n,) around those of their slots."""
     boxes = slots.box_m.reshape(-1, BLOCK, 4)[blocks]
     for side, outermost in enumerate((np.min, np.min, np.max, np.max)):
@@ -141,14 +141,14 @@ def bound_blocks(slots: Slots, blocks: np.ndarray) -> None:
 
 
 @kernel
-def touches(boxes: Float, i: int, box: Float) -> bool:
+def boxes_overlap(boxes: Float, i: int, box: Float) -> bool:
     """Return True if row i of boxes (N, 4) and a box (4,) have a point in common."""
     x = (boxes[i, 0] <= box[2]) & (boxes[i, 2] >= box[0])
     y = (boxes[i, 1] <= box[3]) & (boxes[i, 3] >= box[1])
     return x & y
 
 
-def near(slots: Slots, box: Float) -> np.ndarray:
+def slots_near(slots: Slots, box: Float) -> np.ndarray:
     """Slots, ascending, whose boxes touch a box (4,)."""
     blocks = _touching(slots.block_box_m, box)
     of_blocks = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
@@ -160,7 +160,7 @@ def _touching(boxes: Float, box: Float) -> np.ndarray:
     return np.flatnonzero(np.all((boxes[:, :2] <= box[2:]) & (boxes[:, 2:] >= box[:2]), axis=1))
 
 
-class Tracked:
+class ActiveTracks:
     """The slots of each track that the last frame held."""
 
     def __init__(self) -> None:

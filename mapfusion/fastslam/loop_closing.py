@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.landmarks import Slots
-from mapfusion.fastslam.measurement import NEW, Sightings, quadratic_form
+from mapfusion.fastslam.measurement import NEW, MapObservations, quadratic_form
 from mapfusion.geometry.numerics import (
     Float,
     chi_square_bound,
@@ -29,7 +29,7 @@ from mapfusion.geometry.numerics import (
 
 # Frames between two knots at first. A landmark that has been out of view for less has lost its
 # track, and what the path did meanwhile is in the landmarks that stayed.
-SPACING = 20
+KNOT_SPACING = 20
 # Knots that are kept; with more, every second one goes. A drive seldom closes more loops at once
 # than these tell apart, and closing one takes the square of their number.
 _MOST_KNOTS = 64
@@ -40,13 +40,13 @@ _SAYS_NOTHING = 1e-9
 _WORTH_M = 1e-3
 
 
-class Bends:
+class DriftModel:
     """The bends at K knots and now, jointly Gaussian; each mean is zero once the path has bent."""
 
     def __init__(self) -> None:
         self.frame = -1  # the last that went by
         self._knots = np.zeros(1, dtype=np.int64)  # their frames, ascending
-        self._spacing = SPACING
+        self._spacing = KNOT_SPACING
         self._covariance = np.zeros((6, 6))  # of the first knot and of now, which are the map's
         self._due = np.zeros(6)  # what the path has yet to be bent by
 
@@ -134,7 +134,7 @@ _ROUNDS = 3  # Gauss-Newton steps, as in the proposal
 _LEAST = 3
 
 
-class Seen(NamedTuple):
+class FrameAssociation(NamedTuple):
     """What one particle takes a frame for: K observations at the pose that odometry predicts.
 
     Attributes:
@@ -146,13 +146,13 @@ class Seen(NamedTuple):
     """
 
     chosen: np.ndarray
-    sightings: Sightings
+    sightings: MapObservations
     particle: int
     gate: float
     planar: bool
 
 
-def motion_by_odometry(T_map_predicted: Float, turn: float, sigma: Float) -> Float:
+def odometry_noise_factor(T_map_predicted: Float, turn: float, sigma: Float) -> Float:
     """(3, 3) motion of the plane by each standard deviation of the odometry.
 
     The disturbance shifts the robot in the frame it had before it turned by `turn`, and turns it
@@ -164,7 +164,7 @@ def motion_by_odometry(T_map_predicted: Float, turn: float, sigma: Float) -> Flo
 
 
 def close_loops(
-    bends: Bends, slots: Slots, frame: Seen, by_odometry: Float, probability: float
+    bends: DriftModel, slots: Slots, frame: FrameAssociation, by_odometry: Float, probability: float
 ) -> Float:
     """Learn how the path has bent up to the frame before, if landmarks come back into view.
 
@@ -185,7 +185,7 @@ def close_loops(
     """
     rows = np.flatnonzero(frame.chosen >= 0)
     last = slots.last_frame[frame.chosen[rows]]
-    back = bends.frame + 1 - last > SPACING
+    back = bends.frame + 1 - last > KNOT_SPACING
     n_free = np.count_nonzero(frame.chosen == NEW) + np.count_nonzero(back)
     motion = np.zeros(3)
     covariance, _, _ = _steps(slots, frame, rows[~back], by_odometry, motion, _ROUNDS)
@@ -193,7 +193,7 @@ def close_loops(
     rows, last = rows[back], last[back]
     if len(rows) < _LEAST:
         return drift
-    group_of = last // SPACING  # what went out of view at about the same time
+    group_of = last // KNOT_SPACING  # what went out of view at about the same time
     groups, size = np.unique(group_of, return_counts=True)
     own = [group_of == group for group in groups[size >= _LEAST]]
     if not own:
@@ -206,7 +206,12 @@ def close_loops(
 
 
 def _steps(
-    slots: Slots, frame: Seen, rows: np.ndarray, by_odometry: Float, motion: Float, rounds: int
+    slots: Slots,
+    frame: FrameAssociation,
+    rows: np.ndarray,
+    by_odometry: Float,
+    motion: Float,
+    rounds: int,
 ) -> tuple[Float, Float, Float]:
     """Put the predicted pose right by Gauss-Newton steps.
 
@@ -248,7 +253,9 @@ def _sum_in_order(first: Float, others: Float) -> Float:
     return np.cumsum(np.concatenate([first[None], others]), axis=0)[-1]
 
 
-def _evidence(slots: Slots, frame: Seen, rows: np.ndarray, motion: Float) -> tuple[Float, Float]:
+def _evidence(
+    slots: Slots, frame: FrameAssociation, rows: np.ndarray, motion: Float
+) -> tuple[Float, Float]:
     """What observations say about a further motion after `motion`, weighed as in the proposal.
 
     Returns:

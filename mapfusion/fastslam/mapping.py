@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapfusion.attitude import Attitude, shared_heights
+from mapfusion.attitude import Attitude, attitude_height_errors
 from mapfusion.errors import InputError
 from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, FastSlamParameters, StepResult
@@ -14,7 +14,7 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import require_shape
 from mapfusion.robot_log import RobotLog
 from mapfusion.tables import NO_LABEL
-from mapfusion.viewing import viewing_of
+from mapfusion.viewing import viewing_of_log
 
 # What one source counts for that may say again what another one says: the information of either,
 # times this, is together never more than there is (Julier and Uhlmann 1997).
@@ -96,7 +96,7 @@ def run_log(
         landmarks = replace(slam.best_map(min_count), name=log.robot, calibration=log.calibration)
         seen = slam.best_associations(), slam.best_path()
         if viewing:
-            found = viewing_of(log, *seen, landmarks.source_observation)
+            found = viewing_of_log(log, *seen, landmarks.source_observation)
             landmarks = replace(landmarks, viewing=found)
         if attitude is not None and not log.planar:
             landmarks = _with_attitude(landmarks, log, *seen, attitude)
@@ -139,7 +139,7 @@ def _with_attitude(
     order = np.argsort(landmarks.source_observation, kind="stable")
     place = np.searchsorted(landmarks.source_observation[order], source[rows])
     frame = log.iteration[rows].astype(np.int64)
-    lifted = shared_heights(attitude, path, frame, order[place], landmarks.position_m)
+    lifted = attitude_height_errors(attitude, path, frame, order[place], landmarks.position_m)
     covariance = landmarks.covariance_m2.copy()
     covariance[:, 2, 2] += np.sum(lifted**2, axis=0)
     return replace(landmarks, covariance_m2=covariance)

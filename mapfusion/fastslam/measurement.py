@@ -20,19 +20,19 @@ Vector = tuple[float, float, float]
 Upper = tuple[float, float, float, float, float, float]  # xx, xy, xz, yy, yz, zz
 
 
-class Sightings(NamedTuple):
+class MapObservations(NamedTuple):
     """K observations of one frame, as each of M particles sees them in its map."""
 
     point_m: Float  # (K, M, 3)
     covariance_m2: Float  # (K, M, 6)
 
 
-def sightings(
+def observations_in_map(
     T_map_robot: Float, position_m: Float, covariance_m2: Float, planar: bool
-) -> Sightings:
+) -> MapObservations:
     """Observations (K, 3), (K, 3, 3) of the robot frame in the maps of poses (M, 3)."""
     shape = (len(position_m), len(T_map_robot))
-    seen = Sightings(np.empty((*shape, 3)), np.empty((*shape, 6)))
+    seen = MapObservations(np.empty((*shape, 3)), np.empty((*shape, 6)))
     position, covariance = np.ascontiguousarray(position_m), np.ascontiguousarray(covariance_m2)
     turn = T_map_robot[:, 2]
     _turn_into_map(T_map_robot, np.cos(turn), np.sin(turn), position, covariance, planar, seen)
@@ -47,7 +47,7 @@ def _turn_into_map(
     position: Float,
     covariance: Float,
     planar: bool,
-    seen: Sightings,
+    seen: MapObservations,
 ) -> None:
     for k in range(len(position)):
         x, y, z = position[k, 0], position[k, 1], position[k, 2]
@@ -81,7 +81,7 @@ def inverse_and_determinant(
 
 @kernel(error_model="numpy")
 def innovation(
-    seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool
+    seen: MapObservations, k: int, own: Estimates, r: int, m: int, planar: bool
 ) -> tuple[Vector, Upper, float]:
     """Innovation, inverse of Z (eq. 6) and |Z| of observation k and the landmark of row r.
 
@@ -147,7 +147,7 @@ def update_landmarks(
     own: Estimates,
     row_of: np.ndarray,
     chosen: np.ndarray,
-    seen: Sightings,
+    seen: MapObservations,
     log_new: Float,
     planar: bool,
 ) -> Float:

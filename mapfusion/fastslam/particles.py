@@ -18,13 +18,13 @@ from mapfusion.fastslam.landmarks import (
     Estimates,
     Slots,
     allocate,
-    bend_boxes,
-    bound,
-    bound_blocks,
-    near,
-    with_room,
+    grow,
+    slots_near,
+    transform_boxes,
+    update_block_boxes,
+    update_boxes,
 )
-from mapfusion.fastslam.measurement import NEW, Sightings
+from mapfusion.fastslam.measurement import NEW, MapObservations
 from mapfusion.fastslam.resampling import MEMORY, Genealogy
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import compose
@@ -63,7 +63,7 @@ class ParticleMaps:
 
     def near(self, box_m: Float) -> np.ndarray:
         """Slots whose box touches `box_m` (4,); they may be out of date."""
-        return near(self.slots, box_m)
+        return slots_near(self.slots, box_m)
 
     def bring_up_to_date(self, which: np.ndarray) -> np.ndarray:
         """Write the rows of slots for the present generation; free those that nobody has.
@@ -92,7 +92,7 @@ class ParticleMaps:
 
     def moved(self, which: np.ndarray) -> None:
         """Tell that landmarks of these slots, up to date, have changed: they may lie elsewhere."""
-        bound(self.slots, which, self._gate)
+        update_boxes(self.slots, which, self._gate)
 
     def widen(self, which: np.ndarray, variance_m2: float) -> None:
         """Add to the covariances of these slots' landmarks, along each axis."""
@@ -119,11 +119,15 @@ class ParticleMaps:
             (cos, sin), at = turn[moved].T[:, :, None], means[rows]
             means[rows, :, 0] = cos * at[:, :, 0] - sin * at[:, :, 1] + x[moved, None]
             means[rows, :, 1] = sin * at[:, :, 0] + cos * at[:, :, 1] + y[moved, None]
-        bend_boxes(slots, which, turn, np.stack([x, y], axis=1))
-        bound_blocks(slots, np.arange(len(slots.block_box_m)))
+        transform_boxes(slots, which, turn, np.stack([x, y], axis=1))
+        update_block_boxes(slots, np.arange(len(slots.block_box_m)))
 
     def create(
-        self, chosen: np.ndarray, seen: Sightings, observations: Observations, first_source: int
+        self,
+        chosen: np.ndarray,
+        seen: MapObservations,
+        observations: Observations,
+        first_source: int,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Start a slot for each observation that is NEW in some particle.
 
@@ -134,7 +138,7 @@ class ParticleMaps:
         if len(rows) == 0:
             return rows, rows
         created = self._used_slots.take(len(rows))
-        self.slots = with_room(self.slots, self._used_slots.n_ever, 0)
+        self.slots = grow(self.slots, self._used_slots.n_ever, 0)
         self._give_rows(created)
         slots = self.slots
         slots.generation[created] = self._genealogy.generation
@@ -187,7 +191,7 @@ class ParticleMaps:
     def _give_rows(self, which: np.ndarray) -> None:
         """Rows for slots that have none; what is in them means nothing."""
         rows = self._used_rows.take(len(which))
-        self.slots = with_room(self.slots, 0, self._used_rows.n_ever)
+        self.slots = grow(self.slots, 0, self._used_rows.n_ever)
         self.slots.row[which] = rows
         self.slots.slot_of_row[rows] = which
 
@@ -287,7 +291,7 @@ def _settle(slots: Slots, which: np.ndarray) -> np.ndarray:
 _PRUNED_EVERY = 256
 
 
-class History:
+class PathHistory:
     """Poses, ancestors and associations, a list entry a step.
 
     Of a step only those particles are kept from which some particle of today descends: at first all

@@ -16,7 +16,7 @@ from enum import StrEnum
 import numpy as np
 
 from mapfusion.fastslam.landmarks import LANES, Estimates
-from mapfusion.fastslam.measurement import Sightings, innovation, quadratic_form
+from mapfusion.fastslam.measurement import MapObservations, innovation, quadratic_form
 from mapfusion.geometry.numerics import Float, cholesky, kernel, solve_lower, solve_upper
 
 # Gauss-Newton steps; the turn of a frame is off by 0.1 rad at most, which the second step makes
@@ -33,16 +33,16 @@ class Proposal(StrEnum):
     INFORMED = "informed"  # odometry and observations, with the weights made good
 
 
-def widened(
-    predicted: Sightings, T_map_predicted: Float, odometry: Float, sigma: Float
-) -> Sightings:
+def with_odometry_noise(
+    predicted: MapObservations, T_map_predicted: Float, odometry: Float, sigma: Float
+) -> MapObservations:
     """Sightings at the predicted poses with the odometry's uncertainty in their covariances.
 
     Poses are (M, 3), odometry and its standard deviations `sigma` (3,).
     """
     covariance = predicted.covariance_m2.copy()
     _widen(predicted.point_m, covariance, T_map_predicted, odometry[2], sigma)
-    return Sightings(predicted.point_m, covariance)
+    return MapObservations(predicted.point_m, covariance)
 
 
 @kernel(error_model="numpy")
@@ -67,7 +67,7 @@ def informed_disturbance(
     own: Estimates,
     row_of: np.ndarray,
     chosen: np.ndarray,
-    predicted: Sightings,
+    predicted: MapObservations,
     T_map_predicted: Float,
     turn: float,
     sigma: Float,

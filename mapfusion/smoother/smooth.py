@@ -15,7 +15,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.attitude import Attitude, shared_heights
+from mapfusion.attitude import Attitude, attitude_height_errors
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.joint_covariance import (
     RANK,
@@ -44,7 +44,7 @@ from mapfusion.smoother.optimizer import Problem, Settled, finished, followed, s
 from mapfusion.smoother.problem import Sightings, sightings_of
 from mapfusion.smoother.robust_loss import MOST_DOF, Tails
 from mapfusion.smoother.second_order import SecondOrder, second_order_errors
-from mapfusion.viewing import viewing_of
+from mapfusion.viewing import viewing_of_log
 
 # Probability that two tracks of one corner are not split.
 _TOGETHER = 0.999
@@ -388,7 +388,7 @@ def smoothed_map(
     look = log.observations[source]
     count = np.diff(seen.starts).astype(np.int32)
     about = (count, source, look.descriptor, look.label, log.planar, log.robot)
-    viewing = viewing_of(log, landmark, smoothed.estimate.path, source)
+    viewing = viewing_of_log(log, landmark, smoothed.estimate.path, source)
     return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
 
 
@@ -406,7 +406,9 @@ def condensed_points(smoothed: Smoothed, rank: int = RANK) -> tuple[Float, Joint
 def _with_attitude(smoothed: Smoothed, attitude: Attitude) -> Smoothed:
     """Add the errors of the attitude to the landmarks' shared errors."""
     seen, estimate = smoothed.seen, smoothed.estimate
-    lifted = shared_heights(attitude, estimate.path, seen.frame, seen.landmark, estimate.point_m)
+    lifted = attitude_height_errors(
+        attitude, estimate.path, seen.frame, seen.landmark, estimate.point_m
+    )
     moved = np.zeros((*lifted.shape, 3))
     moved[..., 2] = lifted
     by_path = smoothed.common.spread(np.eye(len(smoothed.common))).T

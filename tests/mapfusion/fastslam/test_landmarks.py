@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.landmarks import FREE, Tracked
-from mapfusion.fastslam.measurement import DROPPED, NEW, sightings
+from mapfusion.fastslam.landmarks import FREE, ActiveTracks
+from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.robot_log import Observations
 from tests.mapfusion.fastslam.landmark_worlds import EXACT_MOTION, nothing, parameters
@@ -102,8 +102,10 @@ def test_the_density_has_no_step_at_the_gate(
 def test_the_end_of_a_track_leaves_alone_what_no_particle_has_any_more() -> None:
     """A row of the dead landmark is another's by then: both would be one from there on."""
     seen = frame([3, 4])
-    maps, tracked = ParticleMaps(2, 9.0), Tracked()
-    places = sightings(np.zeros((2, 3)), seen.position_m, seen.covariance_m2, planar=False)
+    maps, tracked = ParticleMaps(2, 9.0), ActiveTracks()
+    places = observations_in_map(
+        np.zeros((2, 3)), seen.position_m, seen.covariance_m2, planar=False
+    )
     chosen = np.array([[NEW, NEW], [DROPPED, NEW]])  # the second particle alone has the second
     slots, rows = maps.create(chosen, places, seen, 0)
     tracked.went_into(seen.track, chosen, np.stack([rows, slots], axis=1), maps.slots)

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.landmarks import BLOCK, FREE, allocate
-from mapfusion.fastslam.measurement import DROPPED, NEW, sightings
-from mapfusion.fastslam.particles import History, ParticleMaps
+from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
+from mapfusion.fastslam.particles import ParticleMaps, PathHistory
 from mapfusion.fastslam.resampling import MEMORY
 from mapfusion.robot_log import Observations
 
 
-def lives(n_particles: int, n_steps: int, resampled_every: int) -> tuple[History, list]:
+def lives(n_particles: int, n_steps: int, resampled_every: int) -> tuple[PathHistory, list]:
     """A history of made-up steps, and the same as each particle of today would tell it."""
     rng = np.random.default_rng(3)
-    history = History()
+    history = PathHistory()
     told: list = [([], []) for _ in range(n_particles)]
     for step in range(n_steps):
         poses = rng.normal(size=(n_particles, 3))
@@ -53,7 +53,7 @@ def matrix(T: np.ndarray) -> np.ndarray:
 def test_each_bend_moves_the_path_as_the_bends_before_left_it() -> None:
     """The path equals a product of matrices with the last bend leftmost."""
     rng = np.random.default_rng(5)
-    history, told = History(), []
+    history, told = PathHistory(), []
     for step in range(9):
         pose = rng.normal(size=(1, 3))
         history.add(pose, np.empty((0, 1), dtype=np.int32))
@@ -72,7 +72,7 @@ def test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot():
     observations = Observations(
         rng.uniform(-20, 20, (n, 3)), np.tile(sigma_m**2 * np.eye(3), (n, 1, 1))
     )
-    seen = sightings(
+    seen = observations_in_map(
         np.zeros((2, 3)), observations.position_m, observations.covariance_m2, planar=False
     )
     chosen = np.full((n, 2), NEW)
@@ -104,7 +104,9 @@ def test_what_all_particles_have_from_one_ancestor_is_kept_once_and_comes_back()
     rng = np.random.default_rng(1)
     observations = Observations(rng.uniform(-5, 5, (n, 3)), np.tile(0.01 * np.eye(3), (n, 1, 1)))
     poses = rng.normal(0, 0.5, (n_particles, 3))
-    seen = sightings(poses, observations.position_m, observations.covariance_m2, planar=False)
+    seen = observations_in_map(
+        poses, observations.position_m, observations.covariance_m2, planar=False
+    )
     maps = ParticleMaps(n_particles, 9.0)
     slots, _ = maps.create(np.full((n, n_particles), NEW), seen, observations, 0)
     ancestors = np.arange(n_particles, dtype=np.int32)
