@@ -108,8 +108,8 @@ def test_the_end_of_a_track_leaves_alone_what_no_particle_has_any_more() -> None
     )
     chosen = np.array([[NEW, NEW], [DROPPED, NEW]])  # the second particle alone has the second
     slots, rows = maps.create(chosen, places, seen, 0)
-    tracked.went_into(seen.track, chosen, np.stack([rows, slots], axis=1), maps.slots)
-    maps.resampled(np.zeros(2, dtype=np.int32))
+    tracked.update(seen.track, chosen, np.stack([rows, slots], axis=1), maps.slots)
+    maps.resample(np.zeros(2, dtype=np.int32))
     maps.bring_up_to_date(slots[maps.slots.generation[slots] != FREE])
     assert maps.slots.generation[slots[1]] == FREE
     assert tracked.ended(None, maps.slots).tolist() == [slots[0]]

@@ -24,7 +24,7 @@ def lives(n_particles: int, n_steps: int, resampled_every: int) -> tuple[PathHis
             associations.extend(source[:, m])
         if step % resampled_every == 0:
             ancestors = np.sort(rng.integers(n_particles, size=n_particles)).astype(np.int32)
-            history.resampled(ancestors)
+            history.resample(ancestors)
             told = [(list(told[a][0]), list(told[a][1])) for a in ancestors]
     return history, told
 
@@ -60,7 +60,7 @@ def test_each_bend_moves_the_path_as_the_bends_before_left_it() -> None:
         told.append(matrix(pose[0]))
         if step in (3, 5, 8):
             bend = rng.normal(size=(step + 1, 3))
-            history.bent(bend)
+            history.correct(bend)
             told = [matrix(T) @ pose for T, pose in zip(bend, told, strict=True)]
     found = np.array([matrix(pose) for pose in history.path(0)])
     np.testing.assert_allclose(found, told, atol=1e-12)
@@ -91,7 +91,7 @@ def test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot():
             assert maps.near(box).tolist() == sorted(slots[touches & held].tolist())
 
     assert_found(np.ones(n, dtype=bool))
-    maps.resampled(np.array([0, 0], dtype=np.int32))
+    maps.resample(np.array([0, 0], dtype=np.int32))
     maps.bring_up_to_date(slots[maps.slots.generation[slots] != FREE])  # some were visited
     left = np.arange(n) % 3 != 2
     assert maps.n_slots == left.sum()
@@ -111,15 +111,15 @@ def test_what_all_particles_have_from_one_ancestor_is_kept_once_and_comes_back()
     slots, _ = maps.create(np.full((n, n_particles), NEW), seen, observations, 0)
     ancestors = np.arange(n_particles, dtype=np.int32)
     for _ in range(2 * MEMORY):
-        maps.resampled(ancestors)
+        maps.resample(ancestors)
     assert maps.n_rows == n, "particles differ, however long ago they were written"
-    maps.resampled(np.full(n_particles, 2, dtype=np.int32))
+    maps.resample(np.full(n_particles, 2, dtype=np.int32))
     for _ in range(MEMORY):
-        maps.resampled(ancestors)
+        maps.resample(ancestors)
     assert (maps.n_slots, maps.n_rows) == (n, 0)
 
     def assert_known(particle: int) -> None:
-        which, known = maps.of_particle(particle, 1)
+        which, known = maps.landmarks_of(particle, 1)
         np.testing.assert_array_equal(which, slots)
         np.testing.assert_array_equal(known.mean_m, seen.point_m[:, 2])
         np.testing.assert_array_equal(known.covariance_m2, seen.covariance_m2[:, 2])
