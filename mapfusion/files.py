@@ -1,8 +1,8 @@
 """Files on disk: written whole, with an explicit schema, a kind and a version.
 
-Damage to a file is detected when it is read. A Parquet table has a checksum for each page of values.
-Its footer has none, but Arrow writes the schema twice into the footer, and both copies must agree. A
-JSON object contains the SHA-256 of its file.
+Damage to a file is detected when it is read. A Parquet table has a checksum for each page of
+values. Its footer has none, but Arrow writes the schema twice into the footer, and both copies must
+agree. A JSON object contains the SHA-256 of its file.
 """
 
 import base64
@@ -287,14 +287,14 @@ def row_groups(
     try:
         # `pq.read_table` would treat the file as a data set, which takes longer than to read it
         file = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
-        _require_sound_schema(file, data)
+        _require_equal_schemas(file, data)
         names = choose(file.schema_arrow)
         if not file.num_row_groups:
             table = file.schema_arrow.empty_table()
             yield table if names is None else table.select(names)
         for number in range(file.num_row_groups):
             table = file.read_row_group(number, names, use_threads=False)
-            _require_sound_places(file, number, table)
+            _require_disjoint_columns(file, number, table)
             n_rows += len(table)
             yield table if names is None else table.select(names)
         if n_rows != file.metadata.num_rows:
@@ -306,7 +306,7 @@ def row_groups(
         raise DamagedFileError(path, f"damaged or not a Parquet file ({reason})") from error
 
 
-def _require_sound_schema(file: pq.ParquetFile, data: bytes) -> None:
+def _require_equal_schemas(file: pq.ParquetFile, data: bytes) -> None:
     """Raise ValueError unless both copies of the schema agree in a file of ours."""
     found = file.metadata.metadata or {}
     footer = data[-_FOOTER_END - int.from_bytes(data[-_FOOTER_END:][:4], "little") :]
@@ -324,11 +324,11 @@ def _require_sound_schema(file: pq.ParquetFile, data: bytes) -> None:
         raise ValueError("the two copies of its schema differ")
 
 
-def _require_sound_places(file: pq.ParquetFile, number: int, table: pa.Table) -> None:
+def _require_disjoint_columns(file: pq.ParquetFile, number: int, table: pa.Table) -> None:
     """Raise ValueError if columns of a row group overlap in a file that Arrow has written.
 
-    The table must be that of the row group: on a footer that Arrow cannot read, what it shows to
-    Python ends the process.
+    Call this function only with the table that was read from the row group. Access to the metadata
+    of a footer that Arrow cannot read crashes the process.
     """
     group = file.metadata.row_group(number)
     if group.num_rows != len(table):
