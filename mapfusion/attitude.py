@@ -54,7 +54,10 @@ _ABOUT = [
 _OF_FRAMES = [
     described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
     *(described(f, text) for f, text in zip(float_fields(_FIELDS), _ABOUT, strict=True)),
-    *(described(f, "standard deviation of this value") for f in float_fields(_SIGMAS)),
+    *(
+        described(f, f"standard deviation of {value}")
+        for f, value in zip(float_fields(_SIGMAS), _FIELDS, strict=True)
+    ),
 ]
 _ABOUT_CARRIED = "share of the previous row's error that remains in this row, 0 to 1"
 ATTITUDE = schema(
@@ -88,7 +91,7 @@ class Attitude:
             require_shape(name, getattr(self, name), (len(self.value), n))
             require_finite(name, getattr(self, name))
         if np.any(np.abs(self.value[:, :2]) >= np.pi / 2):
-            raise ValueError("value: a body that stands on end or on its head is not level")
+            raise ValueError("value: roll and pitch must be between -90 and 90 degrees")
         if np.any(self.sigma < 0):
             raise ValueError("sigma: is below 0")
         if np.any((self.carried < 0) | (self.carried > 1)):

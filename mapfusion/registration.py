@@ -243,7 +243,7 @@ class Registered(NamedTuple):
 
     @property
     def applied(self) -> Alignment:
-        """The refined alignment with the status of the verdict, for merging."""
+        """Refined alignment with the status of the verdict, for merging."""
         return self.verdict.applied_to(self.refined)
 
     def with_note(self, note: str) -> "Registered":

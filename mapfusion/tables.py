@@ -113,14 +113,14 @@ def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict
     planar = not set(HEIGHT) & set(names)
     found = {field.name: _column(path, table, field, planar) for field in table_schema}
     if missing := [name for name, values in found.items() if values is None]:
-        remedy = f"add to this {kind} table what experiments/docs/formats.md says of them"
+        remedy = f"experiments/docs/formats.md describes the columns of a {kind} table"
         if here := [f"{name} for {similar[name]}" for name in missing if name in similar]:
             more = ", ..." if len(here) > _MAX_NAMED else ""
             remedy = f"did you mean {', '.join(here[:_MAX_NAMED])}{more}?"
         raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")
     if similar:
         asked = " and ".join(f"{there} to {name}" for name, there in similar.items())
-        reason = "a column of an unknown name is left out"
+        reason = "columns with unknown names are ignored"
         raise InputError(f"{path}: rename column {asked} (mind the unit), or remove it: {reason}")
     if planar:
         attributes = {"planar": "true"} | attributes

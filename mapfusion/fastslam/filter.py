@@ -97,7 +97,7 @@ class FastSlamParameters:
 
 @dataclass(frozen=True)
 class StepResult:
-    """The particles after weighting and before resampling.
+    """State of the particles after weighting and before resampling.
 
     Attributes:
         best_pose: (3,) pose of the heaviest particle.

@@ -32,7 +32,7 @@ def spread_matrix(rng: np.random.Generator, size: float) -> Float:
 
 
 class AnyFrames:
-    """The same Gaussian, dense, over the drift_model at these frames, which ascend."""
+    """Dense Gaussian of the drift at some frames, in ascending order."""
 
     def __init__(self, steps: Float, frames: np.ndarray) -> None:
         walk, n = np.cumsum(steps, axis=0)[frames], len(frames)
@@ -41,7 +41,7 @@ class AnyFrames:
         self.frames, self.mean = frames, np.zeros(3 * n)
 
     def add_closure(self, now: int, then: int, motion: Float, noise: Float) -> None:
-        """Bend now less bend then was observed to be a motion."""
+        """Update with an observed difference of the drift between two frames."""
         slope = np.zeros((len(self.frames), 3, 3))
         slope[self.frames == now], slope[self.frames == then] = np.eye(3), -np.eye(3)
         slope = slope.transpose(1, 0, 2).reshape(3, -1)
@@ -178,14 +178,14 @@ GATE, SIGMA = 16.0, np.array([0.05, 0.03, 0.02])
 
 
 class Evidence(DriftModel):
-    """Bends that keep what they are told."""
+    """Drift model that records its closures."""
 
     def add_closure(self, frame, information, pull, now, probability):
         self.told = frame, information, pull, now
 
 
 def loop(planar: bool) -> tuple[Evidence, FrameAssociation, ParticleMaps, np.ndarray, np.ndarray]:
-    """Ten landmarks in two particles: four in view before, three each seen first and a while on."""
+    """Return ten landmarks in two particles: four in view, two groups of three seen earlier."""
     rng = np.random.default_rng(2)
     point = rng.uniform([1, -2, 0], [4, 2, 0 if planar else 1], (12, 3))
     covariance = np.array([root @ root.T for root in rng.normal(0, 0.02, (12, 3, 3))])
@@ -214,7 +214,7 @@ def loop(planar: bool) -> tuple[Evidence, FrameAssociation, ParticleMaps, np.nda
 
 
 def log_likelihood(frame: FrameAssociation, maps: ParticleMaps, rows, motion) -> float:
-    """By Cauchy's loss, as the proposal weighs pairs, after a motion of the plane (x, y, angle)."""
+    """Return the log likelihood with Cauchy loss after a motion of the plane (x, y, angle)."""
     n, total = 2 if frame.planar else 3, 0.0
     upper = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     for k in rows:
@@ -347,7 +347,7 @@ def blind_loop(seed: int, close_loops: bool) -> FastSlam:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_path_and_landmarks_of_a_loop_without_a_look_are_a_line_between_its_ends(seed):
-    """A walk of even steps that is known at both ends: its mean given these adds a line to it."""
+    """A random walk with known ends: its conditional mean adds a linear function."""
     bent, free = blind_loop(seed, True), blind_loop(seed, False)
     n = 2 * KNOT_SPACING
     drawn, path = free.best_path()[:n], bent.best_path()

@@ -11,7 +11,7 @@ from mapfusion.robot_log import Observations
 
 
 def lives(n_particles: int, n_steps: int, resampled_every: int) -> tuple[PathHistory, list]:
-    """A history of made-up steps, and the same as each particle of today would tell it."""
+    """Return a history of random steps, and the expected path and associations per particle."""
     rng = np.random.default_rng(3)
     history = PathHistory()
     told: list = [([], []) for _ in range(n_particles)]
@@ -44,7 +44,7 @@ def test_one_life_is_kept_from_where_all_lines_have_met() -> None:
 
 
 def matrix(T: np.ndarray) -> np.ndarray:
-    """(3, 3) homogeneous matrix of a pose or motion of the plane."""
+    """Return the homogeneous matrix (3, 3) of a pose or motion of the plane."""
     x, y, angle = T
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, x], [sin, cos, y], [0, 0, 1]])

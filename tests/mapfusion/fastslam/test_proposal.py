@@ -1,4 +1,4 @@
-"""The informed proposal: the same posterior as with eq. 3, from particles that are where it is."""
+"""Tests of `mapfusion.fastslam.proposal`: the posterior is the same as with eq. 3."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ DESCRIPTOR = unit(np.random.default_rng(9).standard_normal((4, 64)))
 
 
 def settings_of(proposal: Proposal) -> FastSlamParameters:
-    """The noise of the observations is what it says it is."""
+    """Return settings of 20 particles with a proposal."""
     return FastSlamParameters(n_particles=20, motion=MOTION, proposal=proposal)
 
 
@@ -118,7 +118,7 @@ def test_a_false_pair_does_not_take_the_pose_along() -> None:
 
 
 def many_particles(n: int, n_points: int) -> tuple[Slots, MapObservations, np.ndarray, np.ndarray]:
-    """Landmarks, sightings, poses, and what each particle takes for what; some for nothing."""
+    """Return landmarks, observations, poses and associations, some without a match."""
     rng = np.random.default_rng(8)
     points = rng.uniform((1, -2, 0), (4, 2, 1), (n_points, 3))
     pose = rng.normal(0, 0.03, (n, 3))
