@@ -1,11 +1,11 @@
-"""Landmark maps of independent robots: built by FastSLAM, aligned, merged.
+"""Mapping with FastSLAM, alignment and fusion of landmark maps of independent robots.
 
 Frames are right-handed: x forward, y left, z up; metres, radians, seconds.
 `T_a_b` maps points given in frame b into frame a.
 
-The names below are what a user needs; each is imported when it is first used, so that
-`import mapfusion` costs nothing; `__init__.pyi` tells editors and type checkers the same. See
-`experiments/docs/library.md` for an example.
+The names below are the public interface. Each is imported at its first use, so that
+`import mapfusion` is fast; `__init__.pyi` declares them for editors and type checkers.
+`experiments/docs/library.md` has an example.
 """
 
 import importlib

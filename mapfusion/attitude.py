@@ -1,20 +1,20 @@
-"""Attitude of a robot's body relative to the level map frame, for each frame.
+"""Attitude of the robot's body relative to the level map frame, for each frame of a log.
 
-The robot frame of logs and maps is level: x in the heading of the body, z up, its origin on the
-floor that the map begins on. A body that pitches, rolls or climbs sees points in axes of its own;
-its attitude turns and lifts them. What came to its error while a landmark stays in view is in the
-covariances of a frame's points; what is older all have alike, and is added to the landmarks
-(`attitude_drift.py`). A file beside the log keeps it; a log without one is of a level body.
+The robot frame of logs and maps is level: x along the heading of the body, z up, the origin on the
+floor where the map begins. A body that pitches, rolls or climbs observes points in its own axes;
+its attitude transforms them into the level frame. The covariances of a frame's points contain the
+attitude error that accumulates while a landmark is in view. The older part of the error is common
+to all points of a frame and is added to the landmarks (`attitude_height_errors`). The attitude is
+stored in a file beside the log; a log without this file is from a level body.
 
-Nobody tells how the body stood to begin with, and links between frames add up their errors. A tilt
-that is wrong stays so for a while, and what was seen meanwhile lies on a plane that is tilted as a
-whole. Within a frame and from one to the next that is no noise, and more sightings do not average
-it out. So the landmarks' heights are moved by what a filter calls considered errors (Schmidt 1966,
-"Application of state-space methods to navigation problems"): the estimate stays as it is, its
-covariance has them.
+The initial attitude is unknown, and the errors of relative motions accumulate. A wrong tilt lasts
+for a while and tilts all points observed during that time together. This error is not independent
+noise, so further observations do not average it out. The heights of the landmarks therefore have
+considered errors (Schmidt 1966, "Application of state-space methods to navigation problems"): the
+estimate is unchanged, its covariance includes the errors.
 
-In the plane a wrong tilt moves what is seen by its height above the floor alone, metres where
-levers are tens of them, and the robot's path with it: that is left out.
+In the plane, a wrong tilt moves a point by its height above the floor only, which is much less than
+its distance. This effect is neglected.
 """
 
 from dataclasses import dataclass, replace
@@ -39,7 +39,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se3 import tilt
 from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import Observations
-from mapfusion.tables import told
+from mapfusion.tables import described
 
 FILE = "attitude.parquet"
 _ANGLES = ["roll_rad", "pitch_rad"]
@@ -47,36 +47,39 @@ _FIELDS = [*_ANGLES, "height_m"]
 _SIGMAS = ["sigma_roll_rad", "sigma_pitch_rad", "sigma_height_m"]
 _CARRIED = ["carried_tilt", "carried_height"]
 _ABOUT = [
-    "about the heading, the right side down",
-    "about the axis to the left, looking down",
-    "of the robot's origin above the floor that the map begins on",
+    "rotation about the forward axis, positive with the right side down",
+    "rotation about the left axis, positive with the nose down",
+    "height of the robot's origin above the floor where the map begins",
 ]
 _OF_FRAMES = [
-    told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
-    *(told(f, text) for f, text in zip(float_fields(_FIELDS), _ABOUT, strict=True)),
-    *(told(f, "standard deviation of the same") for f in float_fields(_SIGMAS)),
+    described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+    *(described(f, text) for f, text in zip(float_fields(_FIELDS), _ABOUT, strict=True)),
+    *(
+        described(f, f"standard deviation of {value}")
+        for f, value in zip(float_fields(_SIGMAS), _FIELDS, strict=True)
+    ),
 ]
-_ABOUT_CARRIED = "share of the error of the row before that is left in this one's, 0 to 1"
+_ABOUT_CARRIED = "share of the previous row's error that remains in this row, 0 to 1"
 ATTITUDE = schema(
     "robot_log.attitude",
     2,
-    [*_OF_FRAMES, *(told(f, _ABOUT_CARRIED) for f in float_fields(_CARRIED))],
+    [*_OF_FRAMES, *(described(f, _ABOUT_CARRIED) for f in float_fields(_CARRIED))],
 )
-# Of the version before: each frame's error for itself.
+# Schema version 1: the errors of frames are independent.
 _ATTITUDE_1 = schema("robot_log.attitude", 1, _OF_FRAMES)
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """Attitudes of T frames (T, 3): roll, pitch in radians, height in metres.
+    """Attitudes of T frames.
 
     Attributes:
-        value: roll about the axis ahead (right side down), pitch about the axis to the left
-            (looking down), height of the robot's origin above the floor that the map begins on.
-        sigma: standard deviations of their errors.
-        carried: (T, 2) share of the error of the frame before that is left in each frame's, of roll
-            and pitch and of the height: 0 where each frame is measured for itself, 1 where nothing
-            but motions since the frame before tell.
+        value: (T, 3) roll about the forward axis (right side down) and pitch about the left axis
+            (nose down) in radians, and height in metres of the robot's origin above the floor
+            where the map begins.
+        sigma: (T, 3) standard deviations of the errors of `value`.
+        carried: (T, 2) share of the previous frame's error that remains in each frame, for the
+            tilt and for the height: 0 for independent measurements, 1 for dead reckoning.
     """
 
     value: Float
@@ -88,48 +91,48 @@ class Attitude:
             require_shape(name, getattr(self, name), (len(self.value), n))
             require_finite(name, getattr(self, name))
         if np.any(np.abs(self.value[:, :2]) >= np.pi / 2):
-            raise ValueError("value: a body that stands on end or on its head is not level")
+            raise ValueError("value: roll and pitch must be between -90 and 90 degrees")
         if np.any(self.sigma < 0):
             raise ValueError("sigma: is below 0")
         if np.any((self.carried < 0) | (self.carried > 1)):
             raise ValueError("carried: is not between 0 and 1")
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.value)
 
 
-def moved(observed: Observations, R: Float, t: Float) -> Observations:
-    """The same observations in another frame: turned by R (3, 3), then shifted by t (3,)."""
+def transform_observations(observed: Observations, R: Float, t: Float) -> Observations:
+    """Transform observations into another frame by a rotation R (3, 3) and a shift t (3,)."""
     covariance = R @ observed.covariance_m2 @ R.T
-    covariance = (covariance + covariance.swapaxes(1, 2)) / 2  # as rounding left it
+    covariance = (covariance + covariance.swapaxes(1, 2)) / 2  # symmetric despite rounding
     position = observed.position_m @ R.T + t
     return replace(observed, position_m=position, covariance_m2=covariance)
 
 
-def levelled(observed: Observations, value: Float, sigma: Float) -> Observations:
-    """One frame's observations in the level frame.
+def level_observations(observed: Observations, value: Float, sigma: Float) -> Observations:
+    """Transform one frame's observations from the body frame into the level frame.
 
     Args:
-        observed: in the body's frame.
-        value: (3,) roll, pitch and height, as of `Attitude`.
-        sigma: (3,) of what is not alike in the errors of frames that see the same, which the
-            covariances then include (first order).
+        observed: observations in the body frame.
+        value: (3,) roll, pitch and height, as in `Attitude`.
+        sigma: (3,) standard deviations of the independent part of the error, which the returned
+            covariances include (first order).
     """
     roll, pitch, height_m = value
-    made = moved(observed, tilt(roll, pitch), np.array([0.0, 0.0, height_m]))
-    arm = made.position_m - [0.0, 0.0, height_m]
-    # a roll turns about the pitched axis ahead, a pitch about the axis to the left
+    level = transform_observations(observed, tilt(roll, pitch), np.array([0.0, 0.0, height_m]))
+    arm = level.position_m - [0.0, 0.0, height_m]
+    # a roll rotates about the pitched forward axis, a pitch about the left axis
     by_roll = np.cross(tilt(0.0, pitch)[:, 0], arm)
     by_pitch = np.cross([0.0, 1.0, 0.0], arm)
     upwards = np.broadcast_to([0.0, 0.0, 1.0], arm.shape)
     jacobian = np.stack([by_roll, by_pitch, upwards], -1)
     spread = np.einsum("nij,j,nkj->nik", jacobian, sigma**2, jacobian)
-    return replace(made, covariance_m2=made.covariance_m2 + spread)
+    return replace(level, covariance_m2=level.covariance_m2 + spread)
 
 
 def write_attitude(folder: Path, attitude: Attitude | None) -> None:
-    """Write `attitude.parquet` into a log's folder; None removes what is there."""
+    """Write `attitude.parquet` into a log's folder; None removes the file."""
     if attitude is None:
         (folder / FILE).unlink(missing_ok=True)
         return
@@ -140,14 +143,14 @@ def write_attitude(folder: Path, attitude: Attitude | None) -> None:
 
 
 def read_attitude(folder: Path, n_frames: int | None = None) -> Attitude | None:
-    """Read the attitude of a log; None if its folder holds none, as for level robots.
+    """Read the attitude of a log; None if its folder has no attitude file (a level robot).
 
     Args:
-        folder: of the log.
-        n_frames: of the log; None if it is not known.
+        folder: folder of the log.
+        n_frames: number of frames of the log; None if unknown.
 
     Raises:
-        InputError: the file is damaged, or not as documented.
+        InputError: the file is damaged or not as documented.
     """
     path = folder / FILE
     if not path.is_file():
@@ -164,59 +167,64 @@ def read_attitude(folder: Path, n_frames: int | None = None) -> Attitude | None:
         raise InputError(f"{path}: {error}") from error
 
 
-_MOST_SOURCES = 64  # of new errors along a log; frames between two of them share one
-_SIZE = 3  # of an error: tilts about the map's axes x and y, and a height
+# Number of independent sources of new errors along a log; the frames between two sources share one.
+_MAX_SOURCES = 64
+_SIZE = 3  # components of an error: tilts about the map's axes x and y, and a height
 
 
-def shared_heights(
+def attitude_height_errors(
     attitude: Attitude, path: Float, frame: np.ndarray, landmark: np.ndarray, point_m: Float
 ) -> Float:
-    """How far one sigma of each shared error lifts landmarks: (R, L), in metres.
+    """Return the height error (R, L) in metres of each landmark per sigma of R shared errors.
 
     Args:
-        attitude: of T frames or more.
-        path: (T, 3) of the robot in its map.
-        frame: (N,) of each sighting.
-        landmark: (N,) what it is of: 0 to L - 1, each at least once.
-        point_m: (L, 2) or (L, 3) where these are.
+        attitude: attitudes of at least T frames.
+        path: (T, 3) path of the robot in its map.
+        frame: (N,) frame of each observation.
+        landmark: (N,) landmark of each observation, 0 to L - 1, each at least once.
+        point_m: (L, 2) or (L, 3) positions of the landmarks.
     """
+    # The stated variances (T, 3) contain the error carried over from the frame before. The rest is
+    # new in each frame.
     n = len(path)
-    first = np.unique(np.linspace(1, n, min(_MOST_SOURCES, n), dtype=np.int64))
-    starts = np.concatenate([[0], first[first < n]])  # how the body stood at first is one alone
-    new = np.add.reduceat(_new_variances(attitude, path), starts)
-    order = np.argsort(frame, kind="stable")
-    bounds = np.searchsorted(frame[order], np.arange(n + 1))
-    moved = np.zeros((len(point_m), _SIZE * len(starts)))
-    error, source = np.zeros((_SIZE, _SIZE * len(starts))), 0
-    for k in range(n):
-        if k:
-            error = _carried(attitude, path, k) @ error
-        if source < len(starts) and k == starts[source]:
-            own = slice(_SIZE * source, _SIZE * source + _SIZE)
-            error[:, own] += np.diag(np.sqrt(new[source]))
-            source += 1
-        rows = landmark[order[bounds[k] : bounds[k + 1]]]
-        x, y = (point_m[rows, :2] - path[k, :2]).T
-        np.add.at(moved, rows, np.column_stack([y, -x, np.ones(len(rows))]) @ error)
-    return (moved / np.bincount(landmark, minlength=len(point_m))[:, None]).T
-
-
-def _carried(attitude: Attitude, path: Float, k: int) -> Float:
-    """(3, 3) what the error of frame k - 1 is in frame k: a tilted robot climbs as it goes."""
-    tilt, height = attitude.carried[k]
-    dx, dy = path[k, :2] - path[k - 1, :2]
-    return np.array([[tilt, 0.0, 0.0], [0.0, tilt, 0.0], [height * dy, -height * dx, height]])
-
-
-def _new_variances(attitude: Attitude, path: Float) -> Float:
-    """(T, 3) of the error that comes with each frame, so that all together are as is stated."""
     stated = np.column_stack([np.mean(attitude.sigma[:, :2] ** 2, axis=1)] * 2)
     stated = np.column_stack([stated, attitude.sigma[:, 2] ** 2])
-    new, P = np.zeros((len(path), _SIZE)), np.zeros((_SIZE, _SIZE))
-    for k in range(len(path)):
+    new, P = np.zeros((n, _SIZE)), np.zeros((_SIZE, _SIZE))
+    for k in range(n):
         if k:
-            F = _carried(attitude, path, k)
+            F = _transition(attitude, path, k)
             P = F @ P @ F.T
         new[k] = np.maximum(stated[k] - np.diag(P), 0.0)
         P += np.diag(new[k])
-    return new
+
+    # Sources of new errors; the initial attitude is a source of its own.
+    first = np.unique(np.linspace(1, n, min(_MAX_SOURCES, n), dtype=np.int64))
+    starts = np.concatenate([[0], first[first < n]])
+    variance = np.add.reduceat(new, starts)
+
+    # Propagate the error of each source along the path, and average over a landmark's observations.
+    order = np.argsort(frame, kind="stable")
+    bounds = np.searchsorted(frame[order], np.arange(n + 1))
+    lifted = np.zeros((len(point_m), _SIZE * len(starts)))
+    error, source = np.zeros((_SIZE, _SIZE * len(starts))), 0
+    for k in range(n):
+        if k:
+            error = _transition(attitude, path, k) @ error
+        if source < len(starts) and k == starts[source]:
+            own = slice(_SIZE * source, _SIZE * source + _SIZE)
+            error[:, own] += np.diag(np.sqrt(variance[source]))
+            source += 1
+        rows = landmark[order[bounds[k] : bounds[k + 1]]]
+        x, y = (point_m[rows, :2] - path[k, :2]).T
+        np.add.at(lifted, rows, np.column_stack([y, -x, np.ones(len(rows))]) @ error)
+    return (lifted / np.bincount(landmark, minlength=len(point_m))[:, None]).T
+
+
+def _transition(attitude: Attitude, path: Float, k: int) -> Float:
+    """Return the transition matrix (3, 3) of the error from frame k - 1 to frame k.
+
+    A robot with a tilt error gains a height error as it moves.
+    """
+    tilt, height = attitude.carried[k]
+    dx, dy = path[k, :2] - path[k - 1, :2]
+    return np.array([[tilt, 0.0, 0.0], [0.0, tilt, 0.0], [height * dy, -height * dx, height]])

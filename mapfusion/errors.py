@@ -1,4 +1,4 @@
-"""Errors and warnings that a user reads."""
+"""Errors and warnings with one-line messages for users."""
 
 import difflib
 import itertools
@@ -7,27 +7,27 @@ import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-MOST_CHARACTERS = 500  # of a line: our longest messages fit, with two long paths in them
-_MOST_OF_A_WORD = 120  # a path, as a rule
+MOST_CHARACTERS = 500  # of a message: enough for the longest one with two long paths
+_MAX_WORD = 120  # characters of a word, usually a path
 _GAP = "..."
-_MOST_SUGGESTED = 3  # names; more are no help
-# Share of letters in common, as `difflib` counts them, of names that are alike: two letters of
-# three changed places (ipc, icp) give 2/3; words that only share some letters (nope, opencv) 0.6.
-_LEAST_ALIKE = 0.65
+_MAX_SUGGESTIONS = 3  # names in one message
+# Smallest similarity ratio of `difflib` for a suggestion. Swapped letters in a word of three (ipc,
+# icp) have the ratio 2/3; different words with some common letters (nope, opencv) have 0.6.
+_MIN_SIMILARITY = 0.65
 
 
 class InputError(ValueError):
-    """Something a user gave is unusable.
+    """Unusable input of a user.
 
-    Its text is one line that names the file, the field and what would be right.
+    The message is one line that names the file, the field and the remedy.
     """
 
     def __str__(self) -> str:
         return one_line(super().__str__())
 
 
-class InputErrors(InputError):  # noqa: N818  # several of them
-    """Several things a user gave are unusable; the text has one line for each of `lines`."""
+class InputErrors(InputError):  # noqa: N818  # several errors
+    """Several unusable inputs of a user; the message has one line for each of `lines`."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self.lines = tuple(one_line(line) for line in lines)
@@ -38,9 +38,12 @@ class InputErrors(InputError):  # noqa: N818  # several of them
 
 
 class OutOfRangeError(InputError):
-    """A setting that cannot have its value: its `name`, and the `problem`.
+    """Setting with a value outside its range.
 
-    `also` holds the name and problem of each further setting of the same class.
+    Attributes:
+        name: name of the setting.
+        problem: description of the problem.
+        also: name and problem of each further setting of the same class.
     """
 
     def __init__(self, name: str, problem: str, also: Iterable[tuple[str, str]] = ()) -> None:
@@ -52,7 +55,7 @@ class OutOfRangeError(InputError):
 
 
 class DamagedFileError(InputError):
-    """A file is missing or not as it was written. `path`: which."""
+    """File at `path` that is missing or damaged."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(path, reason)
@@ -63,30 +66,33 @@ class DamagedFileError(InputError):
 
 
 class TellingWarning(UserWarning):
-    """Something a user should know, in one line; the command shows it as it is."""
+    """Warning with a one-line message for users; commands print the message unchanged."""
 
 
-class MendedWarning(TellingWarning):
-    """A damaged stage of the store is made again."""
+class StoreRepairWarning(TellingWarning):
+    """Warning that a damaged stage of the store is computed again."""
 
 
 class NameClashWarning(TellingWarning):
-    """Two methods claim one name; the text says in one line which of them has it."""
+    """Warning that two methods have the same name; the message tells which one is used."""
 
 
 def did_you_mean(wrong: str, known: Iterable[str]) -> str:
-    """The end of a line about an unknown name: those of the known ones that look like it."""
-    like = difflib.get_close_matches(wrong, list(known), _MOST_SUGGESTED, _LEAST_ALIKE)
+    """Return the end of a message about an unknown name: similar known names, or nothing."""
+    like = difflib.get_close_matches(wrong, list(known), _MAX_SUGGESTIONS, _MIN_SIMILARITY)
     return f"; did you mean {' or '.join(like)}?" if like else ""
 
 
 def one_line(text: str) -> str:
-    """Return the text as one line of printable characters, without its middle if it is too long.
+    """Return the text as one line of printable characters, and omit its middle if it is too long.
 
-    Long words are shortened first, so that a quoted value does not displace what is said about it.
-    What is left out of the line are whole words.
+    Long words are shortened first, so that a long value does not displace the rest of the message.
+    Then whole words are omitted.
     """
-    words = [_shortened(_printable(word)) for word in text.split()]
+    escaped = "".join(
+        c if c.isprintable() or c.isspace() else c.encode("unicode_escape").decode() for c in text
+    )
+    words = [_shortened(word) for word in escaped.split()]
     line = " ".join(words)
     if len(line) <= MOST_CHARACTERS:
         return line
@@ -96,21 +102,17 @@ def one_line(text: str) -> str:
 
 
 def _first_of(words: Sequence[str], most: int) -> list[str]:
-    """Return the first of the words that take at most so many characters, with blanks between."""
+    """Return as many of the first words as fit into `most` characters, with blanks between."""
     ends = itertools.accumulate(len(word) + 1 for word in words)
     return [word for word, end in zip(words, ends, strict=True) if end - 1 <= most]
 
 
-def _printable(word: str) -> str:
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in word)
-
-
 def _shortened(word: str) -> str:
-    """Return the first two thirds and the end of a word that is too long."""
-    if len(word) <= _MOST_OF_A_WORD:
+    """Return the beginning and the end of a word that is too long."""
+    if len(word) <= _MAX_WORD:
         return word
-    first = 2 * _MOST_OF_A_WORD // 3
-    return word[:first] + _GAP + word[len(word) - _MOST_OF_A_WORD + first + len(_GAP) :]
+    first = 2 * _MAX_WORD // 3
+    return word[:first] + _GAP + word[len(word) - _MAX_WORD + first + len(_GAP) :]
 
 
 # New modules, and the former modules that plug-ins may import; all names without `mapfusion.`.

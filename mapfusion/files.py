@@ -1,8 +1,8 @@
 """Files on disk: written whole, with an explicit schema, a kind and a version.
 
-Damage to a file is noticed when it is read. A table has the checksums of Parquet: one for each page
-of values. Its footer has none, but Arrow writes the schema into it twice, and the two must agree. A
-JSON object holds the SHA-256 of its file.
+Damage to a file is detected when it is read. A Parquet table has a checksum for each page of
+values. Its footer has none, but Arrow writes the schema twice into the footer, and both copies must
+agree. A JSON object contains the SHA-256 of its file.
 """
 
 import base64
@@ -31,17 +31,17 @@ _PREFIX = "mapfusion."
 _OURS = _PREFIX.encode()
 _ARROW_SCHEMA = b"ARROW:schema"
 _FOOTER_END = 8  # bytes after the footer of Parquet: its length, and the magic number
-# Programs that write the schema twice, and columns one after the other: Arrow's C++ library.
+# Writer that stores the schema twice and columns one after the other: Arrow's C++ library.
 _ARROW = "parquet-cpp-arrow"
 DIGEST = "mapfusion.sha256"  # first field of a JSON object: the SHA-256 of the file with zeros here
 _NO_DIGEST = "0" * 64
-# Errors that Arrow raises on bytes that it cannot read, some of them from Python code it calls.
+# Errors that Arrow raises for unreadable bytes, directly or through Python code that it calls.
 UNREADABLE = (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError)
 PART = ".part"
 _WRITER = re.compile(rf"\.{re.escape(platform.node())}-(?P<pid>\d+)\.[^.]+\.part$")
 
 
-# Writes a file at the path that it is called with; None stands for a file to remove.
+# Function that writes a file at a given path; None for a file to remove.
 Write = Callable[[Path], object] | None
 
 
@@ -89,7 +89,7 @@ def _filled_beside(path: Path, write: Callable[[Path], object]) -> Path:
         temporary.chmod(0o644)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
-        # a full disk is told without a name, or with one that nobody knows
+        # the error of a full disk has no file name, or the temporary one
         if isinstance(error, OSError) and error.filename in (None, name):
             reason = error.strerror or str(error)
             raise OSError(error.errno or errno.EIO, reason, str(path)) from error
@@ -142,7 +142,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
         held = "null" if found is None else f"a {type(found).__name__}"
         raise DamagedFileError(path, f"no JSON object (it holds {held}), expected a {what}")
     name, value = next(iter(found.items()), ("", ""))
-    # a damaged name is noticed, too: no other first field is a digest
+    # detects a damaged name of the field, too: no other first field is a digest
     if name == DIGEST or re.fullmatch("[0-9a-f]{64}", str(value)):
         without = data.replace(str(value).encode(), _NO_DIGEST.encode(), 1)
         if name != DIGEST or hashlib.sha256(without).hexdigest() != value:
@@ -173,22 +173,19 @@ def remove_abandoned(folder: Path) -> None:
     """Remove temporary files that killed processes of this machine left below a folder."""
     for path in list(folder.rglob(f".*{PART}")):
         writer = _WRITER.search(path.name)
-        if not writer or _lives(int(writer["pid"])):
+        if not writer:
+            continue
+        try:
+            os.kill(int(writer["pid"]), 0)
+            continue  # the process is running
+        except ProcessLookupError:
+            pass
+        except OSError:  # the process of another user is running
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # somebody else's
-        return True
-    return True
 
 
 def name_in_text(name: str) -> str:
@@ -243,18 +240,19 @@ def table_write(
         is_list = pa.types.is_fixed_size_list(field.type)
         kind = field.type.value_type if is_list else field.type
         is_bytes = pa.types.is_fixed_size_binary(kind)
-        # nothing packs pixels; what packs numbers smaller takes far longer
+        # pixels do not compress; better compression of numbers is much slower
         leaf = f"{field.name}.list.element" if is_list else field.name
         packed[leaf] = "none" if is_bytes else "lz4"
-        # a dictionary of values that hardly repeat takes as long as all the rest
+        # a dictionary of distinct values would double the time
         if not (is_bytes or pa.types.is_floating(kind)):
             repeats.append(field.name)
     options = {"compression": packed, "use_dictionary": repeats, "write_page_checksum": True}
-    pq.write_table(table, buffer, **options, write_statistics=False)  # damaged ones would mislead
+    pq.write_table(table, buffer, **options, write_statistics=False)  # without checksums
     return lambda temporary: temporary.write_bytes(buffer.getvalue())
 
 
 def _to_arrow(values: Any, kind: pa.DataType) -> pa.Array:
+    """Return values as an Arrow array; lists and bytes of fixed size are rows of a matrix."""
     if pa.types.is_fixed_size_list(kind):
         matrix = np.ascontiguousarray(values).reshape(-1, kind.list_size)
         return pa.FixedSizeListArray.from_arrays(
@@ -289,14 +287,14 @@ def row_groups(
     try:
         # `pq.read_table` would treat the file as a data set, which takes longer than to read it
         file = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True)
-        _require_sound_schema(file, data)
+        _require_equal_schemas(file, data)
         names = choose(file.schema_arrow)
         if not file.num_row_groups:
             table = file.schema_arrow.empty_table()
             yield table if names is None else table.select(names)
         for number in range(file.num_row_groups):
             table = file.read_row_group(number, names, use_threads=False)
-            _require_sound_places(file, number, table)
+            _require_disjoint_columns(file, number, table)
             n_rows += len(table)
             yield table if names is None else table.select(names)
         if n_rows != file.metadata.num_rows:
@@ -308,7 +306,7 @@ def row_groups(
         raise DamagedFileError(path, f"damaged or not a Parquet file ({reason})") from error
 
 
-def _require_sound_schema(file: pq.ParquetFile, data: bytes) -> None:
+def _require_equal_schemas(file: pq.ParquetFile, data: bytes) -> None:
     """Raise ValueError unless both copies of the schema agree in a file of ours."""
     found = file.metadata.metadata or {}
     footer = data[-_FOOTER_END - int.from_bytes(data[-_FOOTER_END:][:4], "little") :]
@@ -326,11 +324,11 @@ def _require_sound_schema(file: pq.ParquetFile, data: bytes) -> None:
         raise ValueError("the two copies of its schema differ")
 
 
-def _require_sound_places(file: pq.ParquetFile, number: int, table: pa.Table) -> None:
+def _require_disjoint_columns(file: pq.ParquetFile, number: int, table: pa.Table) -> None:
     """Raise ValueError if columns of a row group overlap in a file that Arrow has written.
 
-    The table must be that of the row group: on a footer that Arrow cannot read, what it shows to
-    Python ends the process.
+    Call this function only with the table that was read from the row group. Access to the metadata
+    of a footer that Arrow cannot read crashes the process.
     """
     group = file.metadata.row_group(number)
     if group.num_rows != len(table):

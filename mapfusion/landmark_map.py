@@ -1,11 +1,11 @@
 """Landmark map of one robot in its own frame, and its files.
 
-One row a landmark, in the order of the map. What is the landmark's own is stored as it is. What the
-shared variables do to it is stored in single precision, a ten-millionth of its size.
+A map is one Parquet file with one row a landmark, readable with plain pandas. It contains the
+descriptor (or label) of the observation that created each landmark. Files beside the map hold the
+joint covariance of the landmarks' errors and the viewing evidence, if they are known.
 
-One map is one Parquet file, readable with plain pandas, complete in itself: the descriptor (or
-label) of the observation that each landmark came from is carried with it. What the landmarks'
-errors have in common, and from where they were seen, lies in files beside it, where it is known.
+The file of a joint covariance stores the independent part of each landmark's covariance in double
+precision, and the effect of the shared variables in single precision.
 """
 
 import warnings
@@ -42,131 +42,122 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import require_finite, require_no_twins, require_points, require_shape
 from mapfusion.robot_log import with_rows
 from mapfusion.tables import (
+    APPEARANCE_FIELDS,
     DESCRIPTOR_LENGTH,
     HEIGHT,
-    LOOK_FIELDS,
+    appearance_columns,
+    appearance_from,
     csv_bytes,
+    described,
     is_csv,
-    look_columns,
-    looks_from,
     read_open_table,
-    require_looks,
-    told,
+    require_appearance,
 )
 from mapfusion.viewing import Viewing, read_viewing, viewing_writes
 
 _OWN_FIELDS = [f"own_{name}" for name in COVARIANCE_FIELDS]
-# Of marginal covariances, as a share of their trace: what single precision may change, with room.
-_SAME = 1e-4
+# Largest difference of marginal covariances as a share of the trace; errors of single precision are
+# much smaller.
+_MARGINAL_TOLERANCE = 1e-4
 _KIND = "joint_covariance"
 
 
 def joint_schema(rank: int) -> pa.Schema:
-    """Schema of the file, for R shared variables."""
+    """Return the schema of a joint covariance with R shared variables."""
     cell = pa.list_(pa.float32(), 3 * rank)
-    own = (told(field, "what is the landmark's own") for field in float_fields(_OWN_FIELDS))
-    moved = "how far one sigma of each of R shared variables moves it: x, y, z of the first, ..."
-    return schema(_KIND, 1, [*own, told(pa.field("common_m", cell), moved)])
-
-
-def _joint_columns(joint: JointCovariance, rank: int) -> dict[str, np.ndarray]:
-    """The columns of `joint_schema(rank)`; variables beyond those there are move nothing."""
-    common = np.zeros((len(joint), rank, 3), dtype=np.float32)
-    common[:, : joint.rank] = joint.common_m
-    own = covariance_columns(_OWN_FIELDS, joint.own_m2)
-    return own | {"common_m": common.reshape(-1, 3 * rank)}
-
-
-def _joint_from(table: pa.Table) -> JointCovariance:
-    """The inverse of `_joint_columns`."""
-    common = column(table, "common_m").astype(np.float64)
-    common = common.reshape(len(common), common.shape[1] // 3, 3)
-    return JointCovariance(covariances_from(table, _OWN_FIELDS), common)
+    own = (
+        described(field, "independent part of the landmark's covariance")
+        for field in float_fields(_OWN_FIELDS)
+    )
+    moved = "shift per sigma of each of R shared variables: x, y, z of the first, ..."
+    return schema(_KIND, 1, [*own, described(pa.field("common_m", cell), moved)])
 
 
 def joint_path(map_path: Path) -> Path:
-    """Where the joint covariance of a map's file lies."""
+    """Return the path of the joint covariance beside a map's file."""
     return map_path.with_suffix(".joint.parquet")
 
 
 def joint_writes(map_path: Path, joint: JointCovariance | None) -> dict[Path, Write]:
-    """Return what is to be written beside a map's file; of None what lay there is removed."""
+    """Return the writes of the file beside a map's file; None removes this file."""
     path = joint_path(map_path)
     if joint is None:
         return {path: None}
-    rank = max(joint.rank, 1)  # a cell of no numbers is none
-    return {path: table_write(_joint_columns(joint, rank), joint_schema(rank))}
+    rank = max(joint.rank, 1)  # a list type needs at least one number
+    common = np.zeros((len(joint), rank, 3), dtype=np.float32)
+    common[:, : joint.rank] = joint.common_m
+    columns = covariance_columns(_OWN_FIELDS, joint.own_m2)
+    columns |= {"common_m": common.reshape(-1, 3 * rank)}
+    return {path: table_write(columns, joint_schema(rank))}
 
 
 def read_joint(map_path: Path, covariance_m2: Float) -> JointCovariance | None:
-    """The joint covariance beside a map's file; None where there is none.
+    """Read the joint covariance beside a map's file; None if there is none.
 
     Args:
         map_path: file of the map.
-        covariance_m2: (N, 3, 3) of its landmarks.
+        covariance_m2: (N, 3, 3) covariances of the map's landmarks.
 
     Raises:
-        InputError: it is damaged, of another version, or of another map.
+        InputError: the file is damaged, has another version or belongs to another map.
     """
     path = joint_path(map_path)
     if not path.is_file():
         return None
     table = read_parquet(path, f"{_KIND} table")
-    require_kind(path, table, text_attributes(path, table), joint_schema(_rank(table)))
+    known = "common_m" in table.column_names
+    cell = table.schema.field("common_m").type if known else pa.null()
+    rank = cell.list_size // 3 if pa.types.is_fixed_size_list(cell) else 1
+    require_kind(path, table, text_attributes(path, table), joint_schema(rank))
     try:
-        joint = _joint_from(table)
+        common = column(table, "common_m").astype(np.float64).reshape(table.num_rows, rank, 3)
+        joint = JointCovariance(covariances_from(table, _OWN_FIELDS), common)
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
     if len(joint) != len(covariance_m2):
         own = f"of {len(joint)} landmarks, {map_path.name} has {len(covariance_m2)}"
         raise InputError(f"{path}: {own}; remove it, or give the map that it belongs to")
     off = np.abs(joint.marginal_m2 - covariance_m2).max(axis=(1, 2), initial=0.0)
-    wrong = np.flatnonzero(off > _SAME * np.trace(covariance_m2, axis1=1, axis2=2))
+    wrong = np.flatnonzero(off > _MARGINAL_TOLERANCE * np.trace(covariance_m2, axis1=1, axis2=2))
     if len(wrong):
         other = f"another covariance than {map_path.name} in row {wrong[0]}"
         raise InputError(f"{path}: {other}; remove it, or give the map that it belongs to")
     return joint
 
 
-def _rank(table: pa.Table) -> int:
-    """R of a table; 1 of one that is none."""
-    known = "common_m" in table.column_names
-    kind = table.schema.field("common_m").type if known else pa.null()
-    return kind.list_size // 3 if pa.types.is_fixed_size_list(kind) else 1
-
-
 LANDMARKS = schema(
     "landmark_map",
     1,
     [
-        *(told(field, "in the map's frame") for field in point_fields()),
-        told(pa.field("count", pa.int32()), "observations that went into the landmark", 1),
-        told(
+        *(described(field, "in the map frame") for field in point_fields()),
+        described(pa.field("count", pa.int32()), "number of observations of the landmark", 1),
+        described(
             pa.field("source_observation", pa.int64()),
-            "row of the log that it came from, -1 for none",
+            "row of the log that created the landmark, -1 for none",
             -1,
         ),
-        *LOOK_FIELDS,
+        *APPEARANCE_FIELDS,
     ],
 )
 
 
 @dataclass(frozen=True)
 class LandmarkMap:
-    """N landmarks of one map.
+    """Map of N landmarks.
 
     Attributes:
         position_m: (N, 3).
         covariance_m2: (N, 3, 3).
-        count: (N,) int32 observations each landmark was made of.
-        source_observation: (N,) int64 row in the robot's log of the observation it came from.
+        count: (N,) int32 number of observations of each landmark.
+        source_observation: (N,) int64 row in the robot's log of the observation that created it.
         descriptor: (N, 64) float32, or None.
         label: (N,) int32, or None.
         planar: z is 0 and carries no information (2 degrees of freedom).
-        name: whose map it is.
-        joint: what the landmarks' errors have in common, or None; its marginals are covariance_m2.
-        viewing: from where they were seen and what the robot looked through, or None.
-        calibration: of the camera that saw them, what all share by it; neither covariance has it.
+        name: name of the map.
+        joint: joint covariance of the landmarks' errors, or None; its marginals are covariance_m2.
+        viewing: viewing evidence, or None.
+        calibration: error of the camera calibration, which all landmarks share; neither covariance
+            includes it.
     """
 
     position_m: Float
@@ -208,34 +199,41 @@ class LandmarkMap:
         return replace(bare, joint=joint, viewing=viewing)
 
 
-MAP_ENDINGS = (".parquet", ".csv")  # that maps are written with
+MAP_ENDINGS = (".parquet", ".csv")  # of the files that `write_map` writes
 
 
 def write_map(path: Path, landmarks: LandmarkMap) -> None:
-    """Write a map to a file, Parquet or CSV by its ending, and replace what was there.
+    """Write a map as Parquet or CSV, by the ending of the path; replaces an existing file.
 
-    What a Parquet map has of a joint covariance and viewing evidence lies beside it. A CSV map is
-    one file, without these and without metadata: what it leaves out is told by a TellingWarning.
+    The joint covariance and the viewing evidence of a Parquet map are written beside it. A CSV map
+    is one file without these and without metadata; a TellingWarning names the omitted parts.
 
     Raises:
-        InputError: the ending is another.
-        OSError: a file cannot be written; then what was there stays as it was.
+        InputError: the path has another ending.
+        OSError: a file cannot be written; existing files are then unchanged.
     """
     write_together(map_writes(path, landmarks))
 
 
 def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
-    """Return what `write_map` is to write or remove, by file."""
+    """Return the writes and removals of `write_map`, by file."""
     if path.suffix.lower() not in MAP_ENDINGS:
         raise InputError(f"{path}: maps are written as {' or '.join(MAP_ENDINGS)}")
     columns = {
         **point_columns(landmarks.position_m, landmarks.covariance_m2),
         "count": landmarks.count.astype(np.int32),
         "source_observation": landmarks.source_observation.astype(np.int64),
-        **look_columns(len(landmarks), landmarks.descriptor, landmarks.label),
+        **appearance_columns(len(landmarks), landmarks.descriptor, landmarks.label),
     }
     if is_csv(path):
-        _tell_left_out(path, landmarks)
+        parts = {
+            "joint covariance": landmarks.joint is not None,
+            "viewing evidence": landmarks.viewing is not None,
+            "calibration error": landmarks.calibration != EXACT,
+        }
+        if lost := [name for name, there in parts.items() if there]:
+            text = f"{path}: CSV cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
+            warnings.warn(text, TellingWarning, stacklevel=3)
         absent = {"label"} if landmarks.label is None else set()
         absent |= {"descriptor"} if landmarks.descriptor is None else set()
         absent |= set(HEIGHT) if landmarks.planar else set()
@@ -251,23 +249,14 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
     }
 
 
-def _tell_left_out(path: Path, landmarks: LandmarkMap) -> None:
-    """Warn of what a CSV map cannot hold of a map."""
-    parts = {
-        "joint covariance": landmarks.joint is not None,
-        "viewing evidence": landmarks.viewing is not None,
-        "calibration error": landmarks.calibration != EXACT,
-    }
-    if lost := [name for name, there in parts.items() if there]:
-        text = f"{path}: CSV cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
-        warnings.warn(text, TellingWarning, stacklevel=4)
-
-
 def read_map(path: Path, alone: bool = False) -> LandmarkMap:
-    """Read a map; raises InputError naming the file.
+    """Read a map.
 
-    Of a Parquet map what lies beside it is read, too, unless it is asked for `alone`. A CSV map
-    stands alone: what lies beside it belongs to the Parquet map of its name.
+    The files beside a Parquet map are read, too, unless `alone` is True. Files beside a CSV map are
+    not read, since they belong to the Parquet map of the same name.
+
+    Raises:
+        InputError: a file is missing, damaged or not as documented.
     """
     table, attributes = read_open_table(path, LANDMARKS)
     finite = "give a finite number, or remove the row"
@@ -276,7 +265,7 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
     require_cells(path, table, ["count"], lambda count: count >= 1, counted)
     of_log = "give -1 for none, or a row of the log: 0 and more"
     require_cells(path, table, ["source_observation"], lambda row: row >= -1, of_log)
-    require_looks(path, table)
+    require_appearance(path, table)
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
     try:
@@ -285,7 +274,7 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
             covariance,
             column(table, "count"),
             column(table, "source_observation"),
-            *looks_from(table),
+            *appearance_from(table),
             planar,
             attributes.get("name", name_in_text(path.stem)),
             calibration=calibration_from(attributes, path),

@@ -1,4 +1,4 @@
-"""Checks of arguments and settings; a refusal names the argument."""
+"""Checks of arguments and settings; error messages name the argument."""
 
 import functools
 import math
@@ -13,7 +13,7 @@ from annotated_types import BaseMetadata, Ge, GroupedMetadata, Le
 
 from mapfusion.errors import OutOfRangeError
 
-# Above these limits the squares and determinants of a gate lose too many digits.
+# Above these limits, rounding errors of squared distances and determinants are too large.
 LARGEST_POSITION_M = 1e7
 LARGEST_SIGMA_M = 1e5
 
@@ -113,7 +113,7 @@ class Range(GroupedMetadata):
         yield Unit(self.unit)
 
     def problem(self, number: float) -> str:
-        """Return what is wrong with a number outside the range; empty for one inside."""
+        """Return a message for a number outside the range; empty for a number inside."""
         if self.low <= number <= self.high:
             return ""
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -152,11 +152,19 @@ def _declares(hint: Any) -> bool:
 
 
 def _require_as_declared(name: str, value: Any, hint: Any) -> None:
+    """Raise OutOfRangeError if a value, or an item of a value, is outside the range of its hint."""
     parts = get_args(hint)
     if hasattr(hint, "__metadata__"):
         for bounds in hint.__metadata__:
-            if isinstance(bounds, Range):
-                _require_inside(name, value, hint.__origin__, bounds)
+            if not isinstance(bounds, Range):
+                continue
+            is_integer = hint.__origin__ is int
+            kind: Any = Integral if is_integer else Real
+            if isinstance(value, bool) or not isinstance(value, kind):
+                expected = "an integer" if is_integer else "a number"
+                raise OutOfRangeError(name, f"is {value!r}, expected {expected}")
+            if problem := bounds.problem(value):
+                raise OutOfRangeError(name, problem)
         _require_as_declared(name, value, parts[0])
     elif isinstance(value, tuple | list):
         # items of a tuple have one range each, or the same range as in a list
@@ -168,17 +176,8 @@ def _require_as_declared(name: str, value: Any, hint: Any) -> None:
         _require_as_declared(name, value, next(each for each in parts if each is not NoneType))
 
 
-def _require_inside(name: str, number: Any, kind: Any, bounds: Range) -> None:
-    wanted: Any = Integral if kind is int else Real
-    called = "an integer" if kind is int else "a number"
-    if isinstance(number, bool) or not isinstance(number, wanted):
-        raise OutOfRangeError(name, f"is {number!r}, expected {called}")
-    if problem := bounds.problem(number):
-        raise OutOfRangeError(name, problem)
-
-
 def require_at_least(least: float, settings: object, *names: str) -> None:
-    """Raise OutOfRangeError when one of these settings is not `least` or more."""
+    """Raise OutOfRangeError if one of the named settings is below `least`."""
     for name in names:
         if not getattr(settings, name) >= least:
             raise OutOfRangeError(name, f"is {getattr(settings, name)}, must be at least {least:g}")

@@ -31,10 +31,16 @@ from mapfusion.verification.false_alarms import Verdict
 from mapfusion.verification.verdict import Judge, PairEvidence, PairJudge
 
 
-class Completion:
-    """Of estimates on one pair of maps.
+class EstimateVerifier:
+    """Refinement and verdict for estimates on one pair of maps.
 
-    Equal estimates are refined once, and what becomes the same by that is judged once.
+    Equal estimates are refined once, and equal refined alignments are judged once.
+
+    Args:
+        pairs: correspondences of the two maps.
+        refinement: least squares after the estimate.
+        judge: gives the verdict; None accepts what the refinement accepts.
+        evidence: evidence found earlier for these maps; None to compute it when needed.
     """
 
     def __init__(
@@ -44,41 +50,39 @@ class Completion:
         judge: Judge | None,
         evidence: PairEvidence | None = None,
     ) -> None:
-        """For some correspondences; the others are those of `Registration` and of its `on`."""
         self.pairs, self._refinement = pairs, refinement
         self.judge: PairJudge | None = judge.on(pairs, evidence) if judge is not None else None
         self._refined: dict[tuple, Alignment] = {}
         self._judged: dict[tuple, Verdict] = {}
 
-    def of(self, estimated: Alignment) -> tuple[Alignment, Verdict]:
-        """An estimate refined, and the verdict on that."""
+    def verify(self, estimated: Alignment) -> tuple[Alignment, Verdict]:
+        """Return the refined alignment of an estimate, and the verdict on it."""
         refined = estimated
         if estimated.status not in NOT_RUN:
             known = (estimated.T_a_b.tobytes(), estimated.status, estimated.reason)
             if known not in self._refined:
                 found = self._refinement.refine(self.pairs, estimated.T_a_b)
-                if np.isnan(estimated.T_a_b).any():  # why, only the estimator can tell
+                if np.isnan(estimated.T_a_b).any():  # only the estimator knows the reason
                     found = replace(found, reason=estimated.reason)
                 self._refined[known] = found
             refined = self._refined[known]
         arrays = (array.tobytes() for array in (refined.T_a_b, refined.covariance, refined.inlier))
         known = (*arrays, refined.drift_sigma_m, refined.status, refined.reason)
         if known not in self._judged:
-            self._judged[known] = self._judge(refined)
+            self._judged[known] = (
+                Verdict(refined.status, np.nan, refined.reason)
+                if self.judge is None
+                else self.judge.judge(refined)
+            )
         return refined, self._judged[known]
-
-    def _judge(self, refined: Alignment) -> Verdict:
-        if self.judge is None:
-            return Verdict(refined.status, np.nan, refined.reason)
-        return self.judge.judge(refined)
 
 
 class Aligner(Protocol):
-    """Whoever answers with a whole `Alignment`: a `MethodAligner`, or a process of its own."""
+    """Interface of a class that returns a complete `Alignment`."""
 
     @property
     def randomised(self) -> bool:
-        """Whether another generator can give another answer."""
+        """True if the result depends on the random generator."""
         ...
 
     def align(
@@ -94,13 +98,13 @@ class Aligner(Protocol):
 
 @dataclass(frozen=True)
 class MethodAligner:
-    """A method with all that its mathematics leaves out: gathering, refusal, covariance, time."""
+    """Aligner from a method: selects its input and adds refusal, covariance and time."""
 
     method: Method
 
     @property
     def randomised(self) -> bool:
-        """Whether another generator can give another answer."""
+        """True if the result depends on the random generator."""
         return self.method.randomised
 
     def align(
@@ -119,76 +123,76 @@ class MethodAligner:
         return self._align(Pairs(map_a, map_b, correspondences), rng, started_s)
 
     def align_again(self, pairs: Pairs, rng: np.random.Generator) -> Alignment:
-        """The same of pairs that it was given before: the method may have kept what helps it."""
+        """Estimate T_a_b again from the same pairs, for which the method may hold cached data."""
         return self._align(pairs, rng, time.perf_counter())
 
     def _align(self, pairs: Pairs, rng: np.random.Generator, started_s: float) -> Alignment:
         height = getattr(self.method, "height", None)
         needs = getattr(self.method, "needs", None) or Needs()
-        offer = _Offer.of(pairs, height if isinstance(height, HeightGate) else None, needs)
-        if offer.too_little:
-            return undetermined(offer.too_little, len(pairs), started_s)
-        found = self.method.find(offer.given, rng)
+        gate = height if isinstance(height, HeightGate) else None
+        selection = _MethodInput.select(pairs, gate, needs)
+        if selection.shortage:
+            return undetermined(selection.shortage, len(pairs), started_s)
+        found = self.method.find(selection.pairs, rng)
         if isinstance(found, Undetermined):
             return undetermined(found.reason, len(pairs), started_s)
-        answer = offer.answers.get(content := _content(found))
-        if answer is None:
-            answer = alignment_of_fit(found, pairs, offer.rows, started_s)
-            offer.answers[content] = answer
-        return replace(answer, elapsed_s=time.perf_counter() - started_s)
+        # equal fits give equal alignments
+        fitted = None if found.fitted is None else found.fitted.correspondences
+        indices = (None, None) if fitted is None else (fitted.index_a, fitted.index_b)
+        arrays = (found.T_a_b, found.inlier, found.weight, found.gain, *indices)
+        key = (
+            *(None if array is None else np.asarray(array).tobytes() for array in arrays),
+            found.gate_m,
+            found.refusal,
+        )
+        alignment = selection.alignments.get(key)
+        if alignment is None:
+            alignment = alignment_of_fit(found, pairs, selection.rows, started_s)
+            selection.alignments[key] = alignment
+        return replace(alignment, elapsed_s=time.perf_counter() - started_s)
 
 
-class _Offer(NamedTuple):
-    """What a method is given of the pairs of two maps.
+class _MethodInput(NamedTuple):
+    """Pairs that a method gets of all pairs of two maps.
 
     Attributes:
-        rows: (n,) of all pairs.
-        given: those.
-        too_little: why they are less than the method needs; empty when they are not.
-        answers: that fits of them made, by their content.
+        rows: (n,) rows of these pairs among all pairs.
+        pairs: these pairs.
+        shortage: reason why the pairs are not enough for the method; empty if they are.
+        alignments: alignments of earlier fits to these pairs, by the content of the fit.
     """
 
     rows: np.ndarray
-    given: Pairs
-    too_little: str
-    answers: dict[tuple, Alignment]
+    pairs: Pairs
+    shortage: str
+    alignments: dict[tuple, Alignment]
 
     @classmethod
-    def of(cls, pairs: Pairs, height: HeightGate | None, needs: Needs) -> "_Offer":
-        """That of the last call with these pairs, of the same gate and needs, if there was one."""
-        offers: dict[tuple, _Offer] = pairs.kept.setdefault(cls, {})
-        if (height, needs) not in offers:
+    def select(cls, pairs: Pairs, height: HeightGate | None, needs: Needs) -> "_MethodInput":
+        """Return the input for a height gate and needs; equal calls share one object."""
+        inputs: dict[tuple, _MethodInput] = pairs.kept.setdefault(cls, {})
+        if (height, needs) not in inputs:
             rows = np.arange(len(pairs)) if height is None else pairs.of_one_height(height)
             given = pairs if len(rows) == len(pairs) else pairs[rows]
-            offers[height, needs] = cls(rows, given, _why_not_called(needs, pairs, given), {})
-        return offers[height, needs]
-
-
-def _why_not_called(needs: Needs, pairs: Pairs, given: Pairs) -> str:
-    """Why the pairs given to a method are less than it needs; empty when they are not."""
-    shortage = pairs.correspondences.shortage
-    reason = why_too_few(pairs.map_a, pairs.map_b, len(pairs), needs.pairs, shortage)
-    if not reason and len(given) < needs.pairs:
-        n, least = len(given), needs.pairs
-        reason = f"the heights of {n} correspondences agree, at least {least} are needed"
-    return reason or needs.why_without_extent(given)
-
-
-def _content(fit: Fit) -> tuple:
-    """All that a fit says; two of the same content are the same answer."""
-    fitted = None if fit.fitted is None else fit.fitted.correspondences
-    indices = (None, None) if fitted is None else (fitted.index_a, fitted.index_b)
-    arrays = (fit.T_a_b, fit.inlier, fit.weight, fit.gain, *indices)
-    told = (None if array is None else np.asarray(array).tobytes() for array in arrays)
-    return (*told, fit.gate_m, fit.refusal)
+            shortage = pairs.correspondences.shortage
+            reason = why_too_few(pairs.map_a, pairs.map_b, len(pairs), needs.pairs, shortage)
+            if not reason and len(given) < needs.pairs:
+                n, least = len(given), needs.pairs
+                reason = f"the heights of {n} correspondences agree, at least {least} are needed"
+            inputs[height, needs] = cls(rows, given, reason or needs.why_without_extent(given), {})
+        return inputs[height, needs]
 
 
 def alignment_of_fit(
     found: Fit | Undetermined, pairs: Pairs, rows: np.ndarray, started_s: float
 ) -> Alignment:
-    """A method's answer with drift and covariance judged from the residuals that it fitted.
+    """Return the alignment of a fit, with drift and covariance estimated from the residuals.
 
-    It was given `rows` (n,) of all N pairs, at `time.perf_counter()` `started_s`.
+    Args:
+        found: result of the method.
+        pairs: all N pairs.
+        rows: (n,) rows of the pairs that the method got.
+        started_s: `time.perf_counter()` at the start.
     """
     if isinstance(found, Undetermined):
         return undetermined(found.reason, len(pairs), started_s)
@@ -220,17 +224,17 @@ def alignment_of_fit(
 
 
 def as_aligner(method: Method | Aligner) -> Aligner:
-    """The method as one that answers whole: by `align` where it has it, else around `find`."""
+    """Return an aligner for a method: the method itself if it has `align`."""
     return method if hasattr(method, "align") else MethodAligner(method)  # type: ignore[return-value]
 
 
 class Registered(NamedTuple):
-    """One registration of two maps.
+    """Result of one registration of two maps.
 
     Attributes:
-        estimated: the method's answer.
-        refined: after the common least squares; a method that did not run leaves its answer here.
-        verdict: on the refined one.
+        estimated: alignment of the method.
+        refined: alignment after least squares; equals `estimated` if the method did not run.
+        verdict: verdict on the refined alignment.
     """
 
     estimated: Alignment
@@ -239,11 +243,11 @@ class Registered(NamedTuple):
 
     @property
     def applied(self) -> Alignment:
-        """What merging may use: the refined alignment, refused where the verdict says so."""
+        """Refined alignment with the status of the verdict, for merging."""
         return self.verdict.applied_to(self.refined)
 
-    def explained(self, note: str) -> "Registered":
-        """Return the same with a note on the maps behind each reason why it is not accepted."""
+    def with_note(self, note: str) -> "Registered":
+        """Append a note on the maps to each reason for a rejection."""
         if not note or self.verdict.accepted or self.estimated.status in NOT_RUN:
             return self
         estimated, refined, verdict = (
@@ -261,12 +265,12 @@ class Registered(NamedTuple):
 
 @dataclass(frozen=True)
 class Registration:
-    """Estimate, refine, judge.
+    """Registration of two maps: estimate, refine, judge.
 
     Attributes:
-        method: what finds the motion, or answers with a whole alignment.
-        refinement: the least squares after it.
-        judge: gives the verdict after that; None accepts whatever the refinement does.
+        method: estimates the motion.
+        refinement: least squares after the estimate.
+        judge: gives the verdict; None accepts what the refinement accepts.
     """
 
     method: Method | Aligner
@@ -275,7 +279,7 @@ class Registration:
 
     @property
     def randomised(self) -> bool:
-        """Whether another generator can give another answer."""
+        """True if the result depends on the random generator."""
         return self.method.randomised
 
     def on(
@@ -285,20 +289,20 @@ class Registration:
         correspondences: Correspondences,
         evidence: PairEvidence | None = None,
     ) -> "PairRegistration":
-        """Made ready for two maps, to be run any number of times.
+        """Return the registration of two maps, which can run any number of times.
 
         Args:
-            map_a: frame a.
-            map_b: frame b.
-            correspondences: of the two.
-            evidence: what was found for them before; sought where it is needed if None.
+            map_a: map in frame a.
+            map_b: map in frame b.
+            correspondences: correspondences of the two maps.
+            evidence: evidence found earlier for these maps; None to compute it when needed.
 
         Raises:
             ValueError: an index of the correspondences lies outside its map.
         """
         pairs = Pairs(map_a, map_b, correspondences)
         return PairRegistration(
-            self.method, Completion(pairs, self.refinement, self.judge, evidence)
+            self.method, EstimateVerifier(pairs, self.refinement, self.judge, evidence)
         )
 
     def register(
@@ -317,42 +321,44 @@ class Registration:
 
 
 class PairRegistration:
-    """A method on one pair of maps, and the completion of what it estimates.
+    """Registration of one pair of maps with one method.
 
-    Several methods on the same pair may share the completion.
+    Several methods on the same pair may share the verifier.
     """
 
-    def __init__(self, method: Method | Aligner, completion: Completion) -> None:
-        self._aligner, self._completion = as_aligner(method), completion
+    def __init__(self, method: Method | Aligner, verifier: EstimateVerifier) -> None:
+        self._aligner, self._verifier = as_aligner(method), verifier
 
     @property
     def judge(self) -> PairJudge | None:
-        """Who gives the verdict; None where whatever the refinement does is accepted."""
-        return self._completion.judge
+        """Judge that gives the verdict; None accepts what the refinement accepts."""
+        return self._verifier.judge
 
     def register(self, rng: np.random.Generator) -> Registered:
-        """Estimate once more, and complete it."""
-        estimated = self._estimated(rng)
-        done = Registered(estimated, *self._completion.of(estimated))
-        if done.verdict.accepted:
-            return done
-        n_support = int(np.count_nonzero(done.refined.inlier))
-        return done.explained(self._completion.pairs.note(n_support))
-
-    def _estimated(self, rng: np.random.Generator) -> Alignment:
-        pairs = self._completion.pairs
+        """Estimate, refine and judge once."""
+        pairs = self._verifier.pairs
         if isinstance(self._aligner, MethodAligner):
-            return self._aligner.align_again(pairs, rng)
-        return self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
+            estimated = self._aligner.align_again(pairs, rng)
+        else:
+            estimated = self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
+        registered = Registered(estimated, *self._verifier.verify(estimated))
+        if registered.verdict.accepted:
+            return registered
+        n_support = int(np.count_nonzero(registered.refined.inlier))
+        return registered.with_note(pairs.note(n_support))
 
 
 def supported_by(
     pairs: Pairs, inlier: np.ndarray, T_a_b: Float, started_s: float, refusal: str = ""
 ) -> Alignment:
-    """The answer of a method whose motion is the least squares, equally weighted, of some pairs.
+    """Return the alignment of a motion fitted to some pairs by least squares with equal weights.
 
-    `inlier` (N,) marks those it was fitted to; `started_s` is `time.perf_counter()` at the start,
-    `refusal` why the estimate is not to be trusted, if so.
+    Args:
+        pairs: all N pairs.
+        inlier: (N,) bool, True for the fitted pairs.
+        T_a_b: (3,) the motion.
+        started_s: `time.perf_counter()` at the start.
+        refusal: reason to reject the estimate; empty for none.
     """
     found = supported(pairs, inlier, T_a_b, refusal)
     return alignment_of_fit(found, pairs, np.arange(len(pairs)), started_s)

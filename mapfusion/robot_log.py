@@ -1,16 +1,15 @@
 """Robot log: the measurements of one robot, and the truth in files beside them.
 
-A log is a folder of Parquet tables (each readable with plain pandas):
+A log is a folder of Parquet tables, each readable with plain pandas:
 
-- `frames.parquet`: one row an iteration, also those that saw nothing.
-- `observations.parquet`: one row an observation, ordered by iteration.
-- `truth_poses.parquet`, `truth_points.parquet`: optional; only the evaluation opens them.
+- `frames.parquet`: one row a frame, also for frames without observations.
+- `observations.parquet`: one row an observation, ordered by frame.
+- `odometry_covariance.parquet`: optional; covariance of visual odometry. Without this file, the
+  odometry has the motion noise of the filter.
+- `truth_poses.parquet`, `truth_points.parquet`: optional; only the evaluation reads them.
 
-Wheels have the filter's motion noise; odometry from pictures has a covariance of its own, which
-grows where little was seen.
-
-A corner's pixels settle on another point of it in each track, whatever the distance. It repeats in
-all sightings of a track and does not average out.
+All observations of a track show the same point, which has a small offset from the landmark. This
+offset differs between tracks. Within a track it is constant, so it does not average out.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -51,14 +50,14 @@ from mapfusion.parameters import (
     require_shape,
 )
 from mapfusion.tables import (
+    APPEARANCE_FIELDS,
     DESCRIPTOR_LENGTH,
-    LOOK_FIELDS,
-    look_columns,
-    looks_from,
+    appearance_columns,
+    appearance_from,
+    described,
     read_open_table,
-    require_looks,
+    require_appearance,
     table_path,
-    told,
 )
 
 if TYPE_CHECKING:
@@ -66,14 +65,14 @@ if TYPE_CHECKING:
 
 
 NO_TRACK = -1
-# A turn of more than 360 degrees between two frames is not observable: it equals the same turn less
-# whole turns. The limit holds for radians and degrees alike, so that a log in degrees can be read,
-# and what reads it can name the unit.
+# Limit of the heading increment between two frames, as a number. Larger turns are not observable
+# modulo 360 degrees. The limit admits a log in degrees, so that a later check can name the wrong
+# unit.
 LARGEST_TURN = 360.0
 TRUTH_TABLES = ("truth_poses", "truth_points")
 TRUTH_FILES = tuple(f"{name}.parquet" for name in TRUTH_TABLES)
 Arrays = TypeVar("Arrays", bound="DataclassInstance")
-_ITERATION = told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
+_ITERATION = described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
 _ODOMETRY_FIELDS = ["odometry_x_m", "odometry_y_m", "odometry_theta_rad"]
 _PIXEL_FIELDS = ["u_px", "v_px", "disparity_px"]  # left image; NaN where there are no images
 
@@ -82,11 +81,13 @@ FRAMES = schema(
     1,
     [
         _ITERATION,
-        told(pa.field("time_s", pa.float64()), "when, increasing from row to row"),
+        described(
+            pa.field("time_s", pa.float64()), "time of the frame, increasing from row to row"
+        ),
         *(
-            told(
+            described(
                 field,
-                "motion since the row before, in the robot frame of that row; row 0 is not used",
+                "motion since the previous row, in the robot frame of that row; row 0 is not used",
             )
             for field in float_fields(_ODOMETRY_FIELDS)
         ),
@@ -96,14 +97,21 @@ OBSERVATIONS = schema(
     "robot_log.observations",
     2,  # 1 had no tracks
     [
-        told(_ITERATION, "frame of the sighting; rows are ordered by it"),
-        *(told(field, "of the sighting, in the robot frame") for field in point_fields()),
+        described(_ITERATION, "number of the frame; rows are ordered by frame"),
         *(
-            told(pa.field(name, pa.float32()), "in the left image, NaN without images", np.nan)
+            described(field, "position and covariance of the observation, in the robot frame")
+            for field in point_fields()
+        ),
+        *(
+            described(
+                pa.field(name, pa.float32()),
+                "pixel and disparity in the left image, NaN without images",
+                np.nan,
+            )
             for name in _PIXEL_FIELDS
         ),
-        *LOOK_FIELDS,
-        told(pa.field("track", pa.int32()), "number of its track, -1 for none", NO_TRACK),
+        *APPEARANCE_FIELDS,
+        described(pa.field("track", pa.int32()), "number of the track, -1 for none", NO_TRACK),
     ],
 )
 TRUTH_POSES = schema(
@@ -111,23 +119,28 @@ TRUTH_POSES = schema(
     1,
     [
         _ITERATION,
-        *(told(field, "T_world_robot, NaN where unknown") for field in float_fields(POSE_FIELDS)),
+        *(
+            described(field, "true pose T_world_robot, NaN if unknown")
+            for field in float_fields(POSE_FIELDS)
+        ),
     ],
 )
 TRUTH_POINTS = schema(
     "robot_log.truth_points",
     1,
     [
-        told(field, "point of the world that the observation of this row shows, NaN where unknown")
+        described(
+            field, "true point of the observation in this row, in the world frame; NaN if unknown"
+        )
         for field in float_fields(POSITION_FIELDS)
     ],
 )
 
 
 def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
-    """The same dataclass with each of its arrays cut to some rows.
+    """Return a copy of a dataclass with some rows of each array.
 
-    What was found sound is not looked at again: frames are cut out of logs one by one.
+    The checks of the constructor are skipped, since slicing logs into frames must be fast.
     """
     cut = object.__new__(type(value))
     for field in fields(value):
@@ -138,7 +151,7 @@ def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
 
 @dataclass(frozen=True)
 class Observations:
-    """Landmark sightings, of one frame or of a whole log.
+    """Landmark observations of one frame or of a whole log.
 
     Attributes:
         position_m: (N, 3) in the robot frame.
@@ -146,8 +159,9 @@ class Observations:
         descriptor: (N, 64) float32, or None.
         label: (N,) int32 known identities, or None.
         uvd_px: (N, 3) float32 u, v, disparity in the left image, or None.
-        track: (N,) int32, NO_TRACK or what the observations of one track share: these are of one
-            point, where other observations of the landmark are of points nearby. None: no tracks.
+        track: (N,) int32 number of the track, NO_TRACK for none; None without tracks. All
+            observations of a track show the same point; other observations of the landmark show
+            points close to it.
     """
 
     position_m: Float
@@ -177,16 +191,16 @@ class Observations:
 
 @dataclass(frozen=True)
 class RobotLog:
-    """One robot's measurements.
+    """Measurements of one robot.
 
     Attributes:
-        robot: its name.
-        planar: range-and-bearing data; z is 0 and stays out of gates and weights.
-        time_s: (T,).
+        robot: name of the robot.
+        planar: range-and-bearing data; z is 0 and is not used in gates and weights.
+        time_s: (T,) times of the frames.
         odometry: (T, 3) motion since the frame before, in the robot frame; the first row is zero.
-        iteration: (N,) non-decreasing, the frame each observation belongs to.
-        observations: N of them.
-        calibration: what all observations have in common by the camera's calibration.
+        iteration: (N,) frame of each observation, ascending.
+        observations: N observations.
+        calibration: error of the camera calibration, which all observations share.
     """
 
     robot: str
@@ -207,17 +221,17 @@ class RobotLog:
             raise ValueError(f"iteration: must lie in 0..{len(self) - 1}")
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.time_s)
 
     def frame_starts(self) -> np.ndarray:
-        """(T + 1,) row of each frame's first observation."""
+        """Return the row (T + 1,) of each frame's first observation."""
         return np.searchsorted(self.iteration, np.arange(len(self) + 1))
 
 
 @dataclass(frozen=True)
 class RobotTruth:
-    """The truth about a log: `T_world_robot` (T, 3), `point_world_m` (N, 3); NaN where unknown."""
+    """Truth of a log: `T_world_robot` (T, 3), `point_world_m` (N, 3); NaN if unknown."""
 
     T_world_robot: Float
     point_world_m: Float
@@ -234,7 +248,7 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
             "iteration": iteration.astype(np.int32),
             **point_columns(observations.position_m, observations.covariance_m2),
             **named_columns(_PIXEL_FIELDS, uvd.astype(np.float32)),
-            **look_columns(n, observations.descriptor, observations.label),
+            **appearance_columns(n, observations.descriptor, observations.label),
             "track": track.astype(np.int32),
         },
         OBSERVATIONS,
@@ -242,28 +256,41 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
 
 
 def read_observations(folder: Path) -> tuple[np.ndarray, Observations]:
-    """Iterations (N,) and observations of a log's folder; raises InputError."""
+    """Read the frame numbers (N,) and observations of a log's folder; raises InputError."""
     return _observations(folder)[:2]
 
 
 def _observations(folder: Path) -> tuple[np.ndarray, Observations, bool]:
-    """The same, and whether the file itself says that they are planar."""
+    """Read frame numbers (N,) and observations; True if the file itself marks them as planar."""
     path = table_path(folder, "observations")
     table, attributes = read_open_table(path, OBSERVATIONS)
-    _require_sightings(path, table)
+    iteration = column(table, "iteration")
+    require_cells(path, table, ["iteration"], lambda frame: frame >= 0, "frames are 0, 1, 2, ...")
+    back = np.flatnonzero(np.diff(iteration) < 0)
+    if len(back):
+        row = back[0] + 1
+        found = f"is {iteration[row]} in row {row}, after {iteration[row - 1]}"
+        raise InputError(f"{path}: column iteration: {found}; sort the rows by iteration")
+    finite = "give a finite number, or remove the row"
+    require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
+    no_image = "give a finite number, or NaN for none"
+    require_cells(path, table, _PIXEL_FIELDS, lambda px: ~np.isinf(px), no_image)
+    numbered = f"tracks are {NO_TRACK} for none, or 0 and more"
+    require_cells(path, table, ["track"], lambda track: track >= NO_TRACK, numbered)
+    require_appearance(path, table)
     position, covariance = points_from(table)
     uvd, track = columns(table, _PIXEL_FIELDS), column(table, "track")
     try:
         observations = Observations(
             position,
             covariance,
-            *looks_from(table),
+            *appearance_from(table),
             None if np.isnan(uvd).all() else uvd,
             None if np.all(track == NO_TRACK) else track,
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
-    return column(table, "iteration"), observations, attributes.get("planar") == "true"
+    return iteration, observations, attributes.get("planar") == "true"
 
 
 def write_frames(
@@ -294,7 +321,7 @@ def write_log(folder: Path, log: RobotLog) -> None:
 
 
 def read_log(folder: Path) -> RobotLog:
-    """Read a log; raises InputError that names the file."""
+    """Read a log; an InputError names the file."""
     path = table_path(folder, "frames")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a robot log with frames.parquet)")
@@ -310,7 +337,6 @@ def read_log(folder: Path) -> RobotLog:
     if "robot" in attributes:
         planar = attributes.get("planar") == "true"
     name = attributes.get("robot", name_in_text(folder.resolve().name))
-    looks = observations.label
     odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
     odometry[:1] = 0.0  # the first frame has no row before
     calibration = calibration_from(attributes, path)
@@ -320,7 +346,8 @@ def read_log(folder: Path) -> RobotLog:
         raise InputError(f"{folder}: {error}") from error
     try:
         require_points(observations.position_m, observations.covariance_m2, planar)
-        label = np.zeros(len(iteration)) if looks is None else looks
+        label = observations.label
+        label = np.zeros(len(iteration)) if label is None else label
         points = (observations.position_m, observations.covariance_m2.reshape(-1, 9))
         require_no_twins("observations", iteration, label, *points)
     except ValueError as error:
@@ -329,7 +356,7 @@ def read_log(folder: Path) -> RobotLog:
 
 
 def _require_frames(path: Path, table: pa.Table) -> None:
-    """Raise InputError for the first frame that is not as documented; names column and row."""
+    """Raise InputError for the first invalid frame; the message names column and row."""
     _require_numbered(path, table)
     finite = "give a finite number"
     require_cells(path, table, ["time_s", *_ODOMETRY_FIELDS], np.isfinite, finite)
@@ -348,26 +375,8 @@ def _require_frames(path: Path, table: pa.Table) -> None:
     require_cells(path, table, _ODOMETRY_FIELDS[2:], lambda by: abs(by) <= LARGEST_TURN, turn)
 
 
-def _require_sightings(path: Path, table: pa.Table) -> None:
-    """Raise InputError for the first observation that is not as documented, by column and row."""
-    iteration = column(table, "iteration")
-    require_cells(path, table, ["iteration"], lambda frame: frame >= 0, "frames are 0, 1, 2, ...")
-    back = np.flatnonzero(np.diff(iteration) < 0)
-    if len(back):
-        row = back[0] + 1
-        found = f"is {iteration[row]} in row {row}, after {iteration[row - 1]}"
-        raise InputError(f"{path}: column iteration: {found}; sort the rows by iteration")
-    finite = "give a finite number, or remove the row"
-    require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
-    no_image = "give a finite number, or NaN for none"
-    require_cells(path, table, _PIXEL_FIELDS, lambda px: ~np.isinf(px), no_image)
-    numbered = f"tracks are {NO_TRACK} for none, or 0 and more"
-    require_cells(path, table, ["track"], lambda track: track >= NO_TRACK, numbered)
-    require_looks(path, table)
-
-
 def _require_numbered(path: Path, table: pa.Table) -> None:
-    """Raise InputError where frames are not there once each, in order."""
+    """Raise InputError unless the frames are numbered 0, 1, 2, ..."""
     wrong = np.flatnonzero(column(table, "iteration") != np.arange(table.num_rows))
     if len(wrong):
         row = wrong[0]
@@ -376,7 +385,7 @@ def _require_numbered(path: Path, table: pa.Table) -> None:
 
 
 def write_truth_points(folder: Path, point_world_m: Float) -> None:
-    """Write `truth_points.parquet`: (N, 3), row i belongs to observation i."""
+    """Write `truth_points.parquet`: (N, 3), one row for each observation."""
     write_table(
         folder / "truth_points.parquet",
         named_columns(POSITION_FIELDS, point_world_m),
@@ -400,7 +409,7 @@ def read_true_poses(folder: Path) -> Float | None:
     """Read the true poses T_world_robot (T, 3) beside a log; None if there are none.
 
     Raises:
-        InputError: the table is damaged, or not as documented.
+        InputError: the table is damaged or not as documented.
     """
     path = table_path(folder, TRUTH_TABLES[0])
     if not path.is_file():
@@ -428,7 +437,7 @@ def read_truth(folder: Path) -> RobotTruth:
 
 
 def first_frames(log: RobotLog, n_frames: int) -> RobotLog:
-    """The log as it was after so many frames."""
+    """Return the log of the first `n_frames` frames."""
     n = int(np.searchsorted(log.iteration, n_frames))
     return replace(
         log,
@@ -445,9 +454,9 @@ ODOMETRY_COVARIANCE = schema(
     "robot_log.odometry_covariance",
     1,
     [
-        told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+        described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
         *(
-            told(field, "of the motion since the row before: m², m rad, rad²")
+            described(field, "covariance of the motion since the previous row: m², m rad, rad²")
             for field in float_fields(_FIELDS)
         ),
     ],
@@ -455,7 +464,7 @@ ODOMETRY_COVARIANCE = schema(
 
 
 def write_odometry_covariance(folder: Path, covariance: Float | None) -> None:
-    """Write (T, 3, 3) of x, y, theta into a log's folder; None removes what is there."""
+    """Write the covariance (T, 3, 3) of x, y, theta into a log's folder; None removes it."""
     if covariance is None:
         (folder / FILE).unlink(missing_ok=True)
         return
@@ -470,11 +479,11 @@ def read_odometry_covariance(folder: Path, n_frames: int | None = None) -> Float
     """Read the covariance (T, 3, 3) of a log's odometry; None if its folder holds none.
 
     Args:
-        folder: of the log.
-        n_frames: of the log; None if it is not known.
+        folder: folder of the log.
+        n_frames: number of frames of the log; None if unknown.
 
     Raises:
-        InputError: the file is damaged, or not as documented.
+        InputError: the file is damaged or not as documented.
     """
     path = folder / FILE
     if not path.is_file():
@@ -491,7 +500,7 @@ def read_odometry_covariance(folder: Path, n_frames: int | None = None) -> Float
     return covariance
 
 
-# Of tracks of one corner: on walls 1 to 2 mm.
+# Standard deviation, per axis, of a track's offset from its landmark, for corners.
 STRAY_M = 0.002
-# Of what a filter takes for one corner: along its path some are neighbours, a centimetre off.
+# The same for the landmarks of the filter, which confuses some close neighbours.
 FILTERED_STRAY_M = 0.004

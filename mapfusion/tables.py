@@ -1,10 +1,10 @@
-"""Tables of maps and logs, written by this program, by pandas, or as CSV.
+"""Tables of maps and logs, written by this program, by other programs, or as CSV.
 
-A file of another program needs no metadata and may leave out what has a default. Numbers may be of
-any width, lists of any list type; in CSV a list is columns NAME_0, NAME_1, ... (or from 1 on).
-Without any height (z_m and its covariances) data are planar. A column that has nearly the name of a
-known one is refused, since a column left out may change what the data mean.
-`experiments/docs/formats.md` lists all columns.
+A file of another program needs no metadata and may omit columns that have a default. Numbers may
+have any width, and lists any list type. In CSV, a list consists of columns NAME_0, NAME_1, ... (or
+from NAME_1 on). Data without any height column (z_m and its covariances) are planar. A column whose
+name is similar to a known name is rejected, since an omitted column may change the meaning of the
+data. `experiments/docs/formats.md` lists all columns.
 """
 
 import re
@@ -28,45 +28,45 @@ from mapfusion.files import (
 
 _ABOUT, _DEFAULT = b"about", b"default"
 HEIGHT = ("z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2")
-# Other names that heights have, without their units.
+# Other usual names of heights, without units.
 _HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "position_z", "p_z", "pz")
 _UNIT = re.compile(r"_?(\[.*\]|\(.*\)|[mc]?m2?|met(er|re)s?|ft|feet|m?s|rad|deg|px)$")
-_MOST_NAMED = 3  # columns of other names in one line
+_MAX_NAMED = 3  # columns with similar names in one message
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
 
 
-def told(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
-    """A field with what it means, and with its value where a file lacks it."""
+def described(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
+    """Return a field with its description, and the default that replaces a missing column."""
     metadata = {_ABOUT: about.encode()}
     if default is not None:
         metadata[_DEFAULT] = str(default).encode()
     return field.with_metadata(metadata)
 
 
-def about(field: pa.Field) -> str:
-    """What `told` was told of a field; empty where nothing was."""
+def description_of(field: pa.Field) -> str:
+    """Return the description of a field; empty if it has none."""
     return (field.metadata or {}).get(_ABOUT, b"").decode()
 
 
 def default_of(field: pa.Field) -> float | None:
-    """What a file that lacks the column stands for; None where it must not."""
+    """Return the default of a missing column; None if the column is required."""
     text = (field.metadata or {}).get(_DEFAULT)
     return None if text is None else float(text)
 
 
 def table_path(folder: Path, name: str) -> Path:
-    """Where a folder keeps a table: NAME.csv if there is no NAME.parquet."""
+    """Return the path of a table in a folder: NAME.csv if there is no NAME.parquet."""
     parquet, csv = (folder / f"{name}.{kind}" for kind in ("parquet", "csv"))
     return csv if csv.is_file() and not parquet.is_file() else parquet
 
 
 def is_csv(path: Path) -> bool:
-    """Return True for a file that is read and written as CSV, by its name."""
+    """Return True for a file whose name ends in `.csv`."""
     return path.suffix.lower() == ".csv"
 
 
 def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
-    """Return columns as CSV that `read_open_table` reads as they are, to the last bit.
+    """Return columns as CSV, from which `read_open_table` recovers every bit.
 
     A column (N, k) becomes k columns NAME_0, NAME_1, ...; NaN is an empty cell.
     """
@@ -82,40 +82,45 @@ def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
 
 
 def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
-    """Read a table whoever wrote it.
+    """Read a table written by this or another program.
 
     Args:
-        path: of the file; one that ends in `.csv` is CSV, others are Parquet.
-        table_schema: columns that the table needs, or may have.
+        path: path of the file; `.csv` files are CSV, all others Parquet.
+        table_schema: required and optional columns.
 
     Returns:
-        The table with the columns of the schema, and its text attributes; `planar` is among them
-        for a table without heights.
+        The table with the columns of the schema, and its text attributes. The attribute `planar` is
+        added for a table without heights.
 
     Raises:
-        InputError: it is missing, damaged, of another kind, lacks a column, has one under another
-            name, or has text or an empty cell where a number must be.
+        InputError: the file is missing, damaged, or of another kind; it lacks a column, has a
+            column with a similar name, or a cell without a number.
     """
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
     table = _read_csv(path, table_schema) if is_csv(path) else read_parquet(path, f"{kind} table")
     attributes = text_attributes(path, table)
-    if "kind" in attributes and not _is_earlier(attributes, table_schema):
-        require_kind(path, table, attributes, table_schema)
+    if "kind" in attributes:
+        # Files of earlier versions are read, too: later columns have defaults.
+        known = int(table_schema.metadata[b"mapfusion.schema_version"])
+        version = attributes.get("schema_version", "")
+        earlier = version.isdecimal() and 0 < int(version) < known
+        if not (earlier and attributes["kind"] == kind):
+            require_kind(path, table, attributes, table_schema)
     names = table.column_names
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"{path}: has two columns {', '.join(twice)}")
-    meant = _meant(names, table_schema)
+    similar = _similar_names(names, table_schema)
     planar = not set(HEIGHT) & set(names)
     found = {field.name: _column(path, table, field, planar) for field in table_schema}
     if missing := [name for name, values in found.items() if values is None]:
-        remedy = f"add to this {kind} table what experiments/docs/formats.md says of them"
-        if here := [f"{name} for {meant[name]}" for name in missing if name in meant]:
-            more = ", ..." if len(here) > _MOST_NAMED else ""
-            remedy = f"did you mean {', '.join(here[:_MOST_NAMED])}{more}?"
+        remedy = f"experiments/docs/formats.md describes the columns of a {kind} table"
+        if here := [f"{name} for {similar[name]}" for name in missing if name in similar]:
+            more = ", ..." if len(here) > _MAX_NAMED else ""
+            remedy = f"did you mean {', '.join(here[:_MAX_NAMED])}{more}?"
         raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")
-    if meant:
-        asked = " and ".join(f"{there} to {name}" for name, there in meant.items())
-        reason = "a column of an unknown name is left out"
+    if similar:
+        asked = " and ".join(f"{there} to {name}" for name, there in similar.items())
+        reason = "columns with unknown names are ignored"
         raise InputError(f"{path}: rename column {asked} (mind the unit), or remove it: {reason}")
     if planar:
         attributes = {"planar": "true"} | attributes
@@ -124,50 +129,40 @@ def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict
     return columns, attributes
 
 
-def _meant(names: Sequence[str], table_schema: pa.Schema) -> dict[str, str]:
-    """Return unknown columns that have nearly the name of a known one, by the known name.
+def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, str]:
+    """Return unknown columns with a name similar to a known one, by the known name.
 
-    Names are alike that differ in letter case, blanks and hyphens alone, or that lack the unit. All
-    names of heights stand for z_m, as without it data would be taken for planar.
+    Similar names differ only in letter case, blanks, hyphens or the unit. Every usual name of a
+    height is similar to z_m, since data without z_m would be read as planar.
     """
     known = {_plain_name(field.name): field.name for field in table_schema}
     known = {_UNIT.sub("", name): field for name, field in known.items()} | known
     if "z_m" in table_schema.names and "z_m" not in names:
         known |= dict.fromkeys(_HEIGHT_NAMES, "z_m")
-    meant: dict[str, str] = {}
+    similar: dict[str, str] = {}
     for name in names:
         if name in table_schema.names:
             continue
         plain = _plain_name(name)
         like = known.get(plain) or known.get(_UNIT.sub("", plain))
         if like is not None and like not in names:
-            meant.setdefault(like, name)
-    return meant
+            similar.setdefault(like, name)
+    return similar
 
 
 def _plain_name(name: str) -> str:
     return re.sub(r"[\s-]+", "_", name.strip().lower())
 
 
-def _is_earlier(attributes: Mapping[str, str], table_schema: pa.Schema) -> bool:
-    """Whether an earlier version of this program wrote it; later columns have defaults."""
-    wanted = (
-        table_schema.metadata[f"mapfusion.{key}".encode()] for key in ("kind", "schema_version")
-    )
-    kind, version = (text.decode() for text in wanted)
-    found = attributes.get("schema_version", "")
-    return attributes["kind"] == kind and found.isdecimal() and 0 < int(found) < int(version)
-
-
 def _read_csv(path: Path, table_schema: pa.Schema) -> pa.Table:
-    """Read a CSV file, its names without blanks around them; raises InputError."""
+    """Read a CSV file and strip blanks from its column names; raises InputError."""
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
     if not path.is_file():
         raise InputError(f"{path}: no such file (expected a {kind} table)")
     data = path.read_bytes()
     try:
         table = pyarrow.csv.read_csv(pa.BufferReader(data))
-        names = [name.strip() for name in table.column_names]  # they may be no UTF-8
+        names = [name.strip() for name in table.column_names]  # fails for names that are not UTF-8
     except UNREADABLE as error:
         _require_dialect(path, data, table_schema)
         raise InputError(f"{path}: not readable as CSV ({error})") from error
@@ -199,7 +194,7 @@ def _is_number(text: str) -> bool:
 
 
 def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Array | None:
-    """A column in the type of the schema; its default where it is not there, None without."""
+    """Return a column in the type of the schema, or its default; None if it is required."""
     default = 0.0 if planar and field.name in HEIGHT else default_of(field)
     try:
         if pa.types.is_fixed_size_list(field.type):
@@ -212,7 +207,9 @@ def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Ar
         if not is_number and values.null_count < len(values):
             raise InputError(f"{path}: column {field.name} {_no_number(values)}")
         is_float = pa.types.is_floating(field.type)
-        if pa.types.is_floating(values.type) and not is_float:  # as pandas makes of gaps
+        if (
+            pa.types.is_floating(values.type) and not is_float
+        ):  # pandas stores integers with gaps as floats
             values = pa.array(values.to_numpy(zero_copy_only=False), from_pandas=True)
         empty = np.nan if is_float else default  # pandas stores NaN as an empty cell
         if values.null_count and empty is None:
@@ -226,7 +223,7 @@ def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Ar
 
 
 def _no_number(values: pa.Array) -> str:
-    """Return which cell of a column of another type holds no number."""
+    """Return a message about the first cell of a column that holds no number."""
     if pa.types.is_string(values.type) or pa.types.is_large_string(values.type):
         for row, cell in enumerate(values.to_pylist()):
             if cell is not None and not _is_number(cell):
@@ -234,20 +231,26 @@ def _no_number(values: pa.Array) -> str:
     return f"holds {values.type}, not numbers"
 
 
-def _call(name: str, values: pa.Array) -> pa.Array:
-    return pc.call_function(name, [values])
-
-
 def _rows_of_numbers(path: Path, table: pa.Table, field: pa.Field) -> pa.Array:
-    """A column of lists, (N, k) of NaN where there is none; also of columns NAME_0, NAME_1, ..."""
+    """Return a column of N lists, from one column or NAME_0, NAME_1, ...; NaN if missing."""
     width, n = field.type.list_size, table.num_rows
-    apart, values = _columns_apart(path, table, field), None
-    if not apart and field.name in table.column_names:
+    pattern = re.compile(re.escape(field.name) + r"_?(\d{1,9})", re.IGNORECASE)
+    numbered = {
+        int(match[1]): name for name in table.column_names if (match := pattern.fullmatch(name))
+    }
+    order = sorted(numbered)
+    if order and order not in (list(range(width)), list(range(1, width + 1))):
+        first, last = numbered[order[0]], numbered[order[-1]]
+        found = f"has {len(order)} columns {first} to {last}" if first != last else f"has {first}"
+        wanted = f"{field.name}_0 to {field.name}_{width - 1}, {width} of them"
+        raise InputError(f"{path}: {found}; expected {wanted}")
+    values = None
+    if not order and field.name in table.column_names:
         values = table.column(field.name).combine_chunks()
         if values.type == field.type and not values.null_count and not values.flatten().null_count:
             return values
     matrix = np.full((n, width), np.nan)
-    for i, name in enumerate(apart):
+    for i, name in enumerate(numbered[k] for k in order):
         cells = table.column(name).combine_chunks()
         if cells.null_count == n:
             continue
@@ -255,51 +258,34 @@ def _rows_of_numbers(path: Path, table: pa.Table, field: pa.Field) -> pa.Array:
             raise InputError(f"{path}: column {name} {_no_number(cells)}")
         matrix[:, i] = cells.cast(pa.float64()).fill_null(np.nan).to_numpy(zero_copy_only=False)
     if values is not None and values.null_count < n:
-        lengths = _call("list_value_length", values).drop_null().unique().to_pylist()
+        lengths = pc.call_function("list_value_length", [values]).drop_null().unique().to_pylist()
         if lengths != [width]:
             raise pa.ArrowInvalid(f"lists of {sorted(lengths)} numbers")
         there = ~values.is_null().to_numpy(zero_copy_only=False)
-        flat = _call("list_flatten", values).cast(pa.float64()).fill_null(np.nan)
+        flat = pc.call_function("list_flatten", [values]).cast(pa.float64()).fill_null(np.nan)
         matrix[there] = flat.to_numpy(zero_copy_only=False).reshape(-1, width)
     flat = pa.array(matrix.ravel().astype(field.type.value_type.to_pandas_dtype()))
     return pa.FixedSizeListArray.from_arrays(flat, type=field.type)
 
 
-def _columns_apart(path: Path, table: pa.Table, field: pa.Field) -> list[str]:
-    """Return the columns NAME_0, NAME_1, ... (or from 1 on) of a list, in order; none without any.
-
-    Raises:
-        InputError: there are some, but not one for each number of the list.
-    """
-    pattern = re.compile(re.escape(field.name) + r"_?(\d{1,9})", re.IGNORECASE)
-    numbered = {
-        int(match[1]): name for name in table.column_names if (match := pattern.fullmatch(name))
-    }
-    width, order = field.type.list_size, sorted(numbered)
-    if order and order not in (list(range(width)), list(range(1, width + 1))):
-        first, last = numbered[order[0]], numbered[order[-1]]
-        found = f"has {len(order)} columns {first} to {last}" if first != last else f"has {first}"
-        wanted = f"{field.name}_0 to {field.name}_{width - 1}, {width} of them"
-        raise InputError(f"{path}: {found}; expected {wanted}")
-    return [numbered[k] for k in order]
-
-
 DESCRIPTOR_LENGTH = 64
 NO_LABEL = -1
-LOOK_FIELDS = [
-    told(pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL),
-    told(
+APPEARANCE_FIELDS = [
+    described(
+        pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL
+    ),
+    described(
         pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
-        "what it looks like (U-SURF or another), NaN for none",
+        "descriptor of its appearance (U-SURF or another), NaN for none",
         np.nan,
     ),
 ]
 
 
-def look_columns(
+def appearance_columns(
     n: int, descriptor: np.ndarray | None, label: np.ndarray | None
 ) -> dict[str, np.ndarray]:
-    """By what n points are recognised, as the columns of `LOOK_FIELDS`."""
+    """Return descriptors and labels of n points as the columns of `APPEARANCE_FIELDS`."""
     if descriptor is None:
         descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan)
     if label is None:
@@ -307,8 +293,8 @@ def look_columns(
     return {"label": label.astype(np.int32), "descriptor": descriptor.astype(np.float32)}
 
 
-def looks_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Descriptors and labels of a table, None where no row has any."""
+def appearance_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return descriptors and labels of a table; None if no row has any."""
     descriptor, label = column(table, "descriptor"), column(table, "label")
     return (
         None if np.isnan(descriptor).all() else descriptor,
@@ -316,7 +302,7 @@ def looks_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
     )
 
 
-def require_looks(path: Path, table: pa.Table) -> None:
+def require_appearance(path: Path, table: pa.Table) -> None:
     """Raise InputError for the first row whose label or descriptor is not as documented."""
     known_label = f"labels are {NO_LABEL} for none, or 0 and more"
     require_cells(path, table, ["label"], lambda label: label >= NO_LABEL, known_label)

@@ -1,10 +1,11 @@
-"""Viewing evidence of a map: the poses that its landmarks were seen from, and free lines of sight.
+"""Viewing evidence of a map: poses that observed its landmarks, and free lines of sight.
 
-With it one can say of a landmark that another map claims whether this robot must have seen it: it
-lay in the field of view of several frames, and nothing nearer hid it.
+The evidence decides whether the robot must have seen a landmark of another map: the landmark was in
+the field of view of several frames, and no nearer object hid it.
 
-The first has one row a landmark, in the order of the map, the second one row a frame of the log
-that the map was made of; its attributes hold the field of view.
+Two files beside the map store the evidence. `NAME.viewing.parquet` has one row a landmark, in the
+order of the map. `NAME.frames.parquet` has one row a frame of the log, and the field of view in its
+attributes.
 """
 
 import json
@@ -31,25 +32,25 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import wrap
 from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import RobotLog
-from mapfusion.tables import told
+from mapfusion.tables import described
 
-BEARINGS = 16  # across the field of view: 4 degrees each of the STH-MDCS2's
-RANGES = 8  # steps of range up to the farthest, a metre each indoors
-# Of sightings, left out at either end of bearings, ranges and heights: gross ones lie there, and a
-# field of view taken a little too small asks for nothing that could not be seen.
-_STRAY = 0.005
-_LEAST_SIGHTINGS = 20  # of a range of which quantiles of heights can be told
+BEARINGS = 16  # sectors of the field of view
+RANGES = 8  # range steps up to the greatest range
+# Share of observations cut off at either end of bearings, ranges and heights. Outliers lie there,
+# and a field of view that is slightly too small never contains a point that was out of view.
+_OUTLIER_SHARE = 0.005
+_MIN_SIGHTINGS = 20  # observations in a range step for which quantiles of the height are computed
 
 
 @dataclass(frozen=True)
 class FieldOfView:
-    """Where a robot's sightings lie in its own frame.
+    """Field of view in the robot frame.
 
     Attributes:
-        bearing_rad: (2,) least and greatest.
-        range_m: (2,) least and greatest, in the plane.
-        height_m: (RANGES, 2) least and greatest, at equal steps of range from 0 to the greatest;
-            the least above the greatest where nothing was seen.
+        bearing_rad: (2,) smallest and greatest bearing.
+        range_m: (2,) smallest and greatest range in the plane.
+        height_m: (RANGES, 2) smallest and greatest height in equal range steps from 0 to the
+            greatest range. The smallest is above the greatest in a step with too few observations.
     """
 
     bearing_rad: Float
@@ -64,15 +65,15 @@ class FieldOfView:
 
 @dataclass(frozen=True)
 class Viewing:
-    """How a map of N landmarks came to be, over T frames.
+    """Viewing evidence of a map with N landmarks, from T frames.
 
     Attributes:
-        direction_rad: (N,) mean direction from the robot to the landmark, in the map's frame.
-        distance_m: (N,) mean distance between the two, in the plane.
-        n_views: (N,) int32 sightings behind both; 0 where these mean nothing.
-        pose: (T, 3) of the robot, in the map's frame.
-        reach_m: (T, BEARINGS) float32 range of the farthest landmark seen in each part of the field
-            of view, 0 where none was: nothing that is nearer can have been hidden.
+        direction_rad: (N,) mean direction from the robot to the landmark, in the map frame.
+        distance_m: (N,) mean distance from the robot to the landmark, in the plane.
+        n_views: (N,) int32 number of observations in these means; for 0 the means are undefined.
+        pose: (T, 3) poses of the robot in the map frame.
+        reach_m: (T, BEARINGS) float32 range of the farthest landmark observed in each sector of the
+            field of view, 0 for none. No nearer landmark in this sector was hidden.
         field: the field of view.
     """
 
@@ -93,28 +94,28 @@ class Viewing:
             require_finite(name, getattr(self, name))
 
     def __len__(self) -> int:
-        """Number of landmarks."""
+        """Return the number of landmarks."""
         return len(self.direction_rad)
 
     def __getitem__(self, rows: np.ndarray | slice) -> "Viewing":
-        """Of some of the landmarks; the frames stay."""
+        """Return the evidence for some of the landmarks, with all frames."""
         names = ("direction_rad", "distance_m", "n_views")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def joined(self, other: "Viewing", turn_rad: float) -> "Viewing":
-        """With the landmarks of another map behind its own, turned; the frames stay these."""
+        """Append the landmarks of another map, rotated by `turn_rad`; keep these frames."""
         turned = replace(other, direction_rad=wrap(other.direction_rad + turn_rad))
         names = ("direction_rad", "distance_m", "n_views")
         both = {n: np.concatenate([getattr(self, n), getattr(turned, n)]) for n in names}
         return replace(self, **both)
 
 
-class SightLines(NamedTuple):
-    """The n sightings of a log, from which the viewing evidence of its maps is made.
+class LogSightings(NamedTuple):
+    """Polar coordinates of n observations of a log.
 
     Attributes:
-        frame: (n,) ascending.
-        bearing_rad, range_m, height_m: (n,) in the robot's frame, the range in the plane.
+        frame: (n,) frame numbers, ascending.
+        bearing_rad, range_m, height_m: (n,) in the robot frame; the range is in the plane.
     """
 
     frame: np.ndarray
@@ -123,13 +124,13 @@ class SightLines(NamedTuple):
     height_m: Float
 
     @classmethod
-    def of(cls, log: RobotLog, n: int | None = None) -> "SightLines":
-        """Of a log, all of them or the first n."""
+    def of(cls, log: RobotLog, n: int | None = None) -> "LogSightings":
+        """Return the coordinates of all observations of a log, or of the first n."""
         frame, (x, y, z) = log.iteration[:n], log.observations.position_m[:n].T
         return cls(frame, np.arctan2(y, x), np.hypot(x, y), z.copy())
 
     def viewing(self, landmark: np.ndarray, path: Float, source_observation: np.ndarray) -> Viewing:
-        """The viewing evidence of a map made of them, by the arguments of `viewing_of`."""
+        """Return the viewing evidence of a map; for the arguments see `viewing_of_log`."""
         n_seen = min(int(np.searchsorted(self.frame, len(path))), len(landmark))
         bearing, range_m, height = (part[:n_seen] for part in self[1:])
         field = _field_of_view(bearing, range_m, height)
@@ -146,64 +147,64 @@ class SightLines(NamedTuple):
             for values in (np.cos(direction), np.sin(direction), range_m)
         )
         reach = np.zeros(len(path) * BEARINGS, dtype=np.float32)
-        at = frame.astype(np.int64) * BEARINGS + part_of(bearing, field)
+        at = frame.astype(np.int64) * BEARINGS + bearing_bin(bearing, field)
         np.maximum.at(reach, at, range_m.astype(np.float32))
         mean_m, n_views = distance / np.maximum(count, 1), count.astype(np.int32)
-        ways = path, reach.reshape(len(path), BEARINGS), field
-        return Viewing(np.arctan2(sin, cos), mean_m, n_views, *ways)
+        reach = reach.reshape(len(path), BEARINGS)
+        return Viewing(np.arctan2(sin, cos), mean_m, n_views, path, reach, field)
 
 
-def viewing_of(
+def viewing_of_log(
     log: RobotLog, landmark: np.ndarray, path: Float, source_observation: np.ndarray
 ) -> Viewing:
-    """The viewing evidence of a map that was made of a log.
+    """Return the viewing evidence of a map that was built from a log.
 
     Args:
-        log: at least as long as the path.
-        landmark: (n,) which landmark each of the log's first observations is of, as the observation
-            that it came from; negative for none.
-        path: (T, 3) poses of the first T frames, in the map's frame.
-        source_observation: (N,) of the map's landmarks.
+        log: a log with at least T frames.
+        landmark: (n,) landmark of each of the log's first observations, as the row of the
+            observation that created the landmark; negative for none.
+        path: (T, 3) poses of the first T frames in the map frame.
+        source_observation: (N,) row of the observation that created each landmark of the map.
     """
     n_seen = int(np.searchsorted(log.iteration, len(path)))
-    return SightLines.of(log, n_seen).viewing(landmark, path, source_observation)
+    return LogSightings.of(log, n_seen).viewing(landmark, path, source_observation)
 
 
-def part_of(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
-    """Which part of the field of view bearings (n,) lie in; those beyond it in its last ones."""
+def bearing_bin(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
+    """Return the sector of bearings (n,); bearings outside the field of view get the nearest."""
     low, high = field.bearing_rad
     part = np.floor((bearing_rad - low) / max(high - low, 1e-9) * BEARINGS)
     return np.clip(part, 0, BEARINGS - 1).astype(np.int64)
 
 
 def _field_of_view(bearing_rad: Float, range_m: Float, height_m: Float) -> FieldOfView:
-    """Of sightings (n,); none where there are none."""
+    """Return the field of view of observations (n,); an empty one without observations."""
     heights = np.tile([1.0, 0.0], (RANGES, 1))
     if not len(range_m):
         return FieldOfView(np.zeros(2), np.zeros(2), heights)
     nearest, farthest = _ends(range_m)
-    # the last step is of what is farther, as long as a byte holds it
+    # Outliers beyond the greatest range are in step RANGES, which has no height limits.
     step = np.minimum(np.floor(range_m / max(farthest, 1e-9) * RANGES), RANGES).astype(np.int8)
     by_step = height_m[np.argsort(step, kind="stable")]
     starts = np.concatenate([[0], np.cumsum(np.bincount(step, minlength=RANGES))])
     for k in range(RANGES):
         own = by_step[starts[k] : starts[k + 1]]
-        if len(own) >= _LEAST_SIGHTINGS:
+        if len(own) >= _MIN_SIGHTINGS:
             heights[k] = _ends(own)
     return FieldOfView(_ends(bearing_rad), np.array([nearest, farthest]), heights)
 
 
 def _ends(values: Float) -> Float:
-    """The quantiles (2,) between which all values (n,) but the stray ones lie, n at least 1.
+    """Return the quantiles (2,) of values (n,) that cut off outliers at both ends; n >= 1.
 
-    As `np.quantile` has them, which takes several times as long as to sort.
+    The result equals that of `np.quantile`, which is several times slower than a sort.
     """
     ranked = np.sort(values)
-    place = np.array([_STRAY, 1 - _STRAY]) * (len(ranked) - 1)
+    place = np.array([_OUTLIER_SHARE, 1 - _OUTLIER_SHARE]) * (len(ranked) - 1)
     below = place.astype(np.int64)
     low, high = ranked[below], ranked[np.minimum(below + 1, len(ranked) - 1)]
     share = place - below
-    # from the nearer of the two
+    # interpolate from the nearer value, as `np.quantile` does
     return np.where(share < 0.5, low + (high - low) * share, high - (high - low) * (1 - share))
 
 
@@ -211,21 +212,30 @@ VIEWING = schema(
     "landmark_viewing",
     1,
     [
-        told(pa.field("direction_rad", pa.float64()), "mean, from the robot to it, in map frame"),
-        told(pa.field("distance_m", pa.float64()), "mean, from the robot to it, in the plane"),
-        told(pa.field("n_views", pa.int32()), "sightings behind both"),
+        described(
+            pa.field("direction_rad", pa.float64()),
+            "mean direction from the robot to the landmark, in the map frame",
+        ),
+        described(
+            pa.field("distance_m", pa.float64()),
+            "mean distance from the robot to the landmark, in the plane",
+        ),
+        described(pa.field("n_views", pa.int32()), "number of observations in both means"),
     ],
 )
 VIEWED_FRAMES = schema(
     "viewed_frames",
     1,
     [
-        told(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
-        *(told(field, "of the robot, in the map's frame") for field in float_fields(POSE_FIELDS)),
-        told(
+        described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ..."),
+        *(
+            described(field, "pose of the robot in the map frame")
+            for field in float_fields(POSE_FIELDS)
+        ),
+        described(
             pa.field("reach_m", pa.list_(pa.float32(), BEARINGS)),
-            "range of the farthest landmark in each part of the field of view, least bearing first;"
-            " 0 for none",
+            "range of the farthest landmark in each sector of the field of view, smallest bearing"
+            " first; 0 for none",
         ),
     ],
 )
@@ -234,12 +244,12 @@ _FIELD = "field_of_view"
 
 
 def viewing_paths(map_path: Path) -> tuple[Path, Path]:
-    """Where the viewing evidence of a map's file lies: of its landmarks, and of its frames."""
+    """Return the paths of a map's viewing evidence: of its landmarks, and of its frames."""
     return map_path.with_suffix(".viewing.parquet"), map_path.with_suffix(".frames.parquet")
 
 
 def viewing_writes(map_path: Path, viewing: Viewing | None) -> dict[Path, Write]:
-    """Return what is to be written beside a map's file; of None what lay there is removed."""
+    """Return the writes of the files beside a map's file; None removes these files."""
     of_landmarks, of_frames = viewing_paths(map_path)
     if viewing is None:
         return {of_landmarks: None, of_frames: None}
@@ -254,11 +264,11 @@ def viewing_writes(map_path: Path, viewing: Viewing | None) -> dict[Path, Write]
 
 
 def read_viewing(map_path: Path, n_landmarks: int) -> Viewing | None:
-    """The viewing evidence beside a map's file; None where there is none.
+    """Read the viewing evidence beside a map's file; None if there is none.
 
     Raises:
-        InputError: it is damaged, of another version or of another map, or one of the two files is
-            missing.
+        InputError: a file is damaged, has another version or belongs to another map, or one of the
+            two files is missing.
     """
     of_landmarks, of_frames = paths = viewing_paths(map_path)
     there = [path.is_file() for path in paths]
@@ -273,7 +283,8 @@ def read_viewing(map_path: Path, n_landmarks: int) -> Viewing | None:
         raise InputError(f"{of_landmarks}: {own}; remove it, or give the map that it belongs to")
     frames, attributes = read_table(of_frames, VIEWED_FRAMES)
     try:
-        field = _field_from(attributes.get(_FIELD, ""))
+        content = json.loads(attributes.get(_FIELD, ""))
+        field = FieldOfView(**{k: np.array(v, dtype=np.float64) for k, v in content.items()})
     except (ValueError, TypeError, AttributeError) as error:
         expected = f"expected bearing_rad (2), range_m (2), height_m ({RANGES} x 2)"
         raise InputError(f"{of_frames}: {_FIELD}: {expected} ({error})") from error
@@ -286,8 +297,3 @@ def read_viewing(map_path: Path, n_landmarks: int) -> Viewing | None:
         )
     except ValueError as error:
         raise InputError(f"{of_landmarks}: {error}") from error
-
-
-def _field_from(text: str) -> FieldOfView:
-    found = {name: np.array(values, dtype=np.float64) for name, values in json.loads(text).items()}
-    return FieldOfView(**found)

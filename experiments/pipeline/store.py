@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from experiments.pipeline.stage import RecordedLog, Stage
-from mapfusion.errors import DamagedFileError, MendedWarning
+from mapfusion.errors import DamagedFileError, StoreRepairWarning
 from mapfusion.files import PART, digest_of, read_json, require_file, write_json, write_whole
 
 # A process keeps the digests of so many files, those of some thousand stages.
@@ -207,7 +207,7 @@ class Store:
             return False
         shutil.rmtree(stage, ignore_errors=True)
         again = f"the stage {stage.parent.name} is discarded and computed again"
-        warnings.warn(f"{error}; {again}", MendedWarning, stacklevel=2)
+        warnings.warn(f"{error}; {again}", StoreRepairWarning, stacklevel=2)
         return True
 
     def folder(self, stage: Stage) -> StageFolder:

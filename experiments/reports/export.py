@@ -12,7 +12,7 @@ from experiments.reports.inspect import unit_of
 from mapfusion import attitude, landmark_map, robot_log, viewing
 from mapfusion.files import write_whole
 from mapfusion.geometry.joint_covariance import RANK
-from mapfusion.tables import HEIGHT, about, default_of
+from mapfusion.tables import HEIGHT, default_of, description_of
 
 # The CSV keeps every digit.
 _SIGNIFICANT_DIGITS = 4
@@ -95,7 +95,7 @@ def _lines() -> Iterator[str]:
             "|---" * 5 + "|",
         )
         for field in schema:
-            yield _row(field.name, field.type, _if_absent(field), about(field))
+            yield _row(field.name, field.type, _if_absent(field), description_of(field))
     yield "\n## A result: `RESULT/tables/*.parquet`\n"
     yield "What the rows are, `experiments/evaluation/tables.py` says. All columns are there.\n"
     yield from ("| table | column | type | unit |", "|---" * 4 + "|")

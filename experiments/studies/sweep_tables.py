@@ -33,7 +33,7 @@ from experiments.evaluation.criteria import answerable, how_far_off
 from experiments.pipeline.code_version import library_versions, source_hash
 from experiments.pipeline.tables import FLOAT, TEXT, fields
 from experiments.studies.sweep_combinations import SweepRun
-from mapfusion.errors import DamagedFileError, InputError, MendedWarning
+from mapfusion.errors import DamagedFileError, InputError, StoreRepairWarning
 from mapfusion.files import (
     read_json,
     read_parquet,
@@ -210,7 +210,7 @@ class JoinedTables:
                             self._made_from[number] |= _hashes(group)
             except DamagedFileError as error:
                 told = f"{error}; the runs in it are made again, when a sweep asks for them"
-                warnings.warn(told, MendedWarning, stacklevel=2)
+                warnings.warn(told, StoreRepairWarning, stacklevel=2)
                 self._damaged.add(number)
                 self._made_from[number] = {}
         return self._made_from[number]

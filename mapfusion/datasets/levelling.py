@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.attitude import Attitude, moved
+from mapfusion.attitude import Attitude, transform_observations
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
 from mapfusion.datasets.formats import AttitudeSource
 from mapfusion.datasets.imu import SHARED_RAD, ImuData
@@ -97,7 +97,7 @@ def level_observations(
     R, t = T_robot_left[:3, :3], T_robot_left[:3, 3]
     if np.array_equal(R, np.eye(3)) and np.array_equal(t, camera.p_robot_left):
         return observed
-    return moved(observed, R, t - R @ camera.p_robot_left)
+    return transform_observations(observed, R, t - R @ camera.p_robot_left)
 
 
 def upright(T_robot_left: Float, up_left: Float) -> Float:

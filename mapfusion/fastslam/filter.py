@@ -1,9 +1,9 @@
 """FastSLAM 1.0 particle filter: one path per particle, one Kalman filter per particle and landmark.
 
 Montemerlo, Thrun, Koller, Wegbreit (2002), in the paper's form (eq. 1-10) with these additions:
-association per particle, a density for observations that match nothing, weights that are
-multiplied until a resampling, resampling by effective sample size, and paths that bend where a
-loop closes.
+data association per particle, a density for observations without a match, weights that accumulate
+until a resampling, resampling by effective sample size, and a correction of the path at loop
+closures.
 """
 
 from dataclasses import dataclass, field
@@ -13,22 +13,27 @@ import numpy as np
 
 from mapfusion.fastslam.association import (
     Association,
-    choose,
-    pairs_nearby,
-    pairs_of_labels,
-    sources,
+    associate,
+    candidate_pairs,
+    label_pairs,
+    observation_sources,
 )
-from mapfusion.fastslam.landmarks import Tracked
-from mapfusion.fastslam.loop_closing import Bends, Seen, close_loops, motion_by_odometry
+from mapfusion.fastslam.landmarks import ActiveTracks
+from mapfusion.fastslam.loop_closing import (
+    DriftModel,
+    FrameAssociation,
+    close_loops,
+    odometry_noise_factor,
+)
 from mapfusion.fastslam.measurement import (
-    Sightings,
+    MapObservations,
     log_density_at_gate,
-    sightings,
+    observations_in_map,
     update_landmarks,
 )
 from mapfusion.fastslam.motion import MotionNoise, sample_motion
-from mapfusion.fastslam.particles import History, ParticleMaps
-from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
+from mapfusion.fastslam.particles import ParticleMaps, PathHistory
+from mapfusion.fastslam.proposal import Proposal, informed_disturbance, with_odometry_noise
 from mapfusion.fastslam.resampling import effective_sample_size, normalised, systematic_ancestors
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import compose
@@ -40,30 +45,30 @@ from mapfusion.tables import NO_LABEL
 
 @dataclass(frozen=True)
 class FastSlamParameters:
-    """Settings of the filter; the defaults are the recommended ones.
+    """Settings of the filter; the defaults are recommended.
 
     Attributes:
         n_particles: M.
         motion: noise of the odometry.
-        proposal: what particles are drawn from. `motion` is the paper's eq. 3, which leaves few of
-            them where observations are far sharper than the odometry.
-        association: what decides among the landmarks inside the gate.
-        gate_probability: share of true matches that the gate lets pass (chi-square quantile). Close
-            to 1, as a landmark's covariance leaves out the drift since it was last seen; among
-            those inside, the descriptors decide.
+        proposal: distribution from which particles are sampled. `motion` is the paper's eq. 3; with
+            it, few particles survive if observations are much more precise than the odometry.
+        association: criterion that selects among the landmarks inside the gate.
+        gate_probability: share of true matches inside the gate (chi-square quantile). Close to 1,
+            since a landmark's covariance omits the drift since it was last seen; inside the gate
+            the descriptors decide.
         descriptor_threshold: largest Euclidean distance of matching descriptors (unit vectors).
         resample_fraction: resample when the effective sample size is at most this share of M;
             0 never, 1 in every step.
-        stray_m: standard deviation, along each axis, by which the point that one track of
-            observations is of lies beside the landmark; the next track's lies elsewhere.
-        close_loops: bend the path so far, and the map that hangs on it, where landmarks come back
-            into view (see `bends.py`); with the informed proposal alone.
+        stray_m: standard deviation, per axis, of the offset between the landmark and the point that
+            a track of observations shows; each track has its own offset.
+        close_loops: correct the past path and the map when landmarks come into view again (see
+            `loop_closing.py`); only with the informed proposal.
         noise_floor_m: standard deviation added to each coordinate of an observation.
         log_new_landmark_density: log of p_new in 1/m^3 (1/m^2 in planar data), the density of an
-            observation that matches nothing; None: that of a match exactly at the gate, with the
-            covariance of a landmark seen once, and its stray if it has a track.
-        planar: z carries no information; gates and weights have 2 degrees of freedom. None: as the
-            log says; of a filter without a log, no.
+            observation without a match. None: the density of a match at the gate, with the
+            covariance of a landmark seen once, and its offset if it has a track.
+        planar: z carries no information; gates and weights have 2 degrees of freedom. None: from
+            the log; False in a filter without a log.
     """
 
     n_particles: Annotated[int, Range(1, 10_000, "particles")] = 200
@@ -92,17 +97,17 @@ class FastSlamParameters:
 
 @dataclass(frozen=True)
 class StepResult:
-    """The particles after weighting and before resampling.
+    """State of the particles after weighting and before resampling.
 
     Attributes:
-        best_pose: (3,) of the heaviest particle.
+        best_pose: (3,) pose of the heaviest particle.
         effective_sample_size: 1 to M.
-        resampled: whether a resampling followed.
-        n_landmarks: of the heaviest particle, however often seen.
+        resampled: True if a resampling followed.
+        n_landmarks: number of landmarks of the heaviest particle.
         cloud: (M, 3) poses.
         log_weights: (M,) normalised.
-        log_evidence: log density of the frame's observations given all before. Its sum over a log
-            tells which noise explains the data best, without the truth.
+        log_evidence: log density of the frame's observations given all earlier ones. Its sum over a
+            log measures how well the assumed noise explains the data, without the truth.
     """
 
     best_pose: Float
@@ -115,17 +120,17 @@ class StepResult:
 
 
 class FastSlam:
-    """The filter as a stream: one `step` for each frame of a robot, also those that saw nothing.
+    """FastSLAM filter for a stream of frames.
 
-    Observations are numbered in the order in which they come; `source_observation` of a landmark
-    is the number of the one it came from (the row of the log, if a log is streamed from its start).
+    Call `step` once for each frame, also for frames without observations. Observations are numbered
+    in their order; `source_observation` of a landmark is the number of the observation that created
+    it (the row of the log, if a log is filtered from its start).
 
     Args:
         parameters: settings.
-        rng: of the motion and the resampling.
-        keep_history: keep what `best_path` and `best_associations` tell. It grows with every step,
-            by one particle's share once the particles' lines have met; without it the filter's
-            memory grows with the map alone.
+        rng: random generator of the sampling and the resampling.
+        keep_history: store the paths and associations for `best_path` and `best_associations`. The
+            stored history grows with every step; without it, memory depends on the map alone.
     """
 
     def __init__(
@@ -139,66 +144,113 @@ class FastSlam:
         self._poses = np.zeros((parameters.n_particles, 3))
         self._log_weights = np.full(parameters.n_particles, -np.log(parameters.n_particles))
         self._planar = bool(parameters.planar)
-        self._tracked, self._stray_m2 = Tracked(), 2 * parameters.stray_m**2
+        self._tracked, self._stray_m2 = ActiveTracks(), 2 * parameters.stray_m**2
         self._maps = ParticleMaps(parameters.n_particles, parameters.gate)
         self._best = 0
         self._n_observations = 0
         self._slot_of_label: dict[int, int] = {}
         self._has_descriptors = self._has_labels = False
-        self._history = History() if keep_history else None
-        self._bends = Bends()
+        self._history = PathHistory() if keep_history else None
+        self._drift_model = DriftModel()
 
     @property
     def n_slots(self) -> int:
-        """Distinct landmarks that the particles hold between them."""
+        """Number of distinct landmarks in all particles."""
         return self._maps.n_slots
 
     @property
     def n_rows(self) -> int:
-        """Those of them that the particles may estimate differently, M times the memory each."""
+        """Number of landmarks with one estimate per particle; the others share one estimate."""
         return self._maps.n_rows
 
     def step(
         self, odometry: Float, observations: Observations, sigma: Float | None = None
     ) -> StepResult:
-        """Take in one frame: predict, associate, update, weigh, resample.
+        """Process one frame: predict, associate, update, weigh, resample.
 
         Args:
             odometry: (3,) motion since the frame before, in the robot frame of the frame before.
-            observations: what the frame shows; may be none.
-            sigma: (3,) standard deviations of the odometry; None: as the motion noise has them.
+            observations: of the frame; may be empty.
+            sigma: (3,) standard deviations of the odometry; None: from the motion noise.
 
         Returns:
             The particles after weighting and before resampling.
 
         Raises:
             ValueError: odometry is not three finite numbers, a covariance is not positive definite,
-                or descriptors or labels are missing that the association needs. The filter is as it
-                was before then.
+                or descriptors or labels that the association needs are missing. The filter is then
+                unchanged.
         """
         odometry = np.asarray(odometry, dtype=np.float64)
-        self._check(odometry, observations)
-        noise, log_new = self._noise(observations)
-        planar = self._planar
-        sigma = self.parameters.motion.standard_deviations(odometry) if sigma is None else sigma
+        require_shape("odometry", odometry, (3,))
+        require_finite("odometry", odometry)
+        settings, planar, maps = self.parameters, self._planar, self._maps
+        needed = {Association.DESCRIPTOR: "descriptor", Association.LABEL: "label"}
+        name = needed.get(settings.association)
+        if name is not None and len(observations):
+            values = getattr(observations, name)
+            if values is None or (name == "label" and np.any(values == NO_LABEL)):
+                raise ValueError(f"{name}: observations have none, and the association needs it")
 
-        self._maps.widen(self._tracked.ended(observations.track, self._maps.slots), self._stray_m2)
+        # R_t (K, 3, 3) and log p_new (K,). A landmark seen once has lost its track. Without the
+        # offset of its track, every match would be less likely than a new landmark where R is
+        # small.
+        noise = observations.covariance_m2 + settings.noise_floor_m**2 * np.eye(3)
+        stray_m = 0.0 if observations.track is None else settings.stray_m
+        seen_once = noise + stray_m**2 * np.eye(3)
+        log_new = log_density_at_gate(seen_once, settings.gate, planar)
+        if settings.log_new_landmark_density is not None:
+            log_new[:] = settings.log_new_landmark_density
+        sigma = settings.motion.standard_deviations(odometry) if sigma is None else sigma
+
+        # Predict: landmarks lose certainty at the end of their tracks, and the poses move.
+        maps.inflate(self._tracked.ended(observations.track, maps.slots), self._stray_m2)
         self._poses, log_ratio = self._propose(odometry, sigma, observations, noise)
-        seen = sightings(self._poses, observations.position_m, noise, planar)
+
+        # Associate and update the landmarks (eq. 4-9), and create new ones.
+        seen = observations_in_map(self._poses, observations.position_m, noise, planar)
         chosen, changed = self._associate(seen, observations)
-        slots = self._maps.slots
+        slots = maps.slots
         log_likelihood = update_landmarks(slots.own, slots.row, chosen, seen, log_new, planar)
-        self._maps.moved(changed)
-        created = self._start_landmarks(chosen, seen, observations)
-        self._maps.slots.last_frame[np.concatenate([changed, created[:, 1]])] = self._bends.frame
-        self._tracked.went_into(observations.track, chosen, created, self._maps.slots)
-        log_evidence = self._weigh(log_likelihood + log_ratio)
-        self._remember(chosen)
-        return self._resample(log_evidence)
+        maps.update_boxes(changed)
+        created, rows = maps.create(chosen, seen, observations, self._n_observations)
+        if len(observations):
+            if settings.association is Association.LABEL:
+                assert observations.label is not None
+                labels = observations.label[rows].tolist()
+                self._slot_of_label.update(zip(labels, created.tolist(), strict=True))
+            self._has_descriptors |= observations.descriptor is not None
+            self._has_labels |= observations.label is not None
+        maps.slots.last_frame[np.concatenate([changed, created])] = self._drift_model.frame
+        pairs = np.stack([rows, created], axis=1)
+        self._tracked.update(observations.track, chosen, pairs, maps.slots)
+
+        # Weigh (eq. 10).
+        log_weights = self._log_weights + (log_likelihood + log_ratio)
+        self._log_weights, log_evidence = normalised(log_weights)
+        self._best = int(np.argmax(self._log_weights))
+        if self._history is not None:
+            source = observation_sources(maps.slots, chosen, self._n_observations)
+            self._history.add(self._poses, source)
+        self._n_observations += len(chosen)
+        n_effective = effective_sample_size(self._log_weights)
+        few = n_effective <= settings.resample_fraction * settings.n_particles
+        result = StepResult(
+            best_pose=self._poses[self._best],
+            effective_sample_size=n_effective,
+            resampled=few,
+            n_landmarks=int(maps.n_landmarks[self._best]),
+            cloud=self._poses,
+            log_weights=self._log_weights,
+            log_evidence=log_evidence,
+        )
+        if few:
+            self._resample()
+        return result
 
     def best_map(self, min_count: int = 3) -> LandmarkMap:
-        """The heaviest particle's landmarks that were seen at least `min_count` times, by age."""
-        which, known = self._maps.of_particle(self._best, min_count)
+        """Return the heaviest particle's landmarks seen at least `min_count` times, by age."""
+        which, known = self._maps.landmarks_of(self._best, min_count)
         slots = self._maps.slots
         covariance = known.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         return LandmarkMap(
@@ -212,76 +264,50 @@ class FastSlam:
         )
 
     def best_path(self) -> Float:
-        """Poses (steps, 3) of the heaviest particle and its ancestors.
+        """Return the poses (steps, 3) of the heaviest particle and its ancestors.
 
         Raises:
-            ValueError: the history was not kept.
+            ValueError: `keep_history` is False.
         """
         return self._kept_history().path(self._best)
 
     def best_associations(self) -> np.ndarray:
-        """For each observation so far the source of the heaviest particle's landmark it went into.
+        """Return the source (n,) int64 of the heaviest particle's landmark of each observation.
 
-        (n,) int64, -1 where the observation was dropped.
+        The source is -1 for an observation that was dropped.
 
         Raises:
-            ValueError: the history was not kept.
+            ValueError: `keep_history` is False.
         """
         return self._kept_history().associations(self._best)
-
-    def _check(self, odometry: Float, observations: Observations) -> None:
-        """Refuse a frame before anything has changed."""
-        require_shape("odometry", odometry, (3,))
-        require_finite("odometry", odometry)
-        if len(observations) == 0:
-            return
-        needed = {Association.DESCRIPTOR: "descriptor", Association.LABEL: "label"}
-        name = needed.get(self.parameters.association)
-        if name is None:
-            return
-        values = getattr(observations, name)
-        if values is None or (name == "label" and np.any(values == NO_LABEL)):
-            raise ValueError(f"{name}: observations have none, and the association needs it")
-
-    def _noise(self, observations: Observations) -> tuple[Float, Float]:
-        """R_t (K, 3, 3) with the filter's own additions, and log p_new (K,)."""
-        settings = self.parameters
-        noise = observations.covariance_m2 + settings.noise_floor_m**2 * np.eye(3)
-        # The landmark seen once has lost its track. Without its stray no match, however good, would
-        # outweigh a new landmark at a near wall, where R is a fraction of a millimetre.
-        stray_m = 0.0 if observations.track is None else settings.stray_m
-        seen_once = noise + stray_m**2 * np.eye(3)
-        log_new = log_density_at_gate(seen_once, settings.gate, self._planar)
-        if settings.log_new_landmark_density is not None:
-            log_new[:] = settings.log_new_landmark_density
-        return noise, log_new
 
     def _propose(
         self, odometry: Float, sigma: Float, observations: Observations, noise: Float
     ) -> tuple[Float, Float]:
-        """Where the particles are after a motion.
+        """Sample the poses after a motion, and close loops.
 
-        Poses (M, 3), and (M,) log of eq. 3's density over the density they were drawn from.
+        Returns:
+            (M, 3) poses, and (M,) log of eq. 3's density over the density of the proposal.
         """
         settings = self.parameters
         empty = self._maps.n_slots == 0
-        # a robot that stands still is where it was, and without observations there is no news
-        seeing = len(observations) and sigma.any() and not empty
-        if not (settings.proposal is Proposal.INFORMED and seeing):
-            moved = motion_by_odometry(self._poses[self._best], 0.0, sigma)
-            self._bends.went_on(moved @ moved.T)
-            # Before the first landmark no draw is better than another, nor ever will be: whichever
-            # particle is left would have turned the map by its own error beside the odometry's.
+        # without motion or observations, the informed proposal equals the motion proposal
+        informative = len(observations) and sigma.any() and not empty
+        if not (settings.proposal is Proposal.INFORMED and informative):
+            moved = odometry_noise_factor(self._poses[self._best], 0.0, sigma)
+            self._drift_model.add_frame(moved @ moved.T)
+            # Before the first landmark, particles are not disturbed: no observation could ever
+            # correct the disturbance, which would only rotate and shift the map.
             disturbed = np.zeros(3) if empty else sigma
             poses = sample_motion(self._poses, odometry, disturbed, self._rng)
             return poses, np.zeros(settings.n_particles)
         predicted = compose(self._poses, odometry)
-        seen = sightings(predicted, observations.position_m, noise, self._planar)
-        wide = widened(seen, predicted, odometry, sigma)
+        seen = observations_in_map(predicted, observations.position_m, noise, self._planar)
+        wide = with_odometry_noise(seen, predicted, odometry, sigma)
         chosen, _ = self._associate(wide, observations)
         if settings.close_loops and self._close_loops(chosen, seen, predicted, odometry, sigma):
             predicted = compose(self._poses, odometry)
-            seen = sightings(predicted, observations.position_m, noise, self._planar)
+            seen = observations_in_map(predicted, observations.position_m, noise, self._planar)
         slots = self._maps.slots
         eta, log_ratio = informed_disturbance(
             slots.own,
@@ -298,36 +324,43 @@ class FastSlam:
         return compose(self._poses, odometry + sigma * eta), log_ratio
 
     def _close_loops(
-        self, chosen: np.ndarray, seen: Sightings, predicted: Float, odometry: Float, sigma: Float
+        self,
+        chosen: np.ndarray,
+        seen: MapObservations,
+        predicted: Float,
+        odometry: Float,
+        sigma: Float,
     ) -> bool:
-        """Bend all particles' paths and maps by what the best one sees again; whether they were."""
-        m, settings, bends = self._best, self.parameters, self._bends
-        frame = Seen(chosen[:, m].copy(), seen, m, settings.gate, self._planar)
-        by_odometry = motion_by_odometry(predicted[m], odometry[2], sigma)
+        """Correct all particles by the loops that the best one closes; return True if corrected."""
+        m, settings, drift_model = self._best, self.parameters, self._drift_model
+        frame = FrameAssociation(chosen[:, m].copy(), seen, m, settings.gate, self._planar)
+        noise_factor = odometry_noise_factor(predicted[m], odometry[2], sigma)
         slots, probability = self._maps.slots, settings.gate_probability
-        drift = close_loops(bends, slots, frame, by_odometry, probability)
-        bent = bends.due(predicted[m, :2])
-        if bent is not None:
+        drift = close_loops(drift_model, slots, frame, noise_factor, probability)
+        correction = drift_model.take_correction(predicted[m, :2])
+        if correction is not None:
             if self._history is not None:
-                self._history.bent(bends.at(bent, np.arange(bends.frame + 1)))
-            self._poses = compose(bent[-1], self._poses)
-            self._maps.bend(bends.at(bent, slots.last_frame))
-        bends.went_on(drift)
-        return bent is not None
+                self._history.correct(
+                    drift_model.interpolate(correction, np.arange(drift_model.frame + 1))
+                )
+            self._poses = compose(correction[-1], self._poses)
+            self._maps.transform(drift_model.interpolate(correction, slots.last_frame))
+        drift_model.add_frame(drift)
+        return correction is not None
 
     def _associate(
-        self, seen: Sightings, observations: Observations
+        self, seen: MapObservations, observations: Observations
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(K, M) slot of each observation in each particle, or NEW or DROPPED; the slots chosen."""
+        """Return slots (K, M), NEW or DROPPED, of each observation; and the distinct slots."""
         settings = self.parameters
         may_create = np.ones(len(observations), dtype=bool)
         if len(observations) == 0:
             return np.empty(seen.point_m.shape[:2], dtype=np.int64), np.empty(0, dtype=np.int64)
         if settings.association is Association.LABEL:
             assert observations.label is not None
-            pairs, may_create = pairs_of_labels(self._slot_of_label, observations.label)
+            pairs, may_create = label_pairs(self._slot_of_label, observations.label)
         elif settings.association is Association.DESCRIPTOR:
-            pairs = pairs_nearby(
+            pairs = candidate_pairs(
                 self._maps,
                 seen,
                 settings.gate,
@@ -335,67 +368,22 @@ class FastSlam:
                 settings.descriptor_threshold,
             )
         else:
-            pairs = pairs_nearby(self._maps, seen, settings.gate)
+            pairs = candidate_pairs(self._maps, seen, settings.gate)
         nearest = settings.association is Association.GATE
-        return choose(self._maps, pairs, seen, may_create, settings.gate, self._planar, nearest)
+        return associate(self._maps, pairs, seen, may_create, settings.gate, self._planar, nearest)
 
-    def _start_landmarks(
-        self, chosen: np.ndarray, seen: Sightings, observations: Observations
-    ) -> np.ndarray:
-        """A landmark for each observation that is NEW in some particle: rows and slots (n, 2)."""
-        if len(observations) == 0:
-            return np.empty((0, 2), dtype=np.int64)
-        created, rows = self._maps.create(chosen, seen, observations, self._n_observations)
-        if self.parameters.association is Association.LABEL:
-            assert observations.label is not None
-            labels = observations.label[rows].tolist()
-            self._slot_of_label.update(zip(labels, created.tolist(), strict=True))
-        self._has_descriptors |= observations.descriptor is not None
-        self._has_labels |= observations.label is not None
-        return np.stack([rows, created], axis=1)
-
-    def _weigh(self, log_likelihood: Float) -> float:
-        """Multiply the weights by the frame's likelihood (eq. 10).
-
-        Returns:
-            Log density of the frame's observations given all before.
-        """
-        self._log_weights, log_evidence = normalised(self._log_weights + log_likelihood)
-        self._best = int(np.argmax(self._log_weights))
-        return log_evidence
-
-    def _remember(self, chosen: np.ndarray) -> None:
-        """Number the observations, and keep what became of them."""
-        if self._history is not None:
-            source = sources(self._maps.slots, chosen, self._n_observations)
-            self._history.add(self._poses, source)
-        self._n_observations += len(chosen)
-
-    def _resample(self, log_evidence: float) -> StepResult:
-        """Take the result; then replace light particles by heavy ones if few carry the weight."""
+    def _resample(self) -> None:
+        """Replace particles of low weight by copies of heavy ones."""
         n_particles = self.parameters.n_particles
-        n_effective = effective_sample_size(self._log_weights)
-        few = n_effective <= self.parameters.resample_fraction * n_particles
-        result = StepResult(
-            best_pose=self._poses[self._best],
-            effective_sample_size=n_effective,
-            resampled=few,
-            n_landmarks=int(self._maps.n_landmarks[self._best]),
-            cloud=self._poses,
-            log_weights=self._log_weights,
-            log_evidence=log_evidence,
-        )
-        if few:
-            ancestors = systematic_ancestors(self._log_weights, self._rng)
-            self._poses = self._poses[ancestors]
-            self._maps.resampled(ancestors)
-            self._log_weights = np.full(n_particles, -np.log(n_particles))
-            if self._history is not None:
-                self._history.resampled(ancestors)
-            self._best = int(np.searchsorted(ancestors, self._best))
-        return result
+        ancestors = systematic_ancestors(self._log_weights, self._rng)
+        self._poses = self._poses[ancestors]
+        self._maps.resample(ancestors)
+        self._log_weights = np.full(n_particles, -np.log(n_particles))
+        if self._history is not None:
+            self._history.resample(ancestors)
+        self._best = int(np.searchsorted(ancestors, self._best))
 
-    def _kept_history(self) -> History:
+    def _kept_history(self) -> PathHistory:
         if self._history is None:
             raise ValueError("keep_history: is False, the path was not kept")
         return self._history

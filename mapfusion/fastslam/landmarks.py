@@ -1,11 +1,11 @@
-"""Landmark arrays of all particles, and the search among them.
+"""Landmark arrays of all particles, and spatial search.
 
-A slot is one landmark that one observation gave rise to. Particles share its descriptor and label,
-which never change. Where they estimate it differently, it has a row of M estimates; where all
-descend from the particle that saw it last, one estimate stands for all.
+A slot holds one landmark, created by one observation. All particles share its descriptor and label,
+which never change. If particles have different estimates of a landmark, its slot has a row of M
+estimates. If all particles descend from the one that saw it last, they share a common estimate.
 
-All observations of a track are of one point, which lies somewhat beside the landmark: what is sure
-about the one is less so about the other, and about the point that the next track will be of.
+All observations of a track show the same point, which has an offset from the landmark. The landmark
+is therefore less certain than the point, and so is the point of its next track.
 """
 
 from typing import NamedTuple
@@ -15,20 +15,21 @@ import numpy as np
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.tables import DESCRIPTOR_LENGTH, NO_LABEL
 
-FREE = -1  # the generation of a slot in no use, and the slot of a row in no use
-COMMON = -2  # the generation of a slot without a row: all particles have its common estimate
-NOWHERE = (np.inf, np.inf, -np.inf, -np.inf)  # a box that touches none
-# Slots that share a box: a search looks at all blocks, and at the slots of those that touch. Slots
-# of like age lie near each other, so with this many a search among 10^6 costs little beside a step.
+FREE = -1  # generation of an unused slot, and slot of an unused row
+COMMON = -2  # generation of a slot without a row: all particles share its common estimate
+NOWHERE = (np.inf, np.inf, -np.inf, -np.inf)  # empty box: overlaps none
+# Number of slots in a block, which has a box of its own. A search tests the boxes of all blocks,
+# then the slots of the blocks found. Slots of similar age lie close together, so this size keeps
+# the search fast even among 10^6 slots.
 BLOCK = 64
-# Particles that kernels take together, a number of each in a row: many enough that arithmetic on
-# rows is worth its start, few enough that what they see stays near the processor. The usual number
-# of particles is a multiple.
+# Number of particles that kernels process together as a vector: large enough for SIMD instructions,
+# small enough that the data stay in the processor's cache. The default number of particles is a
+# multiple.
 LANES = 40
 
 
 class Estimates(NamedTuple):
-    """Of N landmarks in M particles."""
+    """State of N landmarks in M particles."""
 
     mean_m: np.ndarray  # (N, M, 3)
     covariance_m2: np.ndarray  # (N, M, 6) upper entries
@@ -36,15 +37,15 @@ class Estimates(NamedTuple):
 
 
 class Slots(NamedTuple):
-    """S slots, and R rows of M particles. What belongs to free slots and rows means nothing."""
+    """Arrays of S slots and R rows of M particles; entries of free slots and rows are undefined."""
 
     own: Estimates  # (R, M, ...)
     slot_of_row: np.ndarray  # (R,); FREE
     common: Estimates  # (S, 1, ...)
-    generation: np.ndarray  # (S,) in which the row was written; FREE; COMMON
+    generation: np.ndarray  # (S,) in which the row was written, or FREE or COMMON
     row: np.ndarray  # (S,)
-    source: np.ndarray  # (S,) the observation it came from
-    last_frame: np.ndarray  # (S,) that showed it, in whatever particle
+    source: np.ndarray  # (S,) number of the observation that created it
+    last_frame: np.ndarray  # (S,) last frame that showed it in any particle
     box_m: np.ndarray  # (S, 4) min_x, min_y, max_x, max_y of mean and gate over all particles
     block_box_m: np.ndarray  # (S / BLOCK, 4) around the boxes of BLOCK slots
     descriptor: np.ndarray  # (S, 64) float32
@@ -52,7 +53,7 @@ class Slots(NamedTuple):
 
 
 def allocate(capacity: int, n_rows: int, n_particles: int) -> Slots:
-    """Free slots, a multiple of BLOCK, and free rows."""
+    """Return free slots (their number is a multiple of BLOCK) and free rows."""
     return Slots(
         _estimates(n_rows, n_particles),
         np.full(n_rows, FREE, dtype=np.int64),
@@ -68,8 +69,8 @@ def allocate(capacity: int, n_rows: int, n_particles: int) -> Slots:
     )
 
 
-def with_room(slots: Slots, n_slots: int, n_rows: int) -> Slots:
-    """The same slots and rows, with room for at least so many; what has none is doubled."""
+def grow(slots: Slots, n_slots: int, n_rows: int) -> Slots:
+    """Return the slots with room for at least `n_slots` and `n_rows`; full arrays are doubled."""
     n_particles = slots.own.count.shape[1]
     if n_slots > len(slots.label):
         wider = allocate(_doubled(len(slots.label), n_slots), 0, n_particles)
@@ -99,8 +100,8 @@ def _doubled(capacity: int, needed: int) -> int:
 _ALONG_PLANE = (0, 3)  # xx and yy among a covariance's upper entries
 
 
-def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
-    """Write the boxes of slots (n,) that are up to date, and of their blocks."""
+def update_boxes(slots: Slots, which: np.ndarray, gate: float) -> None:
+    """Compute the boxes of slots (n,), which are up to date, and of their blocks."""
     is_common = slots.generation[which] == COMMON
     common, rowed = which[is_common], which[~is_common]
     low, high, spread = (np.empty((2, len(which))) for _ in range(3))  # along x and y
@@ -113,17 +114,17 @@ def bound(slots: Slots, which: np.ndarray, gate: float) -> None:
         low[axis, ~is_common] = np.where(has, mean, np.inf).min(axis=1)
         high[axis, ~is_common] = np.where(has, mean, -np.inf).max(axis=1)
         spread[axis, ~is_common] = np.where(has, of_mean, 0.0).max(axis=1)
-    # Inside the gate |dx| <= sqrt(gate (Sigma_xx + R_xx)), at most the sum of both roots: one is
-    # the landmark's margin, the other the observation's.
+    # Inside the gate, |dx| <= sqrt(gate (Sigma_xx + R_xx)) <= sqrt(gate Sigma_xx) +
+    # sqrt(gate R_xx). The first term is the landmark's margin, the second the observation's.
     margin = np.sqrt(gate * spread)
     slots.box_m[which, :2], slots.box_m[which, 2:] = (low - margin).T, (high + margin).T
-    bound_blocks(slots, np.unique(which // BLOCK))
+    update_block_boxes(slots, np.unique(which // BLOCK))
 
 
-def bend_boxes(slots: Slots, which: np.ndarray, turn: Float, shift: Float) -> None:
-    """Put boxes of slots (n,) around what is in them after motions of the plane.
+def transform_boxes(slots: Slots, which: np.ndarray, turn: Float, shift: Float) -> None:
+    """Move the boxes of slots (n,) by rigid motions of the plane and enclose the result.
 
-    A motion turns by the cosines and sines `turn` (n, 2) and then shifts by `shift` (n, 2).
+    A motion rotates by an angle with cosine and sine `turn` (n, 2), then shifts by `shift` (n, 2).
     """
     cos, sin = turn.T
     low, high = slots.box_m[which, :2], slots.box_m[which, 2:]
@@ -133,75 +134,77 @@ def bend_boxes(slots: Slots, which: np.ndarray, turn: Float, shift: Float) -> No
     slots.box_m[which] = np.concatenate([middle - wide, middle + wide]).T
 
 
-def bound_blocks(slots: Slots, blocks: np.ndarray) -> None:
-    """Write the boxes of blocks (n,) around those of their slots."""
+def update_block_boxes(slots: Slots, blocks: np.ndarray) -> None:
+    """Compute the boxes of blocks (n,) from the boxes of their slots."""
     boxes = slots.box_m.reshape(-1, BLOCK, 4)[blocks]
     for side, outermost in enumerate((np.min, np.min, np.max, np.max)):
         slots.block_box_m[blocks, side] = outermost(boxes[:, :, side], axis=1)
 
 
 @kernel
-def touches(boxes: Float, i: int, box: Float) -> bool:
-    """Return True if row i of boxes (N, 4) and a box (4,) have a point in common."""
+def boxes_overlap(boxes: Float, i: int, box: Float) -> bool:
+    """Return True if row i of boxes (N, 4) overlaps a box (4,)."""
     x = (boxes[i, 0] <= box[2]) & (boxes[i, 2] >= box[0])
     y = (boxes[i, 1] <= box[3]) & (boxes[i, 3] >= box[1])
     return x & y
 
 
-def near(slots: Slots, box: Float) -> np.ndarray:
-    """Slots, ascending, whose boxes touch a box (4,)."""
-    blocks = _touching(slots.block_box_m, box)
+def slots_near(slots: Slots, box: Float) -> np.ndarray:
+    """Return slots, ascending, whose boxes overlap a box (4,)."""
+    blocks = _overlapping(slots.block_box_m, box)
     of_blocks = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
-    return of_blocks[_touching(slots.box_m[of_blocks], box)]
+    return of_blocks[_overlapping(slots.box_m[of_blocks], box)]
 
 
-def _touching(boxes: Float, box: Float) -> np.ndarray:
-    """Rows of the boxes (N, 4) that have a point in common with a box (4,)."""
+def _overlapping(boxes: Float, box: Float) -> np.ndarray:
+    """Return the rows of boxes (N, 4) that overlap a box (4,)."""
     return np.flatnonzero(np.all((boxes[:, :2] <= box[2:]) & (boxes[:, 2:] >= box[:2]), axis=1))
 
 
-class Tracked:
-    """The slots of each track that the last frame held."""
+class ActiveTracks:
+    """Slots of the tracks that the last frame showed."""
 
     def __init__(self) -> None:
         self._track = self._slot = self._source = np.empty(0, dtype=np.int64)
 
     def ended(self, track: np.ndarray | None, slots: Slots) -> np.ndarray:
-        """Slots (n,) of tracks that go on in none of this frame's observations (K,); once each."""
+        """Return the distinct slots (n,) of tracks that end before a frame.
+
+        Args:
+            track: (K,) tracks of the frame's observations, or None.
+            slots: the landmarks.
+        """
         if track is not None and len(track):
             known = np.sort(track)
             place = np.minimum(np.searchsorted(known, self._track), len(known) - 1)
             over = known[place] != self._track
         else:
             over = np.ones(len(self._track), dtype=bool)
-        # A landmark that no particle has any more is gone, and its slot may be another's by now.
+        # A landmark that no particle has is freed; its slot may hold another landmark by now.
         over &= slots.generation[self._slot] != FREE
         over &= slots.source[self._slot] == self._source
         return np.unique(self._slot[over])
 
-    def went_into(
+    def update(
         self, track: np.ndarray | None, chosen: np.ndarray, created: np.ndarray, slots: Slots
     ) -> None:
-        """Keep the slots of a frame.
+        """Store the slots of a frame's tracks.
 
         Args:
-            track: (K,) of its observations.
-            chosen: (K, M) the slots, or something negative.
-            created: (n, 2) rows of observations that began a slot, and the slot.
+            track: (K,) tracks of the frame's observations, or None.
+            chosen: (K, M) slots; negative if there is none.
+            created: (n, 2) observations that created a slot, and the slot.
             slots: the landmarks.
         """
         if track is None:
             self._track = self._slot = self._source = np.empty(0, dtype=np.int64)
             return
-        pairs = np.concatenate([_distinct(chosen), created])
+        # distinct pairs (n, 2) of observation and slot, in the order of first appearance
+        row, particle = np.nonzero(chosen >= 0)
+        slot = chosen[row, particle].astype(np.int64)
+        _, first = np.unique(row * (slot.max(initial=0) + 1) + slot, return_index=True)
+        first.sort()
+        matched = np.stack([row[first], slot[first]], axis=1)
+        pairs = np.concatenate([matched, created])
         self._track, self._slot = track[pairs[:, 0]], pairs[:, 1]
         self._source = slots.source[self._slot]
-
-
-def _distinct(chosen: np.ndarray) -> np.ndarray:
-    """Rows and slots (n, 2) of `chosen` (K, M), each once and in the order of first appearance."""
-    row, particle = np.nonzero(chosen >= 0)
-    slot = chosen[row, particle].astype(np.int64)
-    _, first = np.unique(row * (slot.max(initial=0) + 1) + slot, return_index=True)
-    first.sort()
-    return np.stack([row[first], slot[first]], axis=1)

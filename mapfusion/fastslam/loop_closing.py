@@ -1,13 +1,13 @@
-"""Loop closing: correct the path when landmarks come into view again.
+"""Loop closing: correct the path and the map when landmarks come into view again.
 
-Particles that were resampled share their past, and no weight mends what it errs by. That is a walk:
-while the robot goes on, the map to come slowly turns and shifts against the one there is. A bend is
-such a motion of the plane, (x, y, angle) about the map's origin, where small ones add. At each knot
-of the path it is unknown, and when landmarks from before are seen again, the difference of two of
-them is observed. What the path then does between is the mean of a Gaussian given that observation:
-a proposal for a block of past states that knows the observation at its end (Doucet, Briers, Senecal
-2006), for a chain of poses in closed form (Dubbelman, Browning 2015), here with any number of
-loops, one inside the other.
+After resampling, all particles share their past path, and reweighting cannot correct its error.
+This error is modelled as drift: a random walk of small motions of the plane, (x, y, angle) about
+the map's origin, by which the map turns and shifts as the robot goes on. Small motions add. The
+drift is a state at each knot of the path. When landmarks come into view again, the difference of
+the drift between two times is observed, and the whole path is corrected by the mean of the drift
+given this observation. This is a proposal for a block of past states that uses the observation at
+its end (Doucet, Briers, Senecal 2006). Dubbelman and Browning (2015) give the closed form for a
+chain of poses; this module handles any number of nested loops.
 """
 
 import math
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.landmarks import Slots
-from mapfusion.fastslam.measurement import NEW, Sightings, quadratic_form
+from mapfusion.fastslam.measurement import NEW, MapObservations, quadratic_form
 from mapfusion.geometry.numerics import (
     Float,
     chi_square_bound,
@@ -27,136 +27,154 @@ from mapfusion.geometry.numerics import (
     source_of,
 )
 
-# Frames between two knots at first. A landmark that has been out of view for less has lost its
-# track, and what the path did meanwhile is in the landmarks that stayed.
-SPACING = 20
-# Knots that are kept; with more, every second one goes. A drive seldom closes more loops at once
-# than these tell apart, and closing one takes the square of their number.
-_MOST_KNOTS = 64
-# Directions of a group of sightings that say less than this share of what the best one says, say
-# nothing: one point does not tell how the plane turns about it.
-_SAYS_NOTHING = 1e-9
-# Bends are put off until one moves the robot by this much: moving a map costs as much as a frame.
-_WORTH_M = 1e-3
+# Frames between two knots at first. A landmark that was out of view for fewer frames still counts
+# as in view: the drift since then is small.
+KNOT_SPACING = 20
+# Number of knots above which every second one is removed. Few drives close more nested loops, and
+# the cost of a closure grows with the square of this number.
+_MAX_KNOTS = 64
+# Directions whose information is below this share of the largest are not observed: for instance,
+# one point does not observe the rotation about itself.
+_MIN_INFORMATION = 1e-9
+# Smallest correction of the robot's position that is applied: moving the map costs about one step.
+_MIN_CORRECTION_M = 1e-3
 
 
-class Bends:
-    """The bends at K knots and now, jointly Gaussian; each mean is zero once the path has bent."""
+class DriftModel:
+    """Joint Gaussian of the drift at K knots of the path and at the present frame.
+
+    Attributes:
+        frame: number of the last frame; -1 before the first.
+    """
 
     def __init__(self) -> None:
-        self.frame = -1  # the last that went by
-        self._knots = np.zeros(1, dtype=np.int64)  # their frames, ascending
-        self._spacing = SPACING
-        self._covariance = np.zeros((6, 6))  # of the first knot and of now, which are the map's
-        self._due = np.zeros(6)  # what the path has yet to be bent by
+        self.frame = -1
+        self._knots = np.zeros(1, dtype=np.int64)  # frame numbers, ascending
+        self._spacing = KNOT_SPACING
+        self._covariance = np.zeros((6, 6))  # of the first knot and the present frame
+        self._pending = np.zeros(6)  # mean of the drift that has not yet been corrected
 
-    def went_on(self, covariance: Float) -> None:
-        """The next frame; `covariance` (3, 3) of what the path may have bent by since the last."""
+    def add_frame(self, covariance: Float) -> None:
+        """Add a frame, in which the drift grows with a covariance (3, 3)."""
         if self.frame - self._knots[-1] >= self._spacing:
-            self._add_knot()
+            self._knots = np.append(self._knots, self.frame)
+            kept = np.arange(len(self._knots) + 1)
+            if len(self._knots) > _MAX_KNOTS:
+                self._spacing *= 2
+                kept = np.append(kept[:-1:2], kept[-1])
+            # The new knot starts as a copy of the present state.
+            state = (3 * np.minimum(kept, len(self._knots) - 1)[:, None] + np.arange(3)).ravel()
+            self._covariance = self._covariance[np.ix_(state, state)]
+            self._pending = self._pending[state]
+            self._knots = self._knots[kept[:-1]]
         self.frame += 1
         self._covariance[-3:, -3:] += covariance
 
-    def closed(
+    def add_closure(
         self, frame: np.ndarray, information: Float, pull: Float, now: Float, probability: float
     ) -> None:
-        """Landmarks from before are seen again: where does this bend the path?
+        """Update the drift with G groups of landmarks that have come into view again.
+
+        A closure outside the chi-square gate is ignored.
 
         Args:
-            frame: (G,) that showed each group of them last.
-            information: (G, 3, 3) of each about the motion that would put the robot right.
-            pull: (G, 3) gradient of its log likelihood: information times that motion.
-            now: (3, 3) covariance of the pose, as a motion, given what has stayed in view.
-            probability: share of true closures that are believed (chi-square quantile).
+            frame: (G,) frame that last showed each group.
+            information: (G, 3, 3) information of each group about the motion of the plane that
+                corrects the present pose.
+            pull: (G, 3) gradient of the log likelihood, the information times that motion.
+            now: (3, 3) covariance of the present pose, as a motion of the plane, given the
+                landmarks that stayed in view.
+            probability: share of true closures inside the gate (chi-square quantile).
         """
+        # Whiten: one scalar observation of unit variance for each observed direction.
         value, vector = np.linalg.eigh(information)
-        group, told = np.nonzero(value > _SAYS_NOTHING * value[:, -1:])
-        root = np.sqrt(value[group, told])
-        direction = vector[group, :, told]  # (n, 3)
-        seen = np.sum(direction * pull[group], axis=1) / root  # of unit variance
+        group, observed = np.nonzero(value > _MIN_INFORMATION * value[:, -1:])
+        root = np.sqrt(value[group, observed])
+        direction = vector[group, :, observed]  # (n, 3)
+        seen = np.sum(direction * pull[group], axis=1) / root
         rows = root[:, None] * direction
+
+        # Jacobian: the drift at the present frame minus the drift when the group was last seen.
         knot, share = self._between(frame[group])
         n, each = len(self._knots) + 1, np.arange(len(rows))
-        slope = np.zeros((len(rows), n, 3))
-        slope[:, -1] = rows
-        slope[each, knot] -= (1 - share)[:, None] * rows
-        slope[each, knot + 1] -= share[:, None] * rows
-        slope = slope.reshape(len(rows), 3 * n)
-        spread = self._covariance @ slope.T
+        jacobian = np.zeros((len(rows), n, 3))
+        jacobian[:, -1] = rows
+        jacobian[each, knot] -= (1 - share)[:, None] * rows
+        jacobian[each, knot + 1] -= share[:, None] * rows
+        jacobian = jacobian.reshape(len(rows), 3 * n)
+
+        # Kalman update
+        cross = self._covariance @ jacobian.T
         noise = np.eye(len(rows)) + rows @ now @ rows.T
-        news = seen - slope @ self._due
-        solved = np.linalg.solve(slope @ spread + noise, np.column_stack([news, spread.T]))
-        if news @ solved[:, 0] > chi_square_bound(probability, len(news)):
+        innovation = seen - jacobian @ self._pending
+        right = np.column_stack([innovation, cross.T])
+        solved = np.linalg.solve(jacobian @ cross + noise, right)
+        if innovation @ solved[:, 0] > chi_square_bound(probability, len(innovation)):
             return
-        covariance = self._covariance - spread @ solved[:, 1:]
+        covariance = self._covariance - cross @ solved[:, 1:]
         self._covariance = 0.5 * (covariance + covariance.T)
-        self._due = self._due + spread @ solved[:, 0]
+        self._pending = self._pending + cross @ solved[:, 0]
 
-    def due(self, place: Float) -> Float | None:
-        """Bends (K + 1, 3) of knots and now that the path has yet to take, and takes with this.
+    def take_correction(self, position: Float) -> Float | None:
+        """Return the pending correction (K + 1, 3) of the knots and the present frame, once.
 
-        None as long as none of them would move a point at `place` (2,) by a millimetre.
+        Return None, and keep the correction, if it moves a point at `position` (2,) by less than a
+        millimetre.
         """
-        bends = self._due.reshape(-1, 3)
-        shift = bends[:, :2] + bends[:, 2:] * [-place[1], place[0]]
-        if np.max(np.sum(shift**2, axis=1)) < _WORTH_M**2:
+        correction = self._pending.reshape(-1, 3)
+        shift = correction[:, :2] + correction[:, 2:] * [-position[1], position[0]]
+        if np.max(np.sum(shift**2, axis=1)) < _MIN_CORRECTION_M**2:
             return None
-        self._due = np.zeros_like(self._due)
-        return bends
+        self._pending = np.zeros_like(self._pending)
+        return correction
 
-    def at(self, bends: Float, frame: np.ndarray) -> Float:
-        """Bends (n, 3) at frames (n,), given those of knots and now."""
+    def interpolate(self, correction: Float, frame: np.ndarray) -> Float:
+        """Return corrections (n, 3) at frames (n,), given those of the knots and the present."""
         knot, share = self._between(frame)
-        return bends[knot] + share[:, None] * (bends[knot + 1] - bends[knot])
+        return correction[knot] + share[:, None] * (correction[knot + 1] - correction[knot])
 
     def _between(self, frame: np.ndarray) -> tuple[np.ndarray, Float]:
-        """(n,) knot before each frame, and how far on the way to the next one, or to now, it is."""
+        """Return the knot (n,) before each frame, and the fraction of the way to the next one."""
         when = np.append(self._knots, self.frame)
         knot = np.clip(np.searchsorted(when, frame, side="right") - 1, 0, len(when) - 2)
         return knot, (frame - when[knot]) / (when[knot + 1] - when[knot])
 
-    def _add_knot(self) -> None:
-        self._knots = np.append(self._knots, self.frame)
-        kept = np.arange(len(self._knots) + 1)
-        if len(self._knots) > _MOST_KNOTS:
-            self._spacing *= 2
-            kept = np.append(kept[:-1:2], kept[-1])
-        # what is now stands for the new knot and goes on
-        state = (3 * np.minimum(kept, len(self._knots) - 1)[:, None] + np.arange(3)).ravel()
-        self._covariance = self._covariance[np.ix_(state, state)]
-        self._due = self._due[state]
-        self._knots = self._knots[kept[:-1]]
+
+_ITERATIONS = 3  # Gauss-Newton steps, as in the proposal
+# Smallest group of landmarks that closes a loop: in a smaller one, one or two false matches would
+# distort the path.
+_MIN_GROUP = 3
 
 
-_ROUNDS = 3  # Gauss-Newton steps, as in the proposal
-# Landmarks that went out of view together and come back together, for a loop: a false pair or two
-# among fewer would bend the path.
-_LEAST = 3
-
-
-class Seen(NamedTuple):
-    """What one particle takes a frame for: K observations at the pose that odometry predicts.
+class FrameAssociation(NamedTuple):
+    """Associations of one particle: K observations at the pose predicted by odometry.
 
     Attributes:
         chosen: (K,) slots, NEW or DROPPED.
-        sightings: of all particles.
-        particle: which one this is.
+        sightings: observations of all particles.
+        particle: index of the particle.
         gate: largest squared Mahalanobis distance of a match.
         planar: two degrees of freedom.
     """
 
     chosen: np.ndarray
-    sightings: Sightings
+    sightings: MapObservations
     particle: int
     gate: float
     planar: bool
 
 
-def motion_by_odometry(T_map_predicted: Float, turn: float, sigma: Float) -> Float:
-    """(3, 3) motion of the plane by each standard deviation of the odometry.
+def odometry_noise_factor(T_map_predicted: Float, turn: float, sigma: Float) -> Float:
+    """Return a factor A (3, 3) of the odometry's covariance A A^T as a motion of the plane.
 
-    The disturbance shifts the robot in the frame it had before it turned by `turn`, and turns it
-    about where it stands at the predicted pose (3,).
+    Column i is the motion for an odometry error of one standard deviation in component i. The error
+    shifts the robot along the axes of the frame before the turn, and turns the robot about its
+    position.
+
+    Args:
+        T_map_predicted: (3,) pose predicted by odometry.
+        turn: heading increment of the odometry, in radians.
+        sigma: (3,) standard deviations of the odometry.
     """
     x, y, heading = T_map_predicted
     cos, sin = np.cos(heading - turn), np.sin(heading - turn)
@@ -164,69 +182,82 @@ def motion_by_odometry(T_map_predicted: Float, turn: float, sigma: Float) -> Flo
 
 
 def close_loops(
-    bends: Bends, slots: Slots, frame: Seen, by_odometry: Float, probability: float
+    drift_model: DriftModel,
+    slots: Slots,
+    frame: FrameAssociation,
+    noise_factor: Float,
+    probability: float,
 ) -> Float:
-    """Learn how the path has bent up to the frame before, if landmarks come back into view.
+    """Update the drift up to the frame before if landmarks come into view again.
 
-    The pose that odometry and the landmarks in view tell is set against those that come back.
+    The pose estimated from odometry and the landmarks in view is compared with the landmarks that
+    come into view again.
 
     Args:
-        bends: of the path before this frame.
-        slots: landmarks, of which those chosen are up to date.
-        frame: what a particle sees.
-        by_odometry: (3, 3) motion of the plane by each standard deviation of the odometry.
-        probability: share of true closures that are believed.
+        drift_model: drift of the path before this frame; updated.
+        slots: landmarks; those of `frame.chosen` are up to date.
+        frame: associations of one particle.
+        noise_factor: (3, 3) of the odometry, from `odometry_noise_factor`.
+        probability: share of true closures inside the gate.
 
     Returns:
-        (3, 3) covariance of what the path may bend by in this frame: as much as the pose is unsure,
-        times the share of the frame that hangs on no landmark seen shortly before. Where all
-        landmarks stay in view nothing drifts, and where all are exchanged the path goes on with
-        this pose's whole error.
+        (3, 3) covariance by which the drift grows in this frame: the covariance of the pose, times
+        the share of the observations that match no landmark in view. There is no drift while all
+        landmarks stay in view.
     """
     rows = np.flatnonzero(frame.chosen >= 0)
     last = slots.last_frame[frame.chosen[rows]]
-    back = bends.frame + 1 - last > SPACING
-    n_free = np.count_nonzero(frame.chosen == NEW) + np.count_nonzero(back)
+    returned = drift_model.frame + 1 - last > KNOT_SPACING
+    n_unanchored = np.count_nonzero(frame.chosen == NEW) + np.count_nonzero(returned)
     motion = np.zeros(3)
-    covariance, _, _ = _steps(slots, frame, rows[~back], by_odometry, motion, _ROUNDS)
-    drift = n_free / max(len(frame.chosen), 1) * covariance
-    rows, last = rows[back], last[back]
-    if len(rows) < _LEAST:
+    covariance, _, _ = _gauss_newton(
+        slots, frame, rows[~returned], noise_factor, motion, _ITERATIONS
+    )
+    drift = n_unanchored / max(len(frame.chosen), 1) * covariance
+    rows, last = rows[returned], last[returned]
+    if len(rows) < _MIN_GROUP:
         return drift
-    group_of = last // SPACING  # what went out of view at about the same time
+    group_of = last // KNOT_SPACING  # landmarks that went out of view at about the same time
     groups, size = np.unique(group_of, return_counts=True)
-    own = [group_of == group for group in groups[size >= _LEAST]]
-    if not own:
+    members = [group_of == group for group in groups[size >= _MIN_GROUP]]
+    if not members:
         return drift
-    said = [_steps(slots, frame, rows[each], by_odometry, motion.copy(), 1) for each in own]
-    information, pull = (np.array([each[k] for each in said]) for k in (1, 2))
-    when = np.array([last[members].mean() for members in own])
-    bends.closed(when, information, pull, covariance, probability)
+    steps = [
+        _gauss_newton(slots, frame, rows[each], noise_factor, motion.copy(), 1) for each in members
+    ]
+    information, pull = (np.array([step[k] for step in steps]) for k in (1, 2))
+    when = np.array([last[each].mean() for each in members])
+    drift_model.add_closure(when, information, pull, covariance, probability)
     return drift
 
 
-def _steps(
-    slots: Slots, frame: Seen, rows: np.ndarray, by_odometry: Float, motion: Float, rounds: int
+def _gauss_newton(
+    slots: Slots,
+    frame: FrameAssociation,
+    rows: np.ndarray,
+    noise_factor: Float,
+    motion: Float,
+    iterations: int,
 ) -> tuple[Float, Float, Float]:
-    """Put the predicted pose right by Gauss-Newton steps.
+    """Correct the predicted pose by Gauss-Newton steps.
 
     Args:
         slots: the landmarks.
-        frame: what a particle sees.
-        rows: (n,) observations that count.
-        by_odometry: (3, 3) motion of the plane by each standard deviation of the odometry.
-        motion: (3,) of the plane from where the steps begin; changed. It is (0, 0, 0) unless only
-            what the observations say there is wanted.
-        rounds: how many steps, at least one.
+        frame: associations of one particle.
+        rows: (n,) observations to use.
+        noise_factor: (3, 3) of the odometry, from `odometry_noise_factor`.
+        motion: (3,) start of the motion of the plane; updated in place. Unless it is zero, only the
+            returned information and gradient are meaningful.
+        iterations: number of steps, at least one.
 
     Returns:
-        (3, 3) the motion's covariance; and of where the last step began what the observations say
-        about a further motion: (3, 3) information, and (3,) gradient of the log likelihood.
+        (3, 3) covariance of the motion; (3, 3) information and (3,) gradient of the log likelihood
+        of the observations at the start of the last step.
     """
-    A, eta = by_odometry, np.zeros(3)
+    A, eta = noise_factor, np.zeros(3)
     root, information, pull = np.eye(3), np.empty((3, 3)), np.empty(3)
-    for _ in range(rounds):
-        information, pull = _evidence(slots, frame, rows, motion)
+    for _ in range(iterations):
+        information, pull = _information_and_gradient(slots, frame, rows, motion)
         terms = A[:, None, :, None] * information[:, :, None, None] * A[None, :, None, :]
         root = _sum_in_order(np.eye(3), terms.reshape(9, 3, 3))
         step = _sum_in_order(-eta, A * pull[:, None])
@@ -235,7 +266,7 @@ def _steps(
         solve_upper(root, step)
         eta += step
         motion[:] = A[:, 0] * eta[0] + A[:, 1] * eta[1] + A[:, 2] * eta[2]
-    # the precision of eta is root root^T, so the motion's covariance is the square of this
+    # The precision of eta is L L^T; the covariance of the motion is B B^T with B = A L^-T.
     half = A.copy()
     for row in half:
         solve_lower(root, row)
@@ -248,8 +279,12 @@ def _sum_in_order(first: Float, others: Float) -> Float:
     return np.cumsum(np.concatenate([first[None], others]), axis=0)[-1]
 
 
-def _evidence(slots: Slots, frame: Seen, rows: np.ndarray, motion: Float) -> tuple[Float, Float]:
-    """What observations say about a further motion after `motion`, weighed as in the proposal.
+def _information_and_gradient(
+    slots: Slots, frame: FrameAssociation, rows: np.ndarray, motion: Float
+) -> tuple[Float, Float]:
+    """Linearise the log likelihood of observations at a motion of the plane.
+
+    Observations have Cauchy weights, as in the proposal.
 
     Returns:
         (3, 3) information, and (3,) gradient of the log likelihood.
@@ -271,7 +306,7 @@ def _evidence(slots: Slots, frame: Seen, rows: np.ndarray, motion: Float) -> tup
     fx = -weight * (ixx * dx + ixy * dy + ixz * dz)
     fy = -weight * (ixy * dx + iyy * dy + iyz * dz)
     ixx, ixy, iyy = weight * ixx, weight * ixy, weight * iyy
-    # a turn moves the point by (-y, x)
+    # the derivative of the point by the angle is (-y, x)
     ax, ay = ixy * x - ixx * y, iyy * x - ixy * y
     terms = np.stack([fx, fy, x * fy - y * fx, ixx, ixy, iyy, ax, ay, x * ay - y * ax], axis=1)
     *pull, xx, xy, yy, xt, yt, tt = _sum_in_order(np.zeros(9), terms)

@@ -1,11 +1,11 @@
 """Measurement model and Kalman update of a landmark in a particle (eq. 4-10).
 
-The observation model g maps a landmark into the robot frame: a rigid motion, whose Jacobian G is a
-rotation. Everything here is turned by the transpose of G into the map frame, where G is the
-identity: innovation z - z_hat becomes (observed point in the map) - (landmark), Z becomes
-Sigma + R_map, and determinants and Mahalanobis distances stay what they are.
+The observation model g transforms a landmark into the robot frame; its Jacobian G is a rotation.
+This module works in the map frame, where G is the identity: the innovation z - z_hat is the
+observed point in the map minus the landmark, and Z is Sigma + R_map. Determinants and Mahalanobis
+distances are the same in both frames.
 
-Symmetric matrices are their six upper entries: xx, xy, xz, yy, yz, zz.
+Symmetric matrices are stored as six upper entries: xx, xy, xz, yy, yz, zz.
 """
 
 from typing import NamedTuple
@@ -20,35 +20,36 @@ Vector = tuple[float, float, float]
 Upper = tuple[float, float, float, float, float, float]  # xx, xy, xz, yy, yz, zz
 
 
-class Sightings(NamedTuple):
-    """K observations of one frame, as each of M particles sees them in its map."""
+class MapObservations(NamedTuple):
+    """K observations of one frame in the map frame of each of M particles."""
 
     point_m: Float  # (K, M, 3)
     covariance_m2: Float  # (K, M, 6)
 
 
-def sightings(
+def observations_in_map(
     T_map_robot: Float, position_m: Float, covariance_m2: Float, planar: bool
-) -> Sightings:
-    """Observations (K, 3), (K, 3, 3) of the robot frame in the maps of poses (M, 3)."""
+) -> MapObservations:
+    """Transform observations (K, 3), (K, 3, 3) from the robot frame into the map, for M poses."""
     shape = (len(position_m), len(T_map_robot))
-    seen = Sightings(np.empty((*shape, 3)), np.empty((*shape, 6)))
+    seen = MapObservations(np.empty((*shape, 3)), np.empty((*shape, 6)))
     position, covariance = np.ascontiguousarray(position_m), np.ascontiguousarray(covariance_m2)
     turn = T_map_robot[:, 2]
-    _turn_into_map(T_map_robot, np.cos(turn), np.sin(turn), position, covariance, planar, seen)
+    _transform_into_map(T_map_robot, np.cos(turn), np.sin(turn), position, covariance, planar, seen)
     return seen
 
 
 @kernel(error_model="numpy")
-def _turn_into_map(
+def _transform_into_map(
     T_map_robot: Float,
     cos: Float,
     sin: Float,
     position: Float,
     covariance: Float,
     planar: bool,
-    seen: Sightings,
+    seen: MapObservations,
 ) -> None:
+    """Write observations into `seen`; `cos` and `sin` (M,) are those of the headings."""
     for k in range(len(position)):
         x, y, z = position[k, 0], position[k, 1], position[k, 2]
         xx, xy, xz = covariance[k, 0, 0], covariance[k, 0, 1], covariance[k, 0, 2]
@@ -67,13 +68,13 @@ def _turn_into_map(
             turned[m, 5] = zz
 
 
-# Division is NumPy's in the filter's kernels (`error_model`): a check for zero at each one keeps
-# LLVM from inlining what divides. No Z is singular: a frame with a singular R_t is refused.
+# The filter's kernels divide as NumPy does (`error_model`): a check for zero would keep LLVM from
+# inlining. Z is never singular: the filter rejects a frame with a singular R_t.
 @kernel(error_model="numpy")
 def inverse_and_determinant(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
 ) -> tuple[Upper, float]:
-    """Inverse and determinant of a symmetric 3x3 matrix, by cofactors."""
+    """Return the inverse and determinant of a symmetric 3x3 matrix, by cofactors."""
     axx, axy, axz, ayy, ayz, azz, determinant = cofactors(xx, xy, xz, yy, yz, zz)
     f = 1.0 / determinant
     return (f * axx, f * axy, f * axz, f * ayy, f * ayz, f * azz), determinant
@@ -81,12 +82,12 @@ def inverse_and_determinant(
 
 @kernel(error_model="numpy")
 def innovation(
-    seen: Sightings, k: int, own: Estimates, r: int, m: int, planar: bool
+    seen: MapObservations, k: int, own: Estimates, r: int, m: int, planar: bool
 ) -> tuple[Vector, Upper, float]:
-    """Innovation, inverse of Z (eq. 6) and |Z| of observation k and the landmark of row r.
+    """Return the innovation, the inverse of Z (eq. 6) and |Z| in particle m.
 
-    Both as particle m has them. In planar data the height says nothing: its innovation is 0 and its
-    variance in Z 1, so that it leaves the Mahalanobis distance and the determinant alone.
+    The pair is observation k and the landmark of row r. In planar data, the height has innovation 0
+    and variance 1 in Z, so that it does not affect the Mahalanobis distance and the determinant.
     """
     point, noise, mean, covariance = seen.point_m, seen.covariance_m2, own.mean_m, own.covariance_m2
     xx = covariance[r, m, 0] + noise[k, m, 0]
@@ -96,7 +97,7 @@ def innovation(
     yz = covariance[r, m, 4] + noise[k, m, 4]
     zz = covariance[r, m, 5] + noise[k, m, 5]
     dz = point[k, m, 2] - mean[r, m, 2]
-    if planar:  # after the reads: a branch between them costs as much as all the arithmetic
+    if planar:  # after the loads: a branch between them is as slow as the arithmetic
         xz = yz = dz = 0.0
         zz = 1.0
     inverse, determinant = inverse_and_determinant(xx, xy, xz, yy, yz, zz)
@@ -106,7 +107,7 @@ def innovation(
 
 @kernel(error_model="numpy")
 def quadratic_form(difference: Vector, inverse: Upper) -> float:
-    """Squared Mahalanobis distance: d^T Z^-1 d."""
+    """Return the squared Mahalanobis distance d^T Z^-1 d."""
     dx, dy, dz = difference
     ixx, ixy, ixz, iyy, iyz, izz = inverse
     return (
@@ -118,10 +119,10 @@ def quadratic_form(difference: Vector, inverse: Upper) -> float:
 
 
 def log_density_at_gate(covariance_m2: Float, gate: float, planar: bool) -> Float:
-    """Log of p_new (K,): the density of a match exactly at the gate of a landmark seen once.
+    """Return the log of p_new (K,), the density of a match at the gate of a landmark seen once.
 
-    Such a landmark has the observation's own covariance R, so Z = 2 R. The density carries the
-    unit 1/m^3 (1/m^2 in the plane) of a match's, so a change of units cancels in the weights.
+    Such a landmark has the covariance R of the observation, so Z = 2 R. The density has the unit of
+    a match's density, 1/m^3 (1/m^2 in the plane), so a change of units cancels in the weights.
 
     Raises:
         ValueError: a covariance (K, 3, 3) is not positive definite.
@@ -135,10 +136,10 @@ def log_density_at_gate(covariance_m2: Float, gate: float, planar: bool) -> Floa
     return -0.5 * (gate + dimensions * np.log(2 * np.pi)) - half_log_det
 
 
-NEW = -1  # the particle has no such landmark yet
-DROPPED = -2  # the observation is used for nothing
-# Rows of what particles have that are taken together: squared distance, |Z|, then from these on the
-# mean, the innovation, and the upper entries of the landmark's covariance and of the observation's.
+NEW = -1  # no match: the observation starts a landmark in this particle
+DROPPED = -2  # the observation is not used
+# Rows of the vectorised state: squared distance, |Z|, and then the first rows of the mean, the
+# innovation, and the upper entries of the landmark's and the observation's covariance.
 _MEAN, _OFF, _SIGMA, _NOISE, _ROWS = 2, 5, 8, 14, 20
 
 
@@ -147,15 +148,21 @@ def update_landmarks(
     own: Estimates,
     row_of: np.ndarray,
     chosen: np.ndarray,
-    seen: Sightings,
+    seen: MapObservations,
     log_new: Float,
     planar: bool,
 ) -> Float:
-    """Correct the landmarks that were chosen, in place, and tell what the observations say.
+    """Update the matched landmarks in place (eq. 7-9) and return the log likelihood (M,).
 
-    `own` and `row_of` are the `own` and `row` of slots: all of them would take long to compile.
-    `chosen` (K, M) is a slot, NEW or DROPPED, `log_new` (K,) the log density of an observation that
-    matches nothing. Returns (M,) log likelihood: the product of eq. 10 over the observations.
+    The likelihood is the product of eq. 10 over the observations.
+
+    Args:
+        own: estimates of the slots, `Slots.own`; all of `Slots` would take long to compile.
+        row_of: (S,) row of each slot, `Slots.row`.
+        chosen: (K, M) slot, NEW or DROPPED.
+        seen: the observations.
+        log_new: (K,) log density of an observation without a match.
+        planar: two degrees of freedom.
     """
     n_observations, n_particles = chosen.shape
     log_two_pi = (2.0 if planar else 3.0) * np.log(2.0 * np.pi)
@@ -163,8 +170,7 @@ def update_landmarks(
     for k in range(n_observations):
         for first in range(0, n_particles, LANES):
             end = min(first + LANES, n_particles)
-            # What the particles from `first` to `end` have of the landmark and of the
-            # observation.
+            # Gather the landmark and the observation of particles `first` to `end`.
             mean, sigma = own.mean_m, own.covariance_m2
             point, noise = seen.point_m, seen.covariance_m2
             for m in range(first, end):
@@ -178,11 +184,10 @@ def update_landmarks(
                 for i in range(6):
                     rows[(_SIGMA + i) * LANES + lane] = sigma[r, m, i]
                     rows[(_NOISE + i) * LANES + lane] = noise[k, m, i]
-            # Equations 7 to 9 with G = I, and the squared distance and |Z|, in all lanes.
-            # Eq. 9, (I - K) Sigma, equals K R. The product has no difference of near equal
-            # numbers in it, so the covariance stays positive however often a landmark is seen.
-            # Lanes of particles that do not have the landmark hold anything, and come to
-            # anything.
+            # Equations 7 to 9 with G = I, the squared distance and |Z|, in all lanes. Eq. 9,
+            # (I - K) Sigma, equals K R. This product avoids cancellation, so the covariance stays
+            # positive definite after any number of updates. Lanes of particles without the
+            # landmark hold undefined values, which are not used.
             for m in range(LANES):
                 sxx, sxy = rows[_SIGMA * LANES + m], rows[(_SIGMA + 1) * LANES + m]
                 sxz, syy = rows[(_SIGMA + 2) * LANES + m], rows[(_SIGMA + 3) * LANES + m]
@@ -214,7 +219,7 @@ def update_landmarks(
                 rows[_MEAN * LANES + m] += k00 * dx + k01 * dy + k02 * dz
                 rows[(_MEAN + 1) * LANES + m] += k10 * dx + k11 * dy + k12 * dz
                 rows[(_MEAN + 2) * LANES + m] += k20 * dx + k21 * dy + k22 * dz
-                # eq. 9; the mean of mirrored entries keeps rounding from making it unsymmetric
+                # eq. 9; the mean of mirrored entries keeps it symmetric despite rounding
                 rows[_SIGMA * LANES + m] = k00 * rxx + k01 * rxy + k02 * rxz
                 rows[(_SIGMA + 3) * LANES + m] = k10 * rxy + k11 * ryy + k12 * ryz
                 rows[(_SIGMA + 5) * LANES + m] = k20 * rxz + k21 * ryz + k22 * rzz
@@ -227,6 +232,7 @@ def update_landmarks(
                 rows[(_SIGMA + 4) * LANES + m] = 0.5 * (
                     (k10 * rxz + k11 * ryz + k12 * rzz) + (k20 * rxy + k21 * ryy + k22 * ryz)
                 )
+            # Write the results back and add the log likelihood.
             for m in range(first, end):
                 s, lane = chosen[k, m], m - first
                 if s < 0:

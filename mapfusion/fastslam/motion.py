@@ -1,4 +1,4 @@
-"""Where a particle may have gone, given what the wheels counted (eq. 3)."""
+"""Motion model: odometry noise and sampling of poses (eq. 3)."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -12,32 +12,30 @@ from mapfusion.parameters import Range, require_in_range
 
 @dataclass(frozen=True)
 class MotionNoise:
-    """Standard deviations of the odometry, as a random walk that covers the systematic errors too.
+    """Odometry noise as a random walk that also covers systematic errors.
 
-    A relative error e that stays the same over a horizon h (metres or radians) ends in an error of
-    e h. A random walk of e sqrt(h) per root unit ends in the same standard deviation, and has a
-    larger one before: so the particles cover the systematic errors without knowing them. Beyond
-    the horizon the map is expected to have corrected the robot.
+    A constant relative error e causes an error of e h after a horizon h (metres or radians). A
+    random walk of e sqrt(h) per root unit has the same standard deviation after the horizon, and a
+    larger one before it. The particles therefore cover systematic errors without a state for them.
+    Beyond the horizon, observations of the map correct the pose.
 
-    Standing still adds nothing by default: wheels that do not turn make no odometry error. The
-    floor is for robots that are pushed, or odometry that drops increments below its resolution.
+    A robot that stands still has no odometry error by default. The floor is for robots that are
+    pushed, and for odometry that drops increments below its resolution.
 
     Attributes:
         translation_m_per_sqrt_m: random walk along the motion.
         rotation_rad_per_sqrt_m: random walk of the heading with the distance.
         rotation_rad_per_sqrt_rad: random walk of the heading with the angle turned.
-        scale_error: relative systematic error of distances, which is along the motion.
-        track_error: relative systematic error of angles. The track that a skid-steered robot
-            behaves as having changes within a turn (P3-AT in simulation: 0.42 to 0.62 m, so about
-            10 %).
-        horizon_m: distance over which the scale error adds up: the way for which most of what the
-            robot sees stays in view.
-        horizon_rad: angle over which the track error adds up: two frames of turning.
-        lateral_m_per_sqrt_m: random walk across the motion. Wheels do not roll sideways: a P3-AT's
-            is 0.002 where it drives straight on a dry floor; the default leaves room for others.
-        lateral_slip_m_per_rad: sideways motion in a turn that the wheels do not count. A P3-AT that
-            stops to turn slides by 0.008 on average and 0.025 at most, one that turns while it
-            still rolls by 0.15.
+        scale_error: relative systematic error of distances, along the motion.
+        track_error: relative systematic error of angles. The effective track of a skid-steered
+            robot varies by about 10 % within a turn.
+        horizon_m: distance over which the scale error accumulates, about the distance for which
+            most landmarks stay in view.
+        horizon_rad: angle over which the track error accumulates, about two frames of turning.
+        lateral_m_per_sqrt_m: random walk across the motion. Wheels hardly roll sideways, so the
+            default is small.
+        lateral_slip_m_per_rad: sideways slip in a turn, which the wheel encoders do not measure. It
+            is larger for a robot that turns while it drives.
         floor_m: added to x and y in every step, whatever the motion.
         floor_rad: added to the heading in every step, whatever the motion.
     """
@@ -58,7 +56,7 @@ class MotionNoise:
         require_in_range(self)
 
     def standard_deviations(self, odometry: Float) -> Float:
-        """(3,) of x_m, y_m, theta_rad for one odometry increment (3,)."""
+        """Return the standard deviations (3,) of x, y, theta for an odometry increment (3,)."""
         distance_m = np.hypot(odometry[0], odometry[1])
         angle_rad = abs(odometry[2])
         along = (
@@ -75,7 +73,7 @@ class MotionNoise:
         return np.sqrt(variance + self._floor**2)
 
     def with_floor(self, covariance: Float) -> Float:
-        """(3,) of a step whose covariance (3, 3) is known, at least the floor."""
+        """Return the standard deviations (3,) of a known covariance (3, 3) plus the floor."""
         return np.sqrt(np.diag(covariance) + self._floor**2)
 
     @property
@@ -86,9 +84,13 @@ class MotionNoise:
 def sample_motion(
     T_map_robot: Float, odometry: Float, sigma: Float, rng: np.random.Generator
 ) -> Float:
-    """Draw the poses (M, 3) after a motion (3,) from those before it (M, 3) (eq. 3).
+    """Sample the poses (M, 3) after an odometry increment from the poses before it (eq. 3).
 
-    `sigma` (3,) are the standard deviations of the motion.
+    Args:
+        T_map_robot: (M, 3) poses before the motion.
+        odometry: (3,) increment in the robot frame.
+        sigma: (3,) standard deviations of the increment.
+        rng: random generator.
     """
     disturbance = rng.standard_normal(T_map_robot.shape) * sigma
     return compose(T_map_robot, odometry + disturbance)

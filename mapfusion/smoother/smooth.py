@@ -16,7 +16,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.attitude import Attitude, shared_heights
+from mapfusion.attitude import Attitude, attitude_height_errors
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.joint_covariance import (
     RANK,
@@ -51,7 +51,7 @@ from mapfusion.smoother.optimizer import (
 from mapfusion.smoother.problem import OrderedObservations, order_observations
 from mapfusion.smoother.robust_loss import MOST_DOF, Tails
 from mapfusion.smoother.second_order import SecondOrder, second_order_errors
-from mapfusion.viewing import viewing_of
+from mapfusion.viewing import viewing_of_log
 
 # Probability that two tracks of one corner are not split.
 _SAME_CORNER = 0.999
@@ -397,7 +397,9 @@ def smoothed_map(
     if attitude is not None and obs.n_dimensions > 2:
         # add the errors of the attitude to the landmarks' shared errors
         estimate, common = smoothed.estimate, smoothed.common
-        heights = shared_heights(attitude, estimate.path, obs.frame, obs.landmark, estimate.point_m)
+        heights = attitude_height_errors(
+            attitude, estimate.path, obs.frame, obs.landmark, estimate.point_m
+        )
         by_attitude = np.zeros((*heights.shape, 3))
         by_attitude[..., 2] = heights
         by_path = common.spread(np.eye(len(common))).T
@@ -415,7 +417,7 @@ def smoothed_map(
         log.planar,
         log.robot,
     )
-    viewing = viewing_of(log, landmark, smoothed.estimate.path, source)
+    viewing = viewing_of_log(log, landmark, smoothed.estimate.path, source)
     return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
 
 

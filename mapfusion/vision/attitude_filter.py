@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mapfusion.attitude import Attitude, levelled, moved
+from mapfusion.attitude import Attitude, level_observations, transform_observations
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se3 import roll_pitch, tilt
@@ -248,5 +248,5 @@ class AttitudeEstimator:
     def to_level_frame(self, observed: Observations) -> Observations:
         """Transform observations of the last frame to the level frame."""
         T = self._T_robot_observed
-        own = observed if T is None else moved(observed, T[:3, :3], T[:3, 3])
-        return levelled(own, self._values[-1], np.sqrt(np.diag(self._filter.fresh)))
+        own = observed if T is None else transform_observations(observed, T[:3, :3], T[:3, 3])
+        return level_observations(own, self._values[-1], np.sqrt(np.diag(self._filter.fresh)))

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from mapfusion.attitude import (
     FILE,
     Attitude,
-    levelled,
-    moved,
+    attitude_height_errors,
+    level_observations,
     read_attitude,
-    shared_heights,
+    transform_observations,
     write_attitude,
 )
 from mapfusion.errors import InputError
@@ -51,7 +51,7 @@ def test_levelled_points_are_where_the_body_s_pose_has_them() -> None:
     rng = np.random.default_rng(1)
     body = seen(rng)
     value = np.array([0.05, -0.08, 0.3])
-    made = levelled(body, value, np.zeros(3))
+    made = level_observations(body, value, np.zeros(3))
     T = se3.in_space(np.zeros(3), value[:2])
     T[2, 3] = value[2]
     expected = (np.c_[body.position_m, np.ones(len(body))] @ T.T)[:, :3]
@@ -69,7 +69,7 @@ def test_the_covariance_holds_what_the_attitude_errs_by() -> None:
     R = se3.tilt(drawn[:, 0], drawn[:, 1])
     points = np.einsum("kij,nj->nki", R, exact.position_m)
     points[..., 2] += drawn[:, 2]
-    made = levelled(exact, value, sigma)
+    made = level_observations(exact, value, sigma)
     for own, spread in zip(made.covariance_m2, map(np.cov, points.swapaxes(1, 2)), strict=True):
         scale = np.sqrt(np.diag(spread))
         np.testing.assert_allclose(own / scale / scale[:, None], spread / scale / scale[:, None],
@@ -80,7 +80,9 @@ def test_moved_there_and_back_they_are_the_same() -> None:
     rng = np.random.default_rng(3)
     first, T = seen(rng), se3.pose(se3.tilt(0.3, -0.2), [0.1, 0.2, 0.3])
     back = se3.inverse(T)
-    made = moved(moved(first, T[:3, :3], T[:3, 3]), back[:3, :3], back[:3, 3])
+    made = transform_observations(
+        transform_observations(first, T[:3, :3], T[:3, 3]), back[:3, :3], back[:3, 3]
+    )
     np.testing.assert_allclose(made.position_m, first.position_m, atol=1e-14)
     np.testing.assert_allclose(made.covariance_m2, first.covariance_m2, atol=1e-15)
 
@@ -192,7 +194,7 @@ def test_they_spread_as_stated(carried: tuple[float, float]) -> None:
     own = errors[frame]
     lifted = own[:, :, 0] * arm[:, 1:] - own[:, :, 1] * arm[:, :1] + own[:, :, 2]
     spread = np.cov(lifted.reshape(N_LANDMARKS, 4, -1).mean(axis=1))
-    shared = shared_heights(told, path, frame, landmark, point)
+    shared = attitude_height_errors(told, path, frame, landmark, point)
     scale = np.sqrt(np.diag(spread))
     found = shared.T @ shared / np.outer(scale, scale)
     np.testing.assert_allclose(found, spread / np.outer(scale, scale), atol=0.05)
@@ -203,7 +205,7 @@ def test_a_tilt_at_first_tilts_the_whole_map() -> None:
     sigma = np.tile([0.01, 0.01, 0.0], (N_FRAMES, 1))
     sigma[:, 2] = 0.01 * np.hypot(*path[:, :2].T)  # a tilted robot climbs, and does nothing else
     told = Attitude(np.zeros_like(sigma), sigma, np.ones((N_FRAMES, 2)))
-    shared = shared_heights(told, path, frame, landmark, point)
+    shared = attitude_height_errors(told, path, frame, landmark, point)
     expected = 1e-4 * point[:, :2] @ point[:, :2].T
     np.testing.assert_allclose(shared.T @ shared, expected, atol=1e-12)
 
@@ -215,7 +217,7 @@ def test_long_logs_have_no_more_of_them() -> None:
     sigma = 1e-3 * np.sqrt(np.arange(1, n + 1))[:, None] * [1.0, 1.0, 5.0]
     told = Attitude(np.zeros((n, 3)), sigma, np.ones((n, 2)))
     point = path[[100, 499]] + [0.0, 3.0, 0.0]
-    shared = shared_heights(told, path, np.array([100, 499]), np.array([0, 1]), point)
+    shared = attitude_height_errors(told, path, np.array([100, 499]), np.array([0, 1]), point)
     assert len(shared) <= 3 * 65
     stated = 9 * sigma[[100, 499], 0] ** 2 + sigma[[100, 499], 2] ** 2
     assert np.sum(shared**2, axis=0) == pytest.approx(stated, rel=0.1)
@@ -228,7 +230,7 @@ def test_a_frame_measured_for_itself_shares_nothing_with_those_before() -> None:
     carried[3] = 0.0
     told = Attitude(np.zeros((6, 3)), np.tile([0.01, 0.01, 0.005], (6, 1)), carried)
     frame, point = np.arange(6), path + np.array([1.0, 2.0, 0.0])
-    shared = shared_heights(told, path, frame, np.arange(6), point)
+    shared = attitude_height_errors(told, path, frame, np.arange(6), point)
     both = shared.T @ shared
     assert not both[:3, 3:].any()
     assert np.all(both[:3, :3] > 0)
@@ -241,7 +243,7 @@ def test_a_tilt_of_any_heading_is_the_mean_of_the_variances_of_roll_and_pitch() 
     sigma = np.tile([roll_rad, pitch_rad, 0.0], (1, 1))
     told = Attitude(np.zeros((1, 3)), sigma, np.zeros((1, 2)))
     arm = np.array([2.0, 1.0, 0.0])
-    shared = shared_heights(told, np.zeros((1, 3)), np.array([0]), np.array([0]), arm[None])
+    shared = attitude_height_errors(told, np.zeros((1, 3)), np.array([0]), np.array([0]), arm[None])
     ahead = arm[0] * np.cos(heading) + arm[1] * np.sin(heading)
     beside = arm[1] * np.cos(heading) - arm[0] * np.sin(heading)
     expected = np.mean((beside * roll_rad) ** 2 + (ahead * pitch_rad) ** 2)

@@ -20,7 +20,7 @@ from mapfusion.align.rigid_motion import (
     residual_covariances,
 )
 from mapfusion.registration import (
-    Completion,
+    EstimateVerifier,
     PairRegistration,
     Registered,
     Registration,
@@ -322,7 +322,7 @@ def test_a_refusal_tells_what_about_the_maps_explains_it():
     assert (pairs.note(20), pairs.note(19) != "") == ("", True)
     failed = without_answer(Status.FAILED, "ended", 40)
     ended = Registered(failed, failed, Verdict(Status.FAILED, math.nan, "ended"))
-    assert ended.explained("a note") is ended
+    assert ended.with_note("a note") is ended
 
 
 @dataclass
@@ -344,11 +344,11 @@ def test_methods_on_one_pair_share_what_completes_their_estimates():
     pair = given_pairs(np.random.default_rng(8), 60, 0.8, 0.02)
     methods = [make_aligner(name) for name in ("ransac", "icp", "impicp", "clique", "gnc")] * 2
     refinement, judge = CountedRefinement(), CountedJudge()
-    completion = Completion(Pairs(*maps_of(pair)), refinement, judge)
+    verifier = EstimateVerifier(Pairs(*maps_of(pair)), refinement, judge)
     motions, refined = set(), set()
     for k, method in enumerate(methods):
         rng, same_rng = np.random.default_rng(k), np.random.default_rng(k)
-        done = PairRegistration(method, completion).register(rng)
+        done = PairRegistration(method, verifier).register(rng)
         alone = Registration(method).register(*maps_of(pair), same_rng)
         assert_same(done.estimated, alone.estimated)
         assert_same(done.refined, alone.refined)
@@ -364,13 +364,13 @@ def test_what_becomes_the_same_is_judged_once_and_what_differs_by_itself():
     motions = [pair.T_a_b + np.array([k * 0.01, 0, 0]) for k in range(6)]
     fits = [Fit(T, np.ones(60, bool)) for T in motions]
     method, refinement, judge = Answers(fits), CountedRefinement(), CountedJudge()
-    completion = Completion(Pairs(*maps_of(pair)), refinement, judge)
-    answer, _ = completion.of(as_aligner(method).align(*maps_of(pair), None))
+    verifier = EstimateVerifier(Pairs(*maps_of(pair)), refinement, judge)
+    answer, _ = verifier.verify(as_aligner(method).align(*maps_of(pair), None))
     refinement.refine = lambda pairs, T_a_b: answer  # all to one place
     n = len(judge.asked)
     for _ in motions:
         rng = np.random.default_rng(0)
-        assert PairRegistration(method, completion).register(rng).refined is answer
+        assert PairRegistration(method, verifier).register(rng).refined is answer
     assert len(judge.asked) == n == 1
     for changed in (
         {"T_a_b": answer.T_a_b + 1e-12},
@@ -381,5 +381,5 @@ def test_what_becomes_the_same_is_judged_once_and_what_differs_by_itself():
     ):
         other = replace(answer, **changed)
         refinement.refine = lambda pairs, T_a_b, other=other: other
-        completion.of(replace(answer, T_a_b=answer.T_a_b + len(judge.asked)))
+        verifier.verify(replace(answer, T_a_b=answer.T_a_b + len(judge.asked)))
         assert judge.asked[-1] is other

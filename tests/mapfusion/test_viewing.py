@@ -9,7 +9,7 @@ import pytest
 from mapfusion.errors import InputError
 from mapfusion.landmark_map import read_map, write_map
 from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.viewing import BEARINGS, RANGES, Viewing, part_of, viewing_of, viewing_paths
+from mapfusion.viewing import BEARINGS, RANGES, Viewing, bearing_bin, viewing_of_log, viewing_paths
 from tests.mapfusion.verification.two_rooms import FARTHEST_M, HALF_VIEW_RAD, Wall, mapped
 
 
@@ -55,7 +55,7 @@ def test_a_field_of_view_ends_at_quantiles(n: int) -> None:
     observations = Observations(position, np.tile(np.eye(3), (n, 1, 1)))
     log = RobotLog("R", False, np.zeros(1), np.zeros((1, 3)), np.zeros(n, int), observations)
     none = np.empty(0, dtype=np.int64)
-    field = viewing_of(log, np.full(n, -1), np.zeros((1, 3)), none).field
+    field = viewing_of_log(log, np.full(n, -1), np.zeros((1, 3)), none).field
     bearing = np.arctan2(position[:, 1], position[:, 0])
     np.testing.assert_array_equal(field.bearing_rad, np.quantile(bearing, stray))
     range_m = np.hypot(position[:, 0], position[:, 1])
@@ -74,7 +74,7 @@ def test_a_field_of_view_ends_at_quantiles(n: int) -> None:
 def test_bearings_beyond_the_field_of_view_are_in_its_last_parts() -> None:
     field = evidence()[0].field
     low, high = field.bearing_rad
-    edges = part_of(np.array([low - 1, low, high, high + 1]), field)
+    edges = bearing_bin(np.array([low - 1, low, high, high + 1]), field)
     assert edges.tolist() == [0, 0, BEARINGS - 1, BEARINGS - 1]
 
 

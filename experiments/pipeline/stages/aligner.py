@@ -26,7 +26,7 @@ from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Refinement
-from mapfusion.registration import Completion, PairRegistration
+from mapfusion.registration import EstimateVerifier, PairRegistration
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters
 from mapfusion.verification.verdict import Judge
@@ -58,8 +58,8 @@ def run(settings: AlignerSettings, job: Job) -> None:
     judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
     inputs = tuple(job.inputs.items())
     rows = []
-    for k, completion in _completions(inputs, job.part, judge, settings.iterations):
-        pairs, on_pair = completion.pairs, PairRegistration(aligner, completion)
+    for k, verifier in _verifiers(inputs, job.part, judge, settings.iterations):
+        pairs, on_pair = verifier.pairs, PairRegistration(aligner, verifier)
         for repetition in range(settings.repetitions if aligner.randomised else 1):
             names = {"robot_a": pairs.map_a.name, "robot_b": pairs.map_b.name, "iteration": k}
             names |= {"aligner": settings.name, "repetition": repetition}
@@ -69,9 +69,9 @@ def run(settings: AlignerSettings, job: Job) -> None:
 
 
 @functools.lru_cache(maxsize=_BATCHES_KEPT)
-def _completions(
+def _verifiers(
     inputs: tuple[tuple[str, Path], ...], part: str, judge: Judge, iterations: tuple[int, ...]
-) -> Sequence[tuple[int, Completion]]:
+) -> Sequence[tuple[int, EstimateVerifier]]:
     """Iterations of a batch, and what completes an estimate there, whichever aligner made it.
 
     One aligner's task follows on another's, so the last ones stay in memory. What is in a folder
@@ -80,9 +80,9 @@ def _completions(
     job = Job(dict(inputs), Path(), part)
     offered = read_rows(match.batch_path(job.inputs["match"], part), CORRESPONDENCES)
     rivals = read_rows(match.rivals_path(job.inputs["match"], part), RIVALS)
-    completions = []
+    verifiers = []
     for k, map_a, map_b in match.pairs_of_maps(job, iterations):
         pairs = Pairs(map_a, map_b, correspondences_of(at_iteration(offered, k)))
         evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), judge.evidence)
-        completions.append((k, Completion(pairs, judge.refinement, judge, evidence)))
-    return completions
+        verifiers.append((k, EstimateVerifier(pairs, judge.refinement, judge, evidence)))
+    return verifiers

@@ -13,7 +13,7 @@ from mapfusion.files import POSE_FIELDS, column, columns, points_from, read_tabl
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log, with_rows
-from mapfusion.viewing import SightLines, Viewing
+from mapfusion.viewing import LogSightings, Viewing
 
 ROBOTS_KEPT = 4  # by a process; of a robot that drives for minutes they are tens of megabytes
 
@@ -97,8 +97,8 @@ class Snapshots(Mapping[int, LandmarkMap]):
         return self._sight_lines.viewing(self.associations.at(iteration, n_seen), path, origin)
 
     @cached_property
-    def _sight_lines(self) -> SightLines:
-        return SightLines.of(self._log)
+    def _sight_lines(self) -> LogSightings:
+        return LogSightings.of(self._log)
 
     @cached_property
     def associations(self) -> Associations:

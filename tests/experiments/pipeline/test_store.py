@@ -6,7 +6,7 @@ import pytest
 from experiments.pipeline.stage import Job, Stage
 from experiments.pipeline.store import Store, link_or_copy, require_sound
 from experiments.pipeline.tasks import tasks_of
-from mapfusion.errors import DamagedFileError, MendedWarning
+from mapfusion.errors import DamagedFileError, StoreRepairWarning
 from mapfusion.files import write_json
 
 
@@ -114,7 +114,7 @@ def test_a_stage_is_made_from_sound_inputs_alone(tmp_path: Path) -> None:
         two.run()
     assert raised.value.path == damaged
     mended = Counter[Path]()
-    with pytest.warns(MendedWarning, match="the stage drive is discarded"):
+    with pytest.warns(StoreRepairWarning, match="the stage drive is discarded"):
         assert store.discard_damaged(raised.value, mended)
     assert not damaged.exists()
     store.path(first).mkdir(parents=True)

@@ -14,7 +14,7 @@ from experiments.studies import sweep_tables as joined_module
 from experiments.studies.run_tables import find_runs
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_tables import JoinedTables, SweepDataset, written_by_nobody_else
-from mapfusion.errors import InputError, MendedWarning
+from mapfusion.errors import InputError, StoreRepairWarning
 from mapfusion.files import write_json
 
 KEYS = ("slam.min_count",)
@@ -211,7 +211,7 @@ def test_damaged_tables_are_told_and_made_again(dataset: SweepDataset, table: st
     before, path = files(dataset), dataset.path(table, 1)
     path.write_bytes(path.read_bytes()[:-20] + b"!" + path.read_bytes()[-19:])
     joined = JoinedTables(dataset)
-    with pytest.warns(MendedWarning, match=rf"{table}/00001\.parquet: damaged"):
+    with pytest.warns(StoreRepairWarning, match=rf"{table}/00001\.parquet: damaged"):
         held = [joined.holds(each, STAGES) for each in RUNS]
     assert held == [True] * 3 + [False] * 3 + [True]
     assert path.is_file()  # only looked at, as by --dry-run

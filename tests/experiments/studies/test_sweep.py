@@ -37,7 +37,7 @@ from experiments.studies.sweep import OnSweepProgress, SweepDriver, SweepProgres
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_plan import PlannedRun, Sweep, planned, prepare
 from experiments.studies.sweep_tables import RUN_TIMES, JoinedTables, SweepDataset
-from mapfusion.errors import InputError, MendedWarning
+from mapfusion.errors import InputError, StoreRepairWarning
 from tests.helpers import acting
 from tests.helpers.killing import KilledCommand, same_rows
 from tests.helpers.tiny_scenario import SHORT, command
@@ -363,7 +363,7 @@ def test_a_damaged_stage_is_made_again_for_all_that_read_it(scene: Scene, client
             Task("drive/k", "drive", acting.write_stage, (made,), (made,)),
             Task(f"slam/{seed}", "slam", *work),
         ]
-    with pytest.warns(MendedWarning, match=r"data: damaged.*the stage drive is discarded"):
+    with pytest.warns(StoreRepairWarning, match=r"data: damaged.*the stage drive is discarded"):
         driver = scene.execute(client)
     assert not driver.progress.failed
     assert driver.progress.done == 4
@@ -384,7 +384,7 @@ def test_a_file_that_is_always_damaged_fails_its_runs(scene: Scene, client: Clie
             ("drive/k",),
         ),
     ]
-    with pytest.warns(MendedWarning):
+    with pytest.warns(StoreRepairWarning):
         driver = scene.execute(client)
     assert "data: damaged" in driver.progress.failed["x-0"]
     assert not driver.progress.defects

@@ -1,4 +1,4 @@
-"""FastSLAM as the equations say it: every particle owns its map, and a resampling copies it.
+"""Reference FastSLAM from the equations: each particle has its own map, resampling copies it.
 
 Slow and obvious, with matrices in the robot frame. It draws the same random numbers as the filter.
 """
@@ -85,7 +85,7 @@ class CopyingFilter:
                 particle.weight = 1 / len(poses)
 
     def informed(self, particle, odometry, observations, draw) -> tuple[np.ndarray, float]:
-        """A pose near the most probable one, and its density by eq. 3 over that it is drawn by.
+        """Sample a pose from the informed proposal, with the ratio of eq. 3 to its density.
 
         Everything in the map frame; derivatives by differences.
         """
@@ -95,7 +95,7 @@ class CopyingFilter:
         turn = rotation_about_z(particle.pose[2])[:n, :n]
 
         def place(k: int, eta: np.ndarray) -> np.ndarray:
-            """Where the observation lies after disturbances eta (..., 3)."""
+            """Return the observed point after disturbances eta (..., 3)."""
             pose = compose(before, odometry + sigma * eta)
             point = rotation_about_z(pose[..., 2]) @ observations.position_m[k]
             point[..., :2] += pose[..., :2]
@@ -131,7 +131,7 @@ class CopyingFilter:
         return compose(before, odometry + sigma * drawn), ratio
 
     def take_in(self, particle: Particle, observations: Observations) -> float:
-        """The frame's likelihood (eq. 10), after the particle's landmarks are corrected."""
+        """Update the particle's landmarks and return the likelihood of the frame (eq. 10)."""
         chosen = self.associate(particle, observations)
         likelihood = 1.0
         for k in range(len(observations)):
@@ -201,7 +201,7 @@ class CopyingFilter:
         return chosen
 
     def unlikeness(self, landmark, observations: Observations, k: int) -> float | None:
-        """How far apart their looks are; None if they cannot be the same."""
+        """Return the descriptor distance; None if the two cannot match."""
         if self.parameters.association == "label":
             return 0.0 if landmark.label == observations.label[k] else None
         if self.parameters.association == "descriptor":
@@ -216,7 +216,7 @@ class CopyingFilter:
         return observations.position_m[k][:n], R
 
     def expectation(self, particle, landmark, z, R):
-        """Innovation, Z and G in the robot frame (eq. 4-6)."""
+        """Return innovation, Z and G in the robot frame (eq. 4-6)."""
         G = rotation_about_z(particle.pose[2]).T[: self.n_dof, : self.n_dof]
         place = np.array([*particle.pose[:2], 0.0])[: self.n_dof]
         return z - G @ (landmark.mean - place), G @ landmark.covariance @ G.T + R, G

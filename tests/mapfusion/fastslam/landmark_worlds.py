@@ -1,4 +1,4 @@
-"""Small worlds with landmarks, a robot that drives in them and what it measures."""
+"""Small simulated worlds: landmarks, a robot path and measurements."""
 
 from dataclasses import dataclass, replace
 
@@ -36,7 +36,7 @@ def drive(
     sigma_m: float = SIGMA_M,
     odometry_sigma: tuple[float, float, float] = (0.01, 0.01, 0.01),
 ) -> World:
-    """A drive on a circle through random landmarks, of which every frame shows a few."""
+    """Simulate a drive on a circle among random landmarks; each frame shows a few of them."""
     rng = np.random.default_rng(seed)
     landmarks = rng.uniform([-2.0, -1.0, 0.0], [2.0, 4.0, 0.0 if planar else 1.5], (n_landmarks, 3))
     descriptor = unit(rng.standard_normal((n_landmarks, 64)))
@@ -56,7 +56,7 @@ def drive(
 
 
 def observe(pose, points, descriptor, label, rng, planar=False, sigma_m=SIGMA_M) -> Observations:
-    """Points of the world in the robot frame, with noise twice as large along x as across."""
+    """Observe points in the robot frame, with twice as much noise along x as along y."""
     n = len(points)
     sigma = np.array([2.0, 1.0, 0.0 if planar else 1.0]) * sigma_m
     covariance = np.diag(sigma**2)
@@ -80,7 +80,7 @@ def nothing() -> Observations:
 
 
 def parameters(**changes) -> FastSlamParameters:
-    """The paper's own filter, with changes."""
+    """Return the settings of the paper's filter, with changes."""
     plain = FastSlamParameters(
         n_particles=15, motion=LOOSE_MOTION, proposal=Proposal.MOTION, close_loops=False
     )

@@ -1,4 +1,4 @@
-"""Which observation the filter takes for which landmark."""
+"""Tests of `mapfusion.fastslam.association`."""
 
 import numpy as np
 import pytest

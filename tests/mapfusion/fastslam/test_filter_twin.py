@@ -1,4 +1,4 @@
-"""The filter against its slow twin that copies whole particles."""
+"""Comparison of the filter with a slow reference that copies whole particles."""
 
 import numpy as np
 import pytest
@@ -90,7 +90,7 @@ def test_equals_the_filter_that_copies_longer_than_the_genealogy_remembers():
 
 
 def test_equals_the_filter_that_copies_when_all_descend_from_one_particle():
-    """Two landmarks out of view while the other two decide which particles live on."""
+    """Two landmarks are out of view while the other two decide the resampling."""
     world = drive(3, n_landmarks=4, per_frame=4, n_frames=2)
     settings = parameters(n_particles=4, association="label", resample_fraction=1.0)
     slam = FastSlam(settings, np.random.default_rng(1))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.landmarks import FREE, Tracked
-from mapfusion.fastslam.measurement import DROPPED, NEW, sightings
+from mapfusion.fastslam.landmarks import FREE, ActiveTracks
+from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.robot_log import Observations
 from tests.mapfusion.fastslam.landmark_worlds import EXACT_MOTION, nothing, parameters
@@ -15,7 +15,7 @@ STRAY_M = 0.02
 
 
 def frame(tracks: list[int] | None, labels: tuple[int, ...] = (0, 1)) -> Observations:
-    """Two landmarks, as observations of these tracks."""
+    """Return observations of two landmarks with these tracks."""
     at = np.array([[2.0, 0.5, 0.1], [3.0, -0.5, 0.2]])[list(labels)]
     return Observations(
         at,
@@ -26,7 +26,7 @@ def frame(tracks: list[int] | None, labels: tuple[int, ...] = (0, 1)) -> Observa
 
 
 def variances(frames: list[Observations], particles: int = 1) -> np.ndarray:
-    """(2,) of the two landmarks after these frames, which all axes share."""
+    """Return the variances (2,) of the two landmarks, equal for all axes, after these frames."""
     settings = parameters(
         n_particles=particles, motion=EXACT_MOTION, association="label", stray_m=STRAY_M
     )
@@ -40,7 +40,7 @@ def variances(frames: list[Observations], particles: int = 1) -> np.ndarray:
 
 
 def after(*counts: int) -> float:
-    """Of a Kalman filter that sees a track for so many frames, and then another, and so on."""
+    """Return the variance of a Kalman filter after tracks of these lengths."""
     information = 0.0
     for k, count in enumerate(counts):
         if k:
@@ -74,7 +74,7 @@ def test_observations_without_tracks_are_each_news_of_the_landmark() -> None:
 def test_the_density_has_no_step_at_the_gate(
     sigma_m: float, tracks: tuple[int, int] | None
 ) -> None:
-    """However sharp: a match inside never says less than a new landmark of the same place."""
+    """A match inside the gate is at least as likely as a new landmark, for any noise."""
     settings = parameters(
         n_particles=1, motion=EXACT_MOTION, association="gate", stray_m=STRAY_M, planar=False
     )
@@ -86,7 +86,7 @@ def test_the_density_has_no_step_at_the_gate(
         return Observations(at, covariance, track=track)
 
     def log_evidence(distance: float) -> float:
-        """Of the second sighting, so many deviations beside the first."""
+        """Return the log evidence of a second observation at this distance in sigmas."""
         stray_m = 0.0 if tracks is None else STRAY_M
         slam = FastSlam(settings, np.random.default_rng(0))
         slam.step(np.zeros(3), seen(0.0, 0))
@@ -100,14 +100,16 @@ def test_the_density_has_no_step_at_the_gate(
 
 
 def test_the_end_of_a_track_leaves_alone_what_no_particle_has_any_more() -> None:
-    """A row of the dead landmark is another's by then: both would be one from there on."""
+    """The row of a freed landmark may belong to another landmark by then."""
     seen = frame([3, 4])
-    maps, tracked = ParticleMaps(2, 9.0), Tracked()
-    places = sightings(np.zeros((2, 3)), seen.position_m, seen.covariance_m2, planar=False)
+    maps, tracked = ParticleMaps(2, 9.0), ActiveTracks()
+    places = observations_in_map(
+        np.zeros((2, 3)), seen.position_m, seen.covariance_m2, planar=False
+    )
     chosen = np.array([[NEW, NEW], [DROPPED, NEW]])  # the second particle alone has the second
     slots, rows = maps.create(chosen, places, seen, 0)
-    tracked.went_into(seen.track, chosen, np.stack([rows, slots], axis=1), maps.slots)
-    maps.resampled(np.zeros(2, dtype=np.int32))
+    tracked.update(seen.track, chosen, np.stack([rows, slots], axis=1), maps.slots)
+    maps.resample(np.zeros(2, dtype=np.int32))
     maps.bring_up_to_date(slots[maps.slots.generation[slots] != FREE])
     assert maps.slots.generation[slots[1]] == FREE
     assert tracked.ended(None, maps.slots).tolist() == [slots[0]]

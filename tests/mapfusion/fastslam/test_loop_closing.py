@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.loop_closing import SPACING, Bends, Seen, close_loops, motion_by_odometry
-from mapfusion.fastslam.measurement import DROPPED, NEW, sightings
+from mapfusion.fastslam.loop_closing import (
+    KNOT_SPACING,
+    DriftModel,
+    FrameAssociation,
+    close_loops,
+    odometry_noise_factor,
+)
+from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.fastslam.particles import History, ParticleMaps
+from mapfusion.fastslam.particles import ParticleMaps, PathHistory
 from mapfusion.fastslam.resampling import MEMORY
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, compose, inverse, rotation_about_z, transform_points
@@ -26,7 +32,7 @@ def spread_matrix(rng: np.random.Generator, size: float) -> Float:
 
 
 class AnyFrames:
-    """The same Gaussian, dense, over the bends at these frames, which ascend."""
+    """Dense Gaussian of the drift at some frames, in ascending order."""
 
     def __init__(self, steps: Float, frames: np.ndarray) -> None:
         walk, n = np.cumsum(steps, axis=0)[frames], len(frames)
@@ -34,8 +40,8 @@ class AnyFrames:
         self.covariance = walk[earlier].transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
         self.frames, self.mean = frames, np.zeros(3 * n)
 
-    def closed(self, now: int, then: int, motion: Float, noise: Float) -> None:
-        """Bend now less bend then was observed to be a motion."""
+    def add_closure(self, now: int, then: int, motion: Float, noise: Float) -> None:
+        """Update with an observed difference of the drift between two frames."""
         slope = np.zeros((len(self.frames), 3, 3))
         slope[self.frames == now], slope[self.frames == then] = np.eye(3), -np.eye(3)
         slope = slope.transpose(1, 0, 2).reshape(3, -1)
@@ -48,57 +54,65 @@ class AnyFrames:
 @pytest.mark.parametrize("n_spacings", [7, 70])  # the latter more than there are knots
 def test_loops_one_inside_the_other_bend_the_path_as_dense_algebra_has_it(n_spacings, taken):
     rng = np.random.default_rng(n_spacings)
-    n = n_spacings * SPACING
+    n = n_spacings * KNOT_SPACING
     steps = np.array([spread_matrix(rng, 1e-2) for _ in range(n)])
     steps[0] = 0  # before the first frame there is no path
-    knots = np.arange(4 * SPACING, n - SPACING, 4 * SPACING)  # of those that are kept to the end
-    loops = {4 * SPACING + 3: 0, 6 * SPACING + 7: 2 * SPACING, n - 1: 4 * SPACING}
-    frames = np.unique([0, 2 * SPACING, *knots, *loops])
-    bends, dense, total = Bends(), AnyFrames(steps, frames), np.zeros((n, 3))
+    knots = np.arange(
+        4 * KNOT_SPACING, n - KNOT_SPACING, 4 * KNOT_SPACING
+    )  # of those that are kept to the end
+    loops = {
+        4 * KNOT_SPACING + 3: 0,
+        6 * KNOT_SPACING + 7: 2 * KNOT_SPACING,
+        n - 1: 4 * KNOT_SPACING,
+    }
+    frames = np.unique([0, 2 * KNOT_SPACING, *knots, *loops])
+    drift_model, dense, total = DriftModel(), AnyFrames(steps, frames), np.zeros((n, 3))
     for frame, step in enumerate(steps):
-        bends.went_on(step)
+        drift_model.add_frame(step)
         if frame not in loops:
             continue
         then, motion = loops[frame], rng.normal(0, 0.05, 3)
         noise, now = spread_matrix(rng, 0.02), spread_matrix(rng, 0.01)
-        dense.closed(frame, then, motion, noise + now)
+        dense.add_closure(frame, then, motion, noise + now)
         # the map shows no more what it was bent by before
         seen = motion - total[frame] + total[then]
         information = np.linalg.inv(noise)
-        bends.closed(np.array([then]), information[None], (information @ seen)[None], now, SURE)
+        drift_model.add_closure(
+            np.array([then]), information[None], (information @ seen)[None], now, SURE
+        )
         if taken or frame == n - 1:
-            found = bends.due(FAR)
+            found = drift_model.take_correction(FAR)
             assert found is not None
-            total[: frame + 1] += bends.at(found, np.arange(frame + 1))
+            total[: frame + 1] += drift_model.interpolate(found, np.arange(frame + 1))
             total[frame + 1 :] = total[frame]
-    checked = frames[(frames >= 4 * SPACING) & np.isin(frames, [*knots, n - 1])]
+    checked = frames[(frames >= 4 * KNOT_SPACING) & np.isin(frames, [*knots, n - 1])]
     expected = dense.mean.reshape(-1, 3)[np.isin(frames, checked)]
     np.testing.assert_allclose(total[checked], expected, atol=1e-9)
     assert np.abs(total[n - 1]).max() > 1e-3
 
 
 def test_between_two_knots_a_bend_grows_evenly():
-    bends = Bends()
-    for _ in range(3 * SPACING):
-        bends.went_on(1e-4 * np.eye(3))
+    drift_model = DriftModel()
+    for _ in range(3 * KNOT_SPACING):
+        drift_model.add_frame(1e-4 * np.eye(3))
     given = np.array([[0, 0, 0], [0, 0, 0], [0.4, 0, 0.2], [0.4, 0, 0.2]])
-    frame = np.array([SPACING, SPACING + SPACING // 2, 2 * SPACING])
+    frame = np.array([KNOT_SPACING, KNOT_SPACING + KNOT_SPACING // 2, 2 * KNOT_SPACING])
     expected = [[0, 0, 0], [0.2, 0, 0.1], [0.4, 0, 0.2]]
-    np.testing.assert_allclose(bends.at(given, frame), expected, atol=1e-12)
+    np.testing.assert_allclose(drift_model.interpolate(given, frame), expected, atol=1e-12)
 
 
 def test_one_landmark_says_nothing_of_the_turn_about_it():
     """Seen off by 0.1 m in x at (2, 3), where the path may have turned about the origin alone."""
-    bends = Bends()
-    for _ in range(2 * SPACING):
-        bends.went_on(np.diag([0, 0, 1e-3]))
+    drift_model = DriftModel()
+    for _ in range(2 * KNOT_SPACING):
+        drift_model.add_frame(np.diag([0, 0, 1e-3]))
     slope = np.array([[1.0, 0, -3], [0, 1, 2]])
     information = 1e4 * slope.T @ slope
     pull = 1e4 * slope.T @ [0.1, 0.0]
-    bends.closed(np.array([0]), information[None], pull[None], np.zeros((3, 3)), SURE)
+    drift_model.add_closure(np.array([0]), information[None], pull[None], np.zeros((3, 3)), SURE)
     # a turn t is seen as (-3 t, 2 t): least squares with its prior
-    turn = 1e4 * -0.3 / (1e4 * 13 + 1 / (2 * SPACING * 1e-3))
-    found = bends.due(np.zeros(2) + 10)
+    turn = 1e4 * -0.3 / (1e4 * 13 + 1 / (2 * KNOT_SPACING * 1e-3))
+    found = drift_model.take_correction(np.zeros(2) + 10)
     assert found is not None
     np.testing.assert_allclose(found[-1], [0, 0, turn], rtol=1e-9, atol=1e-12)
 
@@ -106,93 +120,101 @@ def test_one_landmark_says_nothing_of_the_turn_about_it():
 @pytest.mark.parametrize(("sigmas", "believed"), [(3.9, True), (5.0, False)])
 def test_a_closure_that_no_drift_explains_is_not_believed(sigmas, believed):
     """The 0.9999 quantile of chi-square with 3 degrees of freedom is 21.1, 4.6 squared."""
-    bends, sigma_m = Bends(), 0.03
-    for _ in range(2 * SPACING):
-        bends.went_on(sigma_m**2 / (4 * SPACING) * np.eye(3))
+    drift_model, sigma_m = DriftModel(), 0.03
+    for _ in range(2 * KNOT_SPACING):
+        drift_model.add_frame(sigma_m**2 / (4 * KNOT_SPACING) * np.eye(3))
     information = 2 / sigma_m**2 * np.eye(3)  # half of the variance each
     pull = information @ [sigmas * sigma_m, 0, 0]
-    bends.closed(np.array([0]), information[None], pull[None], np.zeros((3, 3)), 0.9999)
-    assert (bends.due(np.zeros(2)) is not None) == believed
+    drift_model.add_closure(np.array([0]), information[None], pull[None], np.zeros((3, 3)), 0.9999)
+    assert (drift_model.take_correction(np.zeros(2)) is not None) == believed
 
 
 def test_bends_of_less_than_a_millimetre_are_put_off():
-    bends = Bends()
-    for _ in range(2 * SPACING):
-        bends.went_on(1e-2 * np.eye(3))
+    drift_model = DriftModel()
+    for _ in range(2 * KNOT_SPACING):
+        drift_model.add_frame(1e-2 * np.eye(3))
 
     def seen(shift_m: float) -> None:
         information = 1e6 * np.eye(3)
         pull = information @ [shift_m, 0.0, 0.0]
-        bends.closed(np.array([0]), information[None], pull[None], np.zeros((3, 3)), SURE)
+        drift_model.add_closure(
+            np.array([0]), information[None], pull[None], np.zeros((3, 3)), SURE
+        )
 
     seen(6e-4)
-    assert bends.due(np.zeros(2)) is None
+    assert drift_model.take_correction(np.zeros(2)) is None
     seen(2e-3)  # of the map as it is, so the mean of both
-    found = bends.due(np.zeros(2))
+    found = drift_model.take_correction(np.zeros(2))
     assert found is not None
     assert found[-1, 0] == pytest.approx(1.3e-3, rel=1e-4)
-    assert bends.due(np.zeros(2)) is None
+    assert drift_model.take_correction(np.zeros(2)) is None
 
 
 @pytest.mark.parametrize(("sigmas", "believed"), [(4.1, True), (4.45, False)])
 def test_the_gate_counts_the_directions_that_are_seen(sigmas, believed):
     """The 0.9999 quantile of chi-square with 2 degrees of freedom is 18.4, 4.29 squared."""
-    bends, sigma_m = Bends(), 0.03
-    for _ in range(2 * SPACING):
-        bends.went_on(sigma_m**2 / (4 * SPACING) * np.diag([1, 1, 0]))
+    drift_model, sigma_m = DriftModel(), 0.03
+    for _ in range(2 * KNOT_SPACING):
+        drift_model.add_frame(sigma_m**2 / (4 * KNOT_SPACING) * np.diag([1, 1, 0]))
     information = 2 / sigma_m**2 * np.diag([1.0, 1.0, 0.0])  # half of the variance each
     pull = information @ [sigmas * sigma_m, 0, 0]
-    bends.closed(np.array([0]), information[None], pull[None], np.zeros((3, 3)), 0.9999)
-    assert (bends.due(np.zeros(2)) is not None) == believed
+    drift_model.add_closure(np.array([0]), information[None], pull[None], np.zeros((3, 3)), 0.9999)
+    assert (drift_model.take_correction(np.zeros(2)) is not None) == believed
 
 
 def test_a_bend_is_due_where_it_moves_the_robot():
     """A turn of the plane about (2, 3) does not move a robot there; it moves one at (-2, -3)."""
-    bends, about = Bends(), np.array([2.0, 3.0])
-    for _ in range(2 * SPACING):
-        bends.went_on(1e2 * np.eye(3))
+    drift_model, about = DriftModel(), np.array([2.0, 3.0])
+    for _ in range(2 * KNOT_SPACING):
+        drift_model.add_frame(1e2 * np.eye(3))
     information = 1e6 * np.eye(3)
     pull = information @ (0.01 * np.array([about[1], -about[0], 1.0]))
-    bends.closed(np.array([0]), information[None], pull[None], np.zeros((3, 3)), SURE)
-    assert bends.due(about) is None
-    assert bends.due(-about) is not None
+    drift_model.add_closure(np.array([0]), information[None], pull[None], np.zeros((3, 3)), SURE)
+    assert drift_model.take_correction(about) is None
+    assert drift_model.take_correction(-about) is not None
 
 
 GATE, SIGMA = 16.0, np.array([0.05, 0.03, 0.02])
 
 
-class Evidence(Bends):
-    """Bends that keep what they are told."""
+class Evidence(DriftModel):
+    """Drift model that records its closures."""
 
-    def closed(self, frame, information, pull, now, probability):
+    def add_closure(self, frame, information, pull, now, probability):
         self.told = frame, information, pull, now
 
 
-def loop(planar: bool) -> tuple[Evidence, Seen, ParticleMaps, np.ndarray, np.ndarray]:
-    """Ten landmarks in two particles: four in view before, three each seen first and a while on."""
+def loop(planar: bool) -> tuple[Evidence, FrameAssociation, ParticleMaps, np.ndarray, np.ndarray]:
+    """Return ten landmarks in two particles: four in view, two groups of three seen earlier."""
     rng = np.random.default_rng(2)
     point = rng.uniform([1, -2, 0], [4, 2, 0 if planar else 1], (12, 3))
     covariance = np.array([root @ root.T for root in rng.normal(0, 0.02, (12, 3, 3))])
     covariance += 1e-4 * np.eye(3)
     poses = np.array([[0, 0, 0.0], [0.4, -0.2, 0.7]])
     maps = ParticleMaps(2, GATE)
-    first = sightings(poses, point, covariance, planar)
+    first = observations_in_map(poses, point, covariance, planar)
     frame = Observations(point, covariance)
     created, _ = maps.create(np.full((12, 2), NEW), first, frame, 0)
     moved = point + rng.normal(0, 0.02, point.shape) * [1, 1, 0 if planar else 1]
-    seen = sightings(poses, moved, covariance, planar)
+    seen = observations_in_map(poses, moved, covariance, planar)
     chosen = created.copy()
     chosen[10], chosen[11] = NEW, DROPPED
-    bends = Evidence()
-    for _ in range(5 * SPACING):
-        bends.went_on(np.zeros((3, 3)))
-    maps.slots.last_frame[created] = [*[5 * SPACING - 3] * 4, *[3, 4, 6], *[2 * SPACING] * 3, 0, 0]
-    by_odometry = motion_by_odometry(poses[1], 0.2, SIGMA)
-    return bends, Seen(chosen, seen, 1, GATE, planar), maps, by_odometry, poses
+    drift_model = Evidence()
+    for _ in range(5 * KNOT_SPACING):
+        drift_model.add_frame(np.zeros((3, 3)))
+    maps.slots.last_frame[created] = [
+        *[5 * KNOT_SPACING - 3] * 4,
+        *[3, 4, 6],
+        *[2 * KNOT_SPACING] * 3,
+        0,
+        0,
+    ]
+    by_odometry = odometry_noise_factor(poses[1], 0.2, SIGMA)
+    return drift_model, FrameAssociation(chosen, seen, 1, GATE, planar), maps, by_odometry, poses
 
 
-def log_likelihood(frame: Seen, maps: ParticleMaps, rows, motion) -> float:
-    """By Cauchy's loss, as the proposal weighs pairs, after a motion of the plane (x, y, angle)."""
+def log_likelihood(frame: FrameAssociation, maps: ParticleMaps, rows, motion) -> float:
+    """Return the log likelihood with Cauchy loss after a motion of the plane (x, y, angle)."""
     n, total = 2 if frame.planar else 3, 0.0
     upper = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     for k in rows:
@@ -211,10 +233,10 @@ def slope(function, at) -> np.ndarray:
 
 @pytest.mark.parametrize("planar", [False, True])
 def test_evidence_is_the_slope_of_the_likelihood_at_the_pose_in_view(planar):
-    bends, frame, maps, by_odometry, _ = loop(planar)
-    close_loops(bends, maps.slots, frame, by_odometry, 0.9999)
-    when, information, pull, now = bends.told
-    assert when.tolist() == [13 / 3, 2 * SPACING]
+    drift_model, frame, maps, by_odometry, _ = loop(planar)
+    close_loops(drift_model, maps.slots, frame, by_odometry, 0.9999)
+    when, information, pull, now = drift_model.told
+    assert when.tolist() == [13 / 3, 2 * KNOT_SPACING]
 
     def of_view(motion) -> float:
         eta = np.linalg.solve(by_odometry, motion)
@@ -229,9 +251,9 @@ def test_evidence_is_the_slope_of_the_likelihood_at_the_pose_in_view(planar):
         np.testing.assert_allclose(pull[g], gradient, rtol=0.02, atol=0.02 * np.abs(gradient).max())
     # far from the gate the loss is the squares', and so is its curvature
     wide = frame._replace(gate=1e12)
-    bends.told = None
-    close_loops(bends, maps.slots, wide, by_odometry, 0.9999)
-    information, now = bends.told[1], bends.told[3]
+    drift_model.told = None
+    close_loops(drift_model, maps.slots, wide, by_odometry, 0.9999)
+    information, now = drift_model.told[1], drift_model.told[3]
     inverse = np.linalg.inv(now) - np.linalg.inv(by_odometry @ by_odometry.T)
     for rows, found in (([4, 5, 6], information[0]), (range(4), inverse)):
         points = frame.sightings.point_m[list(rows), 1]
@@ -245,25 +267,25 @@ def test_evidence_is_the_slope_of_the_likelihood_at_the_pose_in_view(planar):
 
 
 def test_a_path_may_bend_by_the_share_of_the_frame_that_hangs_on_nothing():
-    bends, frame, maps, by_odometry, _ = loop(planar=False)
-    drift = close_loops(bends, maps.slots, frame, by_odometry, 0.9999)
+    drift_model, frame, maps, by_odometry, _ = loop(planar=False)
+    drift = close_loops(drift_model, maps.slots, frame, by_odometry, 0.9999)
     # six that come back and a new one, of twelve
-    np.testing.assert_allclose(drift, 7 / 12 * bends.told[3], rtol=1e-12)
+    np.testing.assert_allclose(drift, 7 / 12 * drift_model.told[3], rtol=1e-12)
 
 
 def test_fewer_than_three_together_close_nothing():
-    bends, frame, maps, by_odometry, _ = loop(planar=False)
+    drift_model, frame, maps, by_odometry, _ = loop(planar=False)
     chosen = frame.chosen.copy()
     chosen[[4, 7]] = DROPPED
-    bends.told = None
-    close_loops(bends, maps.slots, frame._replace(chosen=chosen), by_odometry, 0.9999)
-    assert bends.told is None
+    drift_model.told = None
+    close_loops(drift_model, maps.slots, frame._replace(chosen=chosen), by_odometry, 0.9999)
+    assert drift_model.told is None
 
 
 def test_odometry_moves_the_plane_as_its_disturbance_moves_the_robot():
     before, odometry = np.array([2.0, -3.0, 0.7]), np.array([0.3, 0.05, 0.2])
     predicted, point = compose(before, odometry), np.array([[1.0, 0.5, 0.2]])
-    by_odometry = motion_by_odometry(predicted, odometry[2], SIGMA)
+    by_odometry = odometry_noise_factor(predicted, odometry[2], SIGMA)
     seen = transform_points(predicted, point)[0]
     for i in range(3):
         eta = 1e-6 * np.eye(3)[i]
@@ -278,17 +300,17 @@ def test_landmarks_of_all_particles_move_and_are_found_where_they_are_now(settle
     n = 150
     observations = Observations(rng.uniform(-5, 5, (n, 3)), np.tile(0.01 * np.eye(3), (n, 1, 1)))
     poses, given = rng.normal(0, 0.1, (3, 3)), (observations.position_m, observations.covariance_m2)
-    seen = sightings(poses, *given, planar=False)
+    seen = observations_in_map(poses, *given, planar=False)
     maps = ParticleMaps(3, 9.0)
     slots, _ = maps.create(np.full((n, 3), NEW), seen, observations, 0)
     same = np.zeros(3, dtype=np.int32)
     for _ in range(MEMORY if settled else 0):
-        maps.resampled(same)
+        maps.resample(same)
     assert (maps.n_rows == 0) == settled
     T = rng.normal(0, [0.3, 0.3, 0.1], (len(maps.slots.source), 3))
-    maps.bend(T)
+    maps.transform(T)
     for particle in range(3):
-        which, known = maps.of_particle(particle, 1)
+        which, known = maps.landmarks_of(particle, 1)
         own = seen.point_m[:, 0 if settled else particle]
         for s, old, new in zip(which, own, known.mean_m, strict=True):
             np.testing.assert_allclose(new, transform_points(T[s], old[None])[0], atol=1e-12)
@@ -302,7 +324,7 @@ def blind_loop(seed: int, close_loops: bool) -> FastSlam:
 
     Its odometry has no error but what is drawn, which grows evenly and leaves the heading alone.
     """
-    rng, n = np.random.default_rng(seed), 2 * SPACING
+    rng, n = np.random.default_rng(seed), 2 * KNOT_SPACING
     motion = MotionNoise(0.05, 0, 0, 0, 0, lateral_m_per_sqrt_m=0.05, lateral_slip_m_per_rad=0)
     settings = parameters(
         n_particles=1,
@@ -317,17 +339,17 @@ def blind_loop(seed: int, close_loops: bool) -> FastSlam:
     start = Observations(point, np.tile(1e-10 * np.eye(3), (6, 1, 1)), label=label)
     slam.step(np.zeros(3), start)
     for k in range(1, n):
-        seen = replace(start, label=label + 6) if k == SPACING else nothing()
-        slam.step(np.array([0.1 if k <= SPACING else -0.1, 0, 0]), seen)
+        seen = replace(start, label=label + 6) if k == KNOT_SPACING else nothing()
+        slam.step(np.array([0.1 if k <= KNOT_SPACING else -0.1, 0, 0]), seen)
     slam.step(np.array([-0.1, 0, 0]), start)
     return slam
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_path_and_landmarks_of_a_loop_without_a_look_are_a_line_between_its_ends(seed):
-    """A walk of even steps that is known at both ends: its mean given these adds a line to it."""
+    """A random walk with known ends: its conditional mean adds a linear function."""
     bent, free = blind_loop(seed, True), blind_loop(seed, False)
-    n = 2 * SPACING
+    n = 2 * KNOT_SPACING
     drawn, path = free.best_path()[:n], bent.best_path()
     off = -drawn[-1, :2] + np.array([0.1, 0.0])
     found = path[:n, :2] - drawn[:, :2]
@@ -338,12 +360,12 @@ def test_path_and_landmarks_of_a_loop_without_a_look_are_a_line_between_its_ends
     before, after = (slam.best_map(min_count=1) for slam in (free, bent))
     half_way = slice(6, 12)
     moved = after.position_m[half_way] - before.position_m[half_way]
-    np.testing.assert_allclose(moved[:, :2], np.tile(found[SPACING], (6, 1)), atol=1e-9)
+    np.testing.assert_allclose(moved[:, :2], np.tile(found[KNOT_SPACING], (6, 1)), atol=1e-9)
     assert np.abs(off).max() > 0.02
 
 
 def test_without_a_loop_nothing_bends():
-    world = drive(0, n_frames=SPACING)
+    world = drive(0, n_frames=KNOT_SPACING)
     paths = []
     for close in (True, False):
         slam = FastSlam(
@@ -364,8 +386,15 @@ def test_after_two_closures_landmarks_lie_where_the_poses_saw_them(seed, monkeyp
     and close a loop each; groups 2 and 3 are seen once, before and after the first closure. The
     path follows the odometry across both closures.
     """
-    n = 4 * SPACING
-    looks = {0: 0, SPACING: 1, SPACING + 10: 2, 2 * SPACING + 2: 0, 3 * SPACING: 3, n - 10: 1}
+    n = 4 * KNOT_SPACING
+    looks = {
+        0: 0,
+        KNOT_SPACING: 1,
+        KNOT_SPACING + 10: 2,
+        2 * KNOT_SPACING + 2: 0,
+        3 * KNOT_SPACING: 3,
+        n - 10: 1,
+    }
     odometry = np.tile([0.1, 0.0, 0.06], (n, 1))
     odometry[0] = 0.0
     truth, rng = [np.zeros(3)], np.random.default_rng(seed)
@@ -383,13 +412,13 @@ def test_after_two_closures_landmarks_lie_where_the_poses_saw_them(seed, monkeyp
         gate_probability=1 - 1e-12,
         close_loops=True,
     )
-    turned, bent = [], History.bent
+    turned, correct = [], PathHistory.correct
 
     def counted(self, T_map_bent):
         turned.append(np.abs(T_map_bent[:, 2]).max())
-        bent(self, T_map_bent)
+        correct(self, T_map_bent)
 
-    monkeypatch.setattr(History, "bent", counted)
+    monkeypatch.setattr(PathHistory, "correct", counted)
     slam = FastSlam(settings, np.random.default_rng(seed))
     seen = {}
     for frame, step in enumerate(odometry):
@@ -402,10 +431,10 @@ def test_after_two_closures_landmarks_lie_where_the_poses_saw_them(seed, monkeyp
         slam.step(step, Observations(at, np.tile(0.01 * np.eye(3), (6, 1, 1)), label=label))
     assert sum(turn > 0.01 for turn in turned) == 2
     path, found = slam.best_path(), slam.best_map(min_count=1)
-    for frame in (SPACING + 10, 3 * SPACING):
+    for frame in (KNOT_SPACING + 10, 3 * KNOT_SPACING):
         rows = np.flatnonzero(found.label // 6 == looks[frame])
         own = transform_points(inverse(path[frame]), found.position_m[rows])
         np.testing.assert_allclose(own, seen[frame], atol=1e-9)
-    for frame in (2 * SPACING + 2, n - 10):
+    for frame in (2 * KNOT_SPACING + 2, n - 10):
         off = between(path[frame - 1], path[frame]) - odometry[frame]
         assert np.all(np.abs(off) < 6 * motion.standard_deviations(odometry[frame]))

@@ -1,4 +1,4 @@
-"""A whole log through the filter."""
+"""Tests of `mapfusion.fastslam.mapping`."""
 
 from dataclasses import replace
 

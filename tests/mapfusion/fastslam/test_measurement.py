@@ -5,11 +5,11 @@ from scipy.stats import chi2, multivariate_normal
 from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.landmarks import Estimates
 from mapfusion.fastslam.measurement import (
-    Sightings,
+    MapObservations,
     innovation,
     log_density_at_gate,
+    observations_in_map,
     quadratic_form,
-    sightings,
 )
 from mapfusion.geometry.se2 import rotation_about_z, transform_points
 
@@ -26,7 +26,7 @@ def test_sightings_are_the_observations_in_each_particles_map(planar):
     rng = np.random.default_rng(0)
     poses, position = rng.normal(size=(4, 3)), rng.normal(size=(6, 3))
     covariance = covariances(rng, 6)
-    seen = sightings(poses, position, covariance, planar)
+    seen = observations_in_map(poses, position, covariance, planar)
     n = 2 if planar else 3
     for m, pose in enumerate(poses):
         turn = rotation_about_z(pose[2])
@@ -48,7 +48,7 @@ def test_innovation_gives_the_distance_and_determinant_of_the_matrix(planar):
     point, mean = rng.normal(size=(2, 50, 3))
     noise, sigma = covariances(rng, 50), covariances(rng, 50)
     flat_noise, flat_sigma = (matrix[None, :, UPPER[0], UPPER[1]] for matrix in (noise, sigma))
-    seen = Sightings(point[None], flat_noise)
+    seen = MapObservations(point[None], flat_noise)
     own = Estimates(mean[None], flat_sigma, np.ones((1, 50), dtype=np.int32))
     for m in range(50):
         *form, determinant = innovation(seen, 0, own, 0, m, planar)

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.landmarks import BLOCK, FREE, allocate
-from mapfusion.fastslam.measurement import DROPPED, NEW, sightings
-from mapfusion.fastslam.particles import History, ParticleMaps
+from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
+from mapfusion.fastslam.particles import ParticleMaps, PathHistory
 from mapfusion.fastslam.resampling import MEMORY
 from mapfusion.robot_log import Observations
 
 
-def lives(n_particles: int, n_steps: int, resampled_every: int) -> tuple[History, list]:
-    """A history of made-up steps, and the same as each particle of today would tell it."""
+def lives(n_particles: int, n_steps: int, resampled_every: int) -> tuple[PathHistory, list]:
+    """Return a history of random steps, and the expected path and associations per particle."""
     rng = np.random.default_rng(3)
-    history = History()
+    history = PathHistory()
     told: list = [([], []) for _ in range(n_particles)]
     for step in range(n_steps):
         poses = rng.normal(size=(n_particles, 3))
@@ -24,7 +24,7 @@ def lives(n_particles: int, n_steps: int, resampled_every: int) -> tuple[History
             associations.extend(source[:, m])
         if step % resampled_every == 0:
             ancestors = np.sort(rng.integers(n_particles, size=n_particles)).astype(np.int32)
-            history.resampled(ancestors)
+            history.resample(ancestors)
             told = [(list(told[a][0]), list(told[a][1])) for a in ancestors]
     return history, told
 
@@ -44,7 +44,7 @@ def test_one_life_is_kept_from_where_all_lines_have_met() -> None:
 
 
 def matrix(T: np.ndarray) -> np.ndarray:
-    """(3, 3) homogeneous matrix of a pose or motion of the plane."""
+    """Return the homogeneous matrix (3, 3) of a pose or motion of the plane."""
     x, y, angle = T
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, x], [sin, cos, y], [0, 0, 1]])
@@ -53,14 +53,14 @@ def matrix(T: np.ndarray) -> np.ndarray:
 def test_each_bend_moves_the_path_as_the_bends_before_left_it() -> None:
     """The path equals a product of matrices with the last bend leftmost."""
     rng = np.random.default_rng(5)
-    history, told = History(), []
+    history, told = PathHistory(), []
     for step in range(9):
         pose = rng.normal(size=(1, 3))
         history.add(pose, np.empty((0, 1), dtype=np.int32))
         told.append(matrix(pose[0]))
         if step in (3, 5, 8):
             bend = rng.normal(size=(step + 1, 3))
-            history.bent(bend)
+            history.correct(bend)
             told = [matrix(T) @ pose for T, pose in zip(bend, told, strict=True)]
     found = np.array([matrix(pose) for pose in history.path(0)])
     np.testing.assert_allclose(found, told, atol=1e-12)
@@ -72,7 +72,7 @@ def test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot():
     observations = Observations(
         rng.uniform(-20, 20, (n, 3)), np.tile(sigma_m**2 * np.eye(3), (n, 1, 1))
     )
-    seen = sightings(
+    seen = observations_in_map(
         np.zeros((2, 3)), observations.position_m, observations.covariance_m2, planar=False
     )
     chosen = np.full((n, 2), NEW)
@@ -91,7 +91,7 @@ def test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot():
             assert maps.near(box).tolist() == sorted(slots[touches & held].tolist())
 
     assert_found(np.ones(n, dtype=bool))
-    maps.resampled(np.array([0, 0], dtype=np.int32))
+    maps.resample(np.array([0, 0], dtype=np.int32))
     maps.bring_up_to_date(slots[maps.slots.generation[slots] != FREE])  # some were visited
     left = np.arange(n) % 3 != 2
     assert maps.n_slots == left.sum()
@@ -104,20 +104,22 @@ def test_what_all_particles_have_from_one_ancestor_is_kept_once_and_comes_back()
     rng = np.random.default_rng(1)
     observations = Observations(rng.uniform(-5, 5, (n, 3)), np.tile(0.01 * np.eye(3), (n, 1, 1)))
     poses = rng.normal(0, 0.5, (n_particles, 3))
-    seen = sightings(poses, observations.position_m, observations.covariance_m2, planar=False)
+    seen = observations_in_map(
+        poses, observations.position_m, observations.covariance_m2, planar=False
+    )
     maps = ParticleMaps(n_particles, 9.0)
     slots, _ = maps.create(np.full((n, n_particles), NEW), seen, observations, 0)
     ancestors = np.arange(n_particles, dtype=np.int32)
     for _ in range(2 * MEMORY):
-        maps.resampled(ancestors)
+        maps.resample(ancestors)
     assert maps.n_rows == n, "particles differ, however long ago they were written"
-    maps.resampled(np.full(n_particles, 2, dtype=np.int32))
+    maps.resample(np.full(n_particles, 2, dtype=np.int32))
     for _ in range(MEMORY):
-        maps.resampled(ancestors)
+        maps.resample(ancestors)
     assert (maps.n_slots, maps.n_rows) == (n, 0)
 
     def assert_known(particle: int) -> None:
-        which, known = maps.of_particle(particle, 1)
+        which, known = maps.landmarks_of(particle, 1)
         np.testing.assert_array_equal(which, slots)
         np.testing.assert_array_equal(known.mean_m, seen.point_m[:, 2])
         np.testing.assert_array_equal(known.covariance_m2, seen.covariance_m2[:, 2])

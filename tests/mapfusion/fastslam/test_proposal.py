@@ -1,4 +1,4 @@
-"""The informed proposal: the same posterior as with eq. 3, from particles that are where it is."""
+"""Tests of `mapfusion.fastslam.proposal`: the posterior is the same as with eq. 3."""
 
 from dataclasses import replace
 
@@ -7,10 +7,10 @@ import pytest
 
 from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
 from mapfusion.fastslam.landmarks import LANES, Slots
-from mapfusion.fastslam.measurement import Sightings, sightings
+from mapfusion.fastslam.measurement import MapObservations, observations_in_map
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.particles import ParticleMaps
-from mapfusion.fastslam.proposal import Proposal, informed_disturbance, widened
+from mapfusion.fastslam.proposal import Proposal, informed_disturbance, with_odometry_noise
 from mapfusion.geometry.se2 import compose, transform_points
 from mapfusion.robot_log import Observations
 from tests.mapfusion.fastslam.landmark_worlds import drive, observe, unit
@@ -22,7 +22,7 @@ DESCRIPTOR = unit(np.random.default_rng(9).standard_normal((4, 64)))
 
 
 def settings_of(proposal: Proposal) -> FastSlamParameters:
-    """The noise of the observations is what it says it is."""
+    """Return settings of 20 particles with a proposal."""
     return FastSlamParameters(n_particles=20, motion=MOTION, proposal=proposal)
 
 
@@ -108,20 +108,22 @@ def test_a_false_pair_does_not_take_the_pose_along() -> None:
     pose = np.array([0.02, -0.01, 0.03])
     slots = slots_of(transform_points(pose, points), 1e-4)
     slots.own.mean_m[7, 0, :2] += [0.5, -0.5]
-    seen = sightings(np.zeros((1, 3)), points, np.tile(1e-4 * np.eye(3), (20, 1, 1)), False)
+    seen = observations_in_map(
+        np.zeros((1, 3)), points, np.tile(1e-4 * np.eye(3), (20, 1, 1)), False
+    )
     chosen = np.arange(20)[:, None]
     at, given = np.zeros((1, 3)), (0.0, np.full(3, 0.05), 21.0, False)
     eta, _ = informed_disturbance(slots.own, slots.row, chosen, seen, at, *given, at)
     np.testing.assert_allclose(0.05 * eta[0], pose, atol=0.003)
 
 
-def many_particles(n: int, n_points: int) -> tuple[Slots, Sightings, np.ndarray, np.ndarray]:
-    """Landmarks, sightings, poses, and what each particle takes for what; some for nothing."""
+def many_particles(n: int, n_points: int) -> tuple[Slots, MapObservations, np.ndarray, np.ndarray]:
+    """Return landmarks, observations, poses and associations, some without a match."""
     rng = np.random.default_rng(8)
     points = rng.uniform((1, -2, 0), (4, 2, 1), (n_points, 3))
     pose = rng.normal(0, 0.03, (n, 3))
     covariance = np.tile(1e-3 * np.diag([4.0, 1.0, 2.0]), (n_points, 1, 1))
-    seen = sightings(pose, points, covariance, False)
+    seen = observations_in_map(pose, points, covariance, False)
     slots = slots_of(points, 1e-4, n)
     slots.own.mean_m[:n_points] += rng.normal(0, 0.02, (n_points, n, 3))
     chosen = np.where(rng.uniform(size=(n_points, n)) < 0.7, np.arange(n_points)[:, None], -1)
@@ -170,8 +172,8 @@ def test_widened_covariances_are_those_of_disturbed_sightings() -> None:
     before, p_robot = np.array([[1.0, 2.0, 0.7]]), np.array([[3.0, 1.0, 0.5]])
     predicted = compose(before, odometry)
     R = np.diag([0.01, 0.02, 0.03]) ** 2
-    seen = sightings(predicted, p_robot, R[None], False)
-    wide = widened(seen, predicted, odometry, sigma)
+    seen = observations_in_map(predicted, p_robot, R[None], False)
+    wide = with_odometry_noise(seen, predicted, odometry, sigma)
     poses = compose(before, odometry + sigma * rng.standard_normal((200_000, 3)))
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = p_robot[0, :2]
@@ -214,9 +216,9 @@ def one_landmark(sigma_m: float = 0.04) -> Slots:
     return slots_of(np.array([[2.0, 1.5, 0.5]]), sigma_m**2)
 
 
-def one_sighting() -> Sightings:
+def one_sighting() -> MapObservations:
     R = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, -0.5], [0.0, -0.5, 1.0]]) * 0.01**2
-    return sightings(START, np.array([[1.9, 0.55, 0.51]]), R[None], False)
+    return observations_in_map(START, np.array([[1.9, 0.55, 0.51]]), R[None], False)
 
 
 def draw(slots, seen, pose, sigma, standard_normal):

@@ -6,7 +6,7 @@ from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import Observations, RobotLog
-from mapfusion.viewing import viewing_of
+from mapfusion.viewing import viewing_of_log
 
 HALF_VIEW_RAD, FARTHEST_M = 0.45, 8.0
 
@@ -73,7 +73,7 @@ def mapped(
     )
     kept = count >= 3
     source = first[kept]
-    viewing = viewing_of(log, first[own], path, source)
+    viewing = viewing_of_log(log, first[own], path, source)
     there = owner_row[source]
     place = p_map[there] + rng.normal(0, noise_m, (len(there), 3)) * [1, 1, 0]
     look = wall.look[there] + rng.normal(0, 0.02, (len(there), 64))
