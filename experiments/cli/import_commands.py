@@ -131,13 +131,13 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
             for finding in log.findings
         ]
         for robot, finding in findings:
-            options.complain(f"warning: {robot}: {finding.text}")
+            options.print_to_stderr(f"warning: {robot}: {finding.text}")
         if too_little := [line for one in done for line in one.too_little]:
-            options.complain(too_little[0])
+            options.print_to_stderr(too_little[0])
             raise typer.Exit(options.EXIT_FAILED)
         if any(finding.kind == "odometry" for _, finding in findings):
             remedy = "maps of these logs would be wrong; --odometry images takes the pictures' own"
-            options.complain(f"odometry and pictures contradict each other: {remedy}")
+            options.print_to_stderr(f"odometry and pictures contradict each other: {remedy}")
             raise typer.Exit(options.EXIT_FAILED)
 
     return _with_options(command, IMPORTERS[format_name].options)

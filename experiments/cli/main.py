@@ -17,7 +17,7 @@ from experiments.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
     STEPS,
-    complain,
+    print_to_stderr,
 )
 from mapfusion.errors import InputError, one_line
 
@@ -72,17 +72,17 @@ def main() -> None:
         code = app(prog_name="mapfusion", standalone_mode=False) or 0
     except InputError as error:
         for line in str(error).splitlines():
-            complain(line)
+            print_to_stderr(line)
         code = EXIT_BAD_INPUT
     except BrokenPipeError:
         code = EXIT_FAILED
     except OSError as error:  # a full disk, a folder that is a file or not ours
         where = "" if error.filename is None else f"{error.filename}: "
-        complain(one_line(f"{where}cannot be read or written ({error.strerror or error})"))
+        print_to_stderr(one_line(f"{where}cannot be read or written ({error.strerror or error})"))
         code = EXIT_BAD_INPUT
     except MemoryError:
         kept = "what was finished is kept; --jobs 1 needs least"
-        complain(f"this machine has too little memory for this ({kept})")
+        print_to_stderr(f"this machine has too little memory for this ({kept})")
         code = EXIT_BAD_INPUT
     except KeyboardInterrupt:  # before or after what the command itself guards
         code = EXIT_INTERRUPTED
@@ -90,14 +90,16 @@ def main() -> None:
         # Typer keeps its usage errors' classes private; all of them can tell their message.
         message = getattr(error, "format_message", None)
         if message is None:
-            complain(saved_defect(error))
+            print_to_stderr(saved_defect(error))
             code = EXIT_DEFECT
         else:
             if message():  # empty where the help was shown instead
-                complain(f"{message()} (see mapfusion --help)")
+                print_to_stderr(f"{message()} (see mapfusion --help)")
             code = EXIT_BAD_INPUT
     if code == EXIT_INTERRUPTED:
-        complain("interrupted; what was finished is kept, the same command goes on from there")
+        print_to_stderr(
+            "interrupted; what was finished is kept, the same command goes on from there"
+        )
     sys.exit(code)
 
 
@@ -115,7 +117,9 @@ def _mend_thread_counts() -> None:
             continue
         os.environ[name] = first if is_count else "1"
         if not is_count:
-            complain(f"warning: {name}={one_line(given)}: is no number of threads; 1 is taken")
+            print_to_stderr(
+                f"warning: {name}={one_line(given)}: is no number of threads; 1 is taken"
+            )
 
 
 def _tell_warnings() -> None:
@@ -126,7 +130,7 @@ def _tell_warnings() -> None:
 
     def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
         if issubclass(category, TellingWarning):
-            complain(f"warning: {message}")
+            print_to_stderr(f"warning: {message}")
         else:
             show(message, category, *rest)
 

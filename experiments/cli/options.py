@@ -84,7 +84,7 @@ DocumentFile = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead.")]
 
 
-def complain(text: str) -> None:
+def print_to_stderr(text: str) -> None:
     """Tell what is wrong, in one line whatever was quoted."""
     # to this stream, which replaces what the terminal lacks; `err=True` may open another
     typer.echo(f"mapfusion: {plain(' '.join(text.split()))}", file=sys.stderr)
@@ -139,7 +139,7 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     The files beside a Parquet map, of its joint covariance and viewing evidence, must not be those
     of an input either.
     """
-    from experiments.evaluation.single_steps import numbered
+    from experiments.evaluation.single_steps import numbered_path
 
     require_file("--output", path, MAP_ENDINGS, inputs)
     companion = next((each for each in _COMPANIONS if path.stem.lower().endswith(each)), None)
@@ -150,7 +150,7 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     known = _paths(inputs)
     read = [*known, *(each for one in known for each in _beside(one) if each.is_file())]
     for k in range(1, n_maps + 1):
-        of_map = numbered(path, k)
+        of_map = numbered_path(path, k)
         for written in (of_map, *_beside(of_map)):
             for each in read:
                 if _is_same(written, each):

@@ -60,11 +60,13 @@ def run(
         add_times(folder, start | {"figures": drawn.elapsed_s})
         run_screen.print_result(folder, drawn.skipped)
         for line in finding_lines(folder):
-            options.complain(f"warning: {line}")
+            options.print_to_stderr(f"warning: {line}")
         if nothing := nothing_merged(folder):
-            options.complain(f"warning: {nothing.text}")
+            options.print_to_stderr(f"warning: {nothing.text}")
         if not has_usable_map(folder):
-            options.complain(f"{folder}: no robot's map can be used: all are empty or contradicted")
+            options.print_to_stderr(
+                f"{folder}: no robot's map can be used: all are empty or contradicted"
+            )
             unusable = True
     if unusable:
         raise typer.Exit(options.EXIT_FAILED)
@@ -171,7 +173,7 @@ def check(
         for checked in check_all(scenarios, parse_seeds(seeds), overrides, run_one):
             checks.append(checked)
             if checked.error:
-                options.complain(checked.error)
+                options.print_to_stderr(checked.error)
         if not as_json:
             run_screen.print_checks(checks)
         json_document.publish("check", json_document.of_checks(checks), as_json, output)

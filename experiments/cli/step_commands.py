@@ -29,7 +29,7 @@ def record(
     from experiments.cli.options import require_folder
     from experiments.evaluation import single_steps as single
     from experiments.evaluation.checks import load_checked
-    from experiments.evaluation.dataset_export import write_drives
+    from experiments.evaluation.single_steps import write_drives
     from experiments.reports.terminal.layout import print_paths, progress
     from experiments.scenario.suite import one_scenario
 
@@ -75,9 +75,9 @@ def slam(
         layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
     for finding in made.findings:
         if finding.kind != "gate":  # which makes the map unusable, see below
-            options.complain(f"warning: {log}: {finding.text}")
+            options.print_to_stderr(f"warning: {log}: {finding.text}")
     if made.unusable:
-        options.complain(f"{log}: {made.unusable}")
+        options.print_to_stderr(f"{log}: {made.unusable}")
         raise typer.Exit(options.EXIT_FAILED)
 
 
@@ -141,7 +141,7 @@ def merge(
     if not paths:
         if not as_json:
             print_unmerged(merged, maps)
-        options.complain(f"no two maps were merged; {output} is not written")
+        options.print_to_stderr(f"no two maps were merged; {output} is not written")
         raise typer.Exit(options.EXIT_FAILED)
     if not as_json:
         for path, fused in zip(paths, merged.fusion.fused, strict=True):

@@ -273,7 +273,7 @@ def calibrate(
 ) -> None:
     """Correct odometry by what logs say of it: `mapfusion study calibrate raw/robot* -o logs`."""
     from experiments.cli.options import require_folder
-    from experiments.evaluation.odometry_calibration import calibrated
+    from experiments.evaluation.odometry_calibration import calibrate_logs
     from experiments.reports import json_document
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of
@@ -281,7 +281,7 @@ def calibrate(
     require_folder(output, [*logs, scenario])
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
-        found = calibrated(logs, output, settings, show)
+        found = calibrate_logs(logs, output, settings, show)
     written = [] if output is None else [output / each.robot for each in found.robots]
     made = study_screen.document(found, written)
     json_document.publish("calibrate", made, as_json)

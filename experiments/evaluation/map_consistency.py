@@ -89,7 +89,7 @@ def rmse(error_m: Float) -> float:
     return float(np.sqrt(np.mean(np.sum(error_m**2, axis=1)))) if len(error_m) else np.nan
 
 
-def fitted(landmarks: LandmarkMap, point_m: Float) -> FittedMap:
+def fit_to_truth(landmarks: LandmarkMap, point_m: Float) -> FittedMap:
     """The best rigid fit of the true points (N, 3), NaN where unknown, to a map.
 
     It is the least-squares motion of the landmarks that are not gross, found by turns with these.
@@ -123,10 +123,10 @@ def _error(landmarks: LandmarkMap, position_m: Float, truth_m: Float) -> Float:
 
 def relative_consistency(landmarks: LandmarkMap, fit: FittedMap) -> Consistency:
     """Of the map as such: gauge removed, gross landmarks left out."""
-    return both_consistencies(landmarks, fit)[0]
+    return consistencies(landmarks, fit)[0]
 
 
-def both_consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, Consistency]:
+def consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, Consistency]:
     """The relative one, and that of the map in the frame that its truth was given in.
 
     Both without the gross landmarks; what takes long is the same for both.
@@ -148,7 +148,7 @@ def both_consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consiste
     )
 
 
-def _consistency(joint: "_LowRank", error: Float, J: Float, solved: Float) -> Consistency:
+def _consistency(joint: "_LowRankCovariance", error: Float, J: Float, solved: Float) -> Consistency:
     """Of errors (n, D) without what lies along J (n, D, k), by S^-1 of both (n D, 1 + k)."""
     d = error.shape[1]
     J_flat = J.reshape(error.size, -1)
@@ -171,7 +171,7 @@ def rigid_motions(point_m: Float, n_dimensions: int) -> Float:
 
 
 @dataclass(frozen=True)
-class _LowRank:
+class _LowRankCovariance:
     """S of n landmarks in D dimensions: block diagonal `own` (n, D, D) plus C' C, C (R, n D)."""
 
     own: Float
@@ -207,16 +207,16 @@ class _LowRank:
         return self.own + C @ np.swapaxes(C, 1, 2)
 
 
-def _joint_of(landmarks: LandmarkMap, rows: np.ndarray, d: int) -> _LowRank:
+def _joint_of(landmarks: LandmarkMap, rows: np.ndarray, d: int) -> _LowRankCovariance:
     """The joint covariance of some landmarks; without one, errors are taken for independent."""
     joint = landmarks.joint
     if joint is None:
         joint = JointCovariance(landmarks.covariance_m2, np.zeros((len(landmarks), 0, 3)))
     own, common = joint.own_m2[rows, :d, :d], joint.common_m[rows, :, :d]
-    return _LowRank(own, common.transpose(1, 0, 2).reshape(joint.rank, d * len(rows)))
+    return _LowRankCovariance(own, common.transpose(1, 0, 2).reshape(joint.rank, d * len(rows)))
 
 
-def _projected(joint: _LowRank, error: Float, J: Float) -> tuple[Float, Float]:
+def _projected(joint: _LowRankCovariance, error: Float, J: Float) -> tuple[Float, Float]:
     """Errors (n, D), and marginal covariances (n, D, D), without what lies along J (n D, k)."""
     n, d = error.shape
     if not J.shape[1]:

@@ -16,8 +16,13 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import criteria
-from experiments.evaluation.alignment_summary import error_over_oracle, maps_of
-from experiments.evaluation.criteria import ORACLE, merged_robots, rich
+from experiments.evaluation.criteria import (
+    ORACLE,
+    error_over_oracle,
+    merged_robots,
+    rich,
+    summarise_alignments,
+)
 from experiments.evaluation.path_errors import path_rms, rms
 from experiments.evaluation.team_errors import edge_precision, edge_recall
 from experiments.scenario.settings import FUSER_METRICS
@@ -90,7 +95,7 @@ def _of_the_smoother(tables: Tables, which: str) -> float:
 def _oracle_at_the_end(tables: Tables, which: str) -> float:
     """The oracle's errors and true pairs at the last iteration, median over seeds and pairs."""
     rows = criteria.at_the_end(_of(tables["errors"], ORACLE))
-    return criteria.how_far_off(rows, [which])[which].median()
+    return criteria.absolute_errors(rows, [which])[which].median()
 
 
 def _truly_fused(tables: Tables) -> pd.DataFrame:
@@ -161,7 +166,7 @@ def _team_edges(tables: Tables, which: str) -> float:
 def refined_oracle_distance_m(tables: Tables, aligner: str) -> float:
     """Refined translation against the oracle's, where there are 30 or more true pairs."""
     rows = rich(_of(tables["errors"], aligner))
-    return criteria.how_far_off(rows, ["oracle_distance_m"])["oracle_distance_m"].median()
+    return criteria.absolute_errors(rows, ["oracle_distance_m"])["oracle_distance_m"].median()
 
 
 @metric(
@@ -170,14 +175,14 @@ def refined_oracle_distance_m(tables: Tables, aligner: str) -> float:
 def _over_oracle(tables: Tables, aligner: str, which: str) -> float:
     """Median translation error over the oracle's, 30 or more true pairs."""
     errors = rich(tables["errors"])
-    maps = maps_of(errors[errors["aligner"].isin([aligner, ORACLE])])
+    maps = summarise_alignments(errors[errors["aligner"].isin([aligner, ORACLE])])
     return error_over_oracle(maps, which).get(aligner, np.nan)
 
 
 @metric()
 def estimated_translation_m(tables: Tables, aligner: str) -> float:
     """Median translation error as estimated, iterations with three or more true pairs."""
-    maps = maps_of(criteria.answerable(_of(tables["errors"], aligner)))
+    maps = summarise_alignments(criteria.answerable(_of(tables["errors"], aligner)))
     return maps["translation_error_m"].median()
 
 
@@ -187,7 +192,11 @@ def lead_over_others(tables: Tables, aligner: str) -> float:
 
     As estimated. The paper's claim is about its own four (algorithm 1 in both readings).
     """
-    medians = maps_of(rich(tables["errors"])).groupby("aligner")["translation_error_m"].median()
+    medians = (
+        summarise_alignments(rich(tables["errors"]))
+        .groupby("aligner")["translation_error_m"]
+        .median()
+    )
     others = medians[medians.index.isin({*PAPER_ALIGNERS} - {aligner})]
     return others.min() / medians.get(aligner, np.nan)
 

@@ -22,7 +22,7 @@ from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.tables import NO_LABEL
 
 
-def calibrated(
+def calibrate_logs(
     logs: Sequence[Path], output: Path | None, settings: Scenario, on_progress: OnProgress
 ) -> Calibration:
     """Calibrate logs, one a robot; write them with corrected odometry into `output`, if given.

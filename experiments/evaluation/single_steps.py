@@ -1,11 +1,19 @@
-"""Single steps on a user's files: slam, align, merge."""
+"""Single steps on a user's files: record, slam, align, merge."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.evaluation.evaluated_run import JudgedRun, finding_of_truth
+import numpy as np
+
+from experiments.evaluation.evaluated_run import EvaluatedRun, finding_of_truth
+from experiments.pipeline.pipeline import SimulatedRobotStages
+from experiments.pipeline.stage import Stage
+from experiments.pipeline.stages.drive import TRAJECTORY_FILE
+from experiments.pipeline.stages.features import rendered
+from experiments.pipeline.stages.log import measured_odometry
+from experiments.pipeline.stages.observed import told_tilt
 from experiments.pipeline.store import Store, link_or_copy, mending
 from experiments.pipeline.tables import estimate_row
 from experiments.pipeline.tasks import OnProgress
@@ -15,6 +23,8 @@ from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Reco
 from mapfusion.align.alignment import NOT_RUN, Pairs, Status
 from mapfusion.align.correspondences import match
 from mapfusion.attitude import read_attitude
+from mapfusion.datasets.export import StereoDrive
+from mapfusion.datasets.formats import EXPORTERS, export_drive
 from mapfusion.datasets.log_consistency import Finding, check_log, gate_finding, without_jumps
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
@@ -26,6 +36,8 @@ from mapfusion.fusion.team_graph import Place
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.registration import Registration
 from mapfusion.robot_log import read_log, read_odometry_covariance, read_true_poses
+from sim.recorder import FrameSource
+from sim.trajectory import Trajectory, read_trajectory
 
 
 def require_simulation(scenario: AnyScenario) -> None:
@@ -40,7 +52,7 @@ def record(
 ) -> list[Path]:
     """Simulate and write one log a robot into `output`; returns their folders."""
     require_simulation(scenario)
-    run = JudgedRun.of(scenario, Store.of(results))
+    run = EvaluatedRun.of(scenario, Store.of(results))
 
     def make() -> None:
         run.execute(jobs, on_progress, [robot.log for robot in run.pipeline.simulated])
@@ -52,7 +64,7 @@ def record(
     return [output / robot.name for robot in run.pipeline.robots]
 
 
-class MadeMap(NamedTuple):
+class SlamResult(NamedTuple):
     """Map of one robot's log.
 
     Attributes:
@@ -72,7 +84,7 @@ class MadeMap(NamedTuple):
         return f"the map does not describe its log: {gate[0]}" if gate else ""
 
 
-def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> MadeMap:
+def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> SlamResult:
     """The most probable map at the end of a log, by a scenario's `slam` section and seed."""
     robot_log = read_log(log)
     if not len(robot_log):
@@ -95,7 +107,7 @@ def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> MadeMap:
         sound = not any(finding.kind == "odometry" for finding in findings)
         truth = finding_of_truth(robot_log, poses, settings.slam.filter.motion, sound)
         findings += [] if truth is None else [truth]
-    return MadeMap(made.landmarks, tuple(findings))
+    return SlamResult(made.landmarks, tuple(findings))
 
 
 def save_map(path: Path, landmarks: LandmarkMap) -> None:
@@ -118,7 +130,7 @@ _OF_THE_TEAM = {
 }
 
 
-class Merged(NamedTuple):
+class MergeResult(NamedTuple):
     """Maps of the user's own made one.
 
     Attributes:
@@ -147,12 +159,12 @@ class Merged(NamedTuple):
         return found
 
 
-def numbered(path: Path, k: int) -> Path:
+def numbered_path(path: Path, k: int) -> Path:
     """Return where the k-th of several fused maps goes: `path` itself, then `.2` and so on."""
     return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
 
 
-def save_fused(path: Path, merged: Merged) -> list[Path]:
+def save_fused(path: Path, merged: MergeResult) -> list[Path]:
     """Write the fused maps: that of the most maps to `path`, others beside it, from `.2` on.
 
     All are written or none. Where nothing was merged there is none.
@@ -160,7 +172,7 @@ def save_fused(path: Path, merged: Merged) -> list[Path]:
     if not merged.any_merged:
         return []
     fused = merged.fusion.fused
-    paths = [numbered(path, k) for k in range(1, len(fused) + 1)]
+    paths = [numbered_path(path, k) for k in range(1, len(fused) + 1)]
     writes: dict[Path, Write] = {}
     for place, each in zip(paths, fused, strict=True):
         writes |= map_writes(place, each.landmarks)
@@ -193,7 +205,7 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
         yield row
 
 
-def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:
+def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
     """What became of an estimate (a row of `align`) in the end, and what is to be said of it."""
     status = Status(row["verdict"])
     if row["status"] in NOT_RUN:
@@ -203,7 +215,7 @@ def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:
     return status, row["reason"] or row["refined_reason"] or row["acceptance_reason"]
 
 
-def merge(paths: Sequence[Path], settings: Scenario) -> Merged:
+def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
     """Fuse maps by the alignments of each with each, a pair in the order of its robots' names."""
     if len(paths) < 2:
         raise InputError("merge: give two maps or more")
@@ -225,4 +237,65 @@ def merge(paths: Sequence[Path], settings: Scenario) -> Merged:
             pairs += [AlignedPair(a, b, rival, offered, sureness) for rival in rivals]
     chosen = settings.merge
     fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))
-    return Merged(fusion, pairs)
+    return MergeResult(fusion, pairs)
+
+
+def write_drives(
+    scenario: AnyScenario,
+    format_name: str,
+    output: Path,
+    results: Path,
+    jobs: int,
+    on_progress: OnProgress,
+) -> list[Path]:
+    """Simulate, and write what each robot sees into `output`; returns what can be imported.
+
+    Raises:
+        InputError: an unknown format, or a scenario of recorded logs.
+    """
+    if format_name not in EXPORTERS:
+        known = ", ".join(["log", *EXPORTERS])
+        raise InputError(f"--format {format_name}: unknown; known: {known}")
+    require_simulation(scenario)
+    run = EvaluatedRun.of(scenario, Store.of(results))
+    robots = run.pipeline.simulated
+    driven, painted = (_before(robots[0], name) for name in ("drive", "faces"))
+    mending(run.store, lambda: run.execute(jobs, on_progress, [driven, painted]))
+    trajectory = read_trajectory(run.store.path(driven) / TRAJECTORY_FILE)
+    settings = robots[0].features.settings  # camera and renderer are all robots'
+    world = (run.store.path(painted), settings.camera, trajectory.robots, settings.renderer)
+    written = []
+    with FrameSource(*world) as source:
+        for robot in robots:
+            label = f"{robot.name}: write {format_name}"
+            drive = _drive_of(robot, trajectory, source)
+            written += export_drive(
+                format_name, output, drive, lambda done, n, label=label: on_progress(label, done, n)
+            )
+    return written
+
+
+def _before(robot: SimulatedRobotStages, name: str) -> Stage:
+    stage = robot.features.before[name]
+    assert isinstance(stage, Stage)
+    return stage
+
+
+def _drive_of(
+    robot: SimulatedRobotStages, trajectory: Trajectory, source: FrameSource
+) -> StereoDrive:
+    def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
+        frame = rendered(robot.features.settings, source, trajectory.bodies(k), k)
+        return frame.left, frame.right
+
+    index, tilts = trajectory.index(robot.name), trajectory.tilt_rad
+    return StereoDrive(
+        robot.name,
+        robot.features.settings.camera,
+        trajectory.time_s,
+        trajectory.T_world_robot[index],
+        measured_odometry(robot.log.settings, trajectory),
+        pair,
+        None if tilts is None else tilts[index],
+        told_tilt(robot.observed.settings, trajectory),
+    )

@@ -10,10 +10,9 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.map_consistency import fitted, relative_consistency
-from experiments.evaluation.pair_evaluation import truth_of
+from experiments.evaluation.map_consistency import fit_to_truth, relative_consistency
 from experiments.evaluation.path_errors import ate_m
-from experiments.evaluation.truth import landmark_truth
+from experiments.evaluation.truth import landmark_truth, truth_of
 from experiments.pipeline.stages.slam import RobotFolders, final_path
 from experiments.pipeline.stages.smooth import (
     read_endings,
@@ -110,12 +109,12 @@ def _row(smoothed: SmoothedRobot) -> dict[str, Any]:
     row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
     row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | smoothed.ending
     row["not_smoothed"] = smoothed.given_at(last)[1]
-    of_filter = fitted(robot.maps[last], robot.points_world_m[last])
+    of_filter = fit_to_truth(robot.maps[last], robot.points_world_m[last])
     row |= {"filter_landmark_rmse_m": of_filter.rmse_m, "filter_gross_share": of_filter.gross_share}
     if last not in smoothed.maps:
         return row | {"n_landmarks": 0}
     landmarks = smoothed.maps[last]
-    fit = fitted(landmarks, smoothed.points_world_m[last])
+    fit = fit_to_truth(landmarks, smoothed.points_world_m[last])
     row |= {"landmark_rmse_m": fit.rmse_m, "gross_share": fit.gross_share}
     row |= {"n_landmarks": len(landmarks)}
     consistency = relative_consistency(landmarks, fit)

@@ -212,7 +212,7 @@ def table_path(result: Path, name: str) -> Path:
     return result / "tables" / f"{name}.parquet"
 
 
-def framed(name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> pd.DataFrame:
+def as_table(name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> pd.DataFrame:
     """Rows with the columns of the table of that name alone; of no rows, columns of any type."""
     import pandas as pd
 
@@ -221,7 +221,7 @@ def framed(name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> pd.DataFrame
 
 def write(path: Path, name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> None:
     """Write rows as the table of that name."""
-    tables.write_rows(path, ALL[name], framed(name, rows))
+    tables.write_rows(path, ALL[name], as_table(name, rows))
 
 
 def read(path: Path, name: str) -> pd.DataFrame:

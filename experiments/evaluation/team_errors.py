@@ -142,18 +142,18 @@ def _placed_errors(team: FusedTeam, pairs: np.ndarray) -> Float:
     return off
 
 
-def believed(pairs: pd.DataFrame) -> pd.Series:
+def is_used_by_team(pairs: pd.DataFrame) -> pd.Series:
     """Bool per row of `team_pairs`: whether the team's map was placed by this alignment."""
     return pairs["place"].isin([Place.CONFIRMED, Place.BRIDGE])
 
 
 def edge_precision(pairs: pd.DataFrame) -> float:
     """Share of right ones among the alignments that were believed; NaN where none were."""
-    used = pairs[believed(pairs)]
+    used = pairs[is_used_by_team(pairs)]
     return float(1 - criteria.is_false_merge(used).mean())
 
 
 def edge_recall(pairs: pd.DataFrame) -> float:
     """Share of the pairs with common ground whose alignment is right and was believed."""
     met = pairs[criteria.has_common_ground(pairs)]
-    return float((criteria.right_refined(met) & believed(met)).mean())
+    return float((criteria.right_refined(met) & is_used_by_team(met)).mean())

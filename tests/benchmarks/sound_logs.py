@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from experiments.evaluation.evaluated_run import finding_of_truth
-from experiments.evaluation.pair_evaluation import truth_of
+from experiments.evaluation.truth import truth_of
 from mapfusion.datasets.log_consistency import Finding, check_log
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import read_log
