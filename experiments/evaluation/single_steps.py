@@ -1,5 +1,6 @@
-"""Single steps on a user's files: record, slam, align, merge."""
+"""Single steps on a user's files: record, export as a dataset, slam, align, merge."""
 
+import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -50,7 +51,7 @@ def require_simulation(scenario: AnyScenario) -> None:
 def record(
     scenario: AnyScenario, output: Path, results: Path, jobs: int, on_progress: OnProgress
 ) -> list[Path]:
-    """Simulate and write one log a robot into `output`; returns their folders."""
+    """Simulate, and write the log of each robot into `output`; return the folders of the logs."""
     require_simulation(scenario)
     run = EvaluatedRun.of(scenario, Store.of(results))
 
@@ -68,8 +69,8 @@ class SlamResult(NamedTuple):
     """Map of one robot's log.
 
     Attributes:
-        landmarks: the most probable map at its end.
-        findings: what the log says against itself.
+        landmarks: map of the most probable particle at the end.
+        findings: contradictions in the log.
     """
 
     landmarks: LandmarkMap
@@ -77,7 +78,7 @@ class SlamResult(NamedTuple):
 
     @property
     def unusable(self) -> str:
-        """Why nothing can be done with the map; empty where it can be used."""
+        """Reason why the map cannot be used; empty if it can."""
         if not len(self.landmarks):
             return "the map is empty: no landmark was seen often enough where it was expected"
         gate = [finding.text for finding in self.findings if finding.kind == "gate"]
@@ -85,33 +86,38 @@ class SlamResult(NamedTuple):
 
 
 def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> SlamResult:
-    """The most probable map at the end of a log, by a scenario's `slam` section and seed."""
+    """Map the log of a robot with the `slam` section and the seed of a scenario.
+
+    Raises:
+        InputError: the log cannot be read or has no frame.
+    """
     robot_log = read_log(log)
     if not len(robot_log):
         raise InputError(f"{log}: frames.parquet holds no frame")
     n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
-    found = check_log(robot_log, settings.slam.filter.motion)
-    own = without_jumps(robot_log, found.jumps, read_odometry_covariance(log, n_frames))
-    wanted, least, made = [n_frames - 1], settings.slam.min_count, None
-    told = own[1], read_attitude(log, n_frames)
-    for frame in run_log(own[0], settings.slam.filter, rng, wanted, least, *told):
+    checked = check_log(robot_log, settings.slam.filter.motion)
+    stated = read_odometry_covariance(log, n_frames)
+    used_log, covariance = without_jumps(robot_log, checked.jumps, stated)
+    kept, min_count, last = [n_frames - 1], settings.slam.min_count, None
+    attitude, parameters = read_attitude(log, n_frames), settings.slam.filter
+    for frame in run_log(used_log, parameters, rng, kept, min_count, covariance, attitude):
         on_progress("FastSLAM", frame.iteration + 1, n_frames)
-        made = frame
-    assert made is not None
-    assert made.landmarks is not None
-    assert made.associations is not None
-    gate = gate_finding(robot_log, made.associations)
-    findings = [*found.findings, *([] if gate is None else [gate])]
-    poses = read_true_poses(log)  # for this check alone, after the map is made
+        last = frame
+    assert last is not None
+    assert last.landmarks is not None
+    assert last.associations is not None
+    gate = gate_finding(robot_log, last.associations)
+    findings = [*checked.findings, *([] if gate is None else [gate])]
+    poses = read_true_poses(log)  # only for this check, after the map is complete
     if poses is not None and len(poses) == n_frames:
         sound = not any(finding.kind == "odometry" for finding in findings)
         truth = finding_of_truth(robot_log, poses, settings.slam.filter.motion, sound)
         findings += [] if truth is None else [truth]
-    return SlamResult(made.landmarks, tuple(findings))
+    return SlamResult(last.landmarks, tuple(findings))
 
 
 def save_map(path: Path, landmarks: LandmarkMap) -> None:
-    """Write a map where the user wants it; raises InputError where that is impossible."""
+    """Write a map; raise InputError if that is impossible."""
     _save(path, map_writes(path, landmarks))
 
 
@@ -122,8 +128,8 @@ def _save(path: Path, writes: Mapping[Path, Write]) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-# Why an alignment that is accepted by itself is not used.
-_OF_THE_TEAM = {
+# Reasons why the team does not use an accepted alignment.
+_TEAM_REASONS = {
     Place.UNCONFIRMED: "no other alignment confirms this one",
     Place.CONTRADICTED: "other alignments contradict this one",
     Place.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
@@ -131,12 +137,12 @@ _OF_THE_TEAM = {
 
 
 class MergeResult(NamedTuple):
-    """Maps of the user's own made one.
+    """Result of a merge of a user's maps.
 
     Attributes:
-        fusion: what became of them.
-        pairs: the alignments of each two of them, in the order of `fusion.place`; of ambiguous ones
-            the alternatives, too.
+        fusion: fused maps.
+        pairs: alignments of all pairs of maps, in the order of `fusion.place`; with the
+            alternatives of ambiguous alignments.
     """
 
     fusion: Fusion
@@ -144,30 +150,31 @@ class MergeResult(NamedTuple):
 
     @property
     def any_merged(self) -> bool:
-        """Return True if two maps or more were merged."""
+        """True if two or more maps were merged."""
         return len(self.fusion.fused[0].members) > 1
 
     def reasons(self) -> dict[tuple[int, int], str]:
-        """Return why each two maps were not merged by their own alignment; empty if they were."""
-        found: dict[tuple[int, int], str] = {}
+        """Return by pair of maps the reason why their alignment is not used; empty if it is."""
+        reasons: dict[tuple[int, int], str] = {}
         for pair, place in zip(self.pairs, self.fusion.place, strict=True):
-            reason = pair.alignment.reason or _OF_THE_TEAM.get(place, "")
+            reason = pair.alignment.reason or _TEAM_REASONS.get(place, "")
             if place in (Place.CONFIRMED, Place.BRIDGE):
-                found[pair.a, pair.b] = ""
+                reasons[pair.a, pair.b] = ""
             else:
-                found.setdefault((pair.a, pair.b), reason)
-        return found
+                reasons.setdefault((pair.a, pair.b), reason)
+        return reasons
 
 
 def numbered_path(path: Path, k: int) -> Path:
-    """Return where the k-th of several fused maps goes: `path` itself, then `.2` and so on."""
+    """Return the path of the k-th fused map: `path` for k = 1, then `.2` and so on."""
     return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
 
 
 def save_fused(path: Path, merged: MergeResult) -> list[Path]:
-    """Write the fused maps: that of the most maps to `path`, others beside it, from `.2` on.
+    """Write all fused maps or none, the map of most robots to `path`; see `numbered_path`.
 
-    All are written or none. Where nothing was merged there is none.
+    Returns:
+        The paths of the maps; none if no maps were merged.
     """
     if not merged.any_merged:
         return []
@@ -186,10 +193,10 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
 
 
 def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, Any]]:
-    """Yield every aligner's estimate, its refinement and the verdict on it, a row at a time.
+    """Yield for each aligner a row with its estimate, the refinement and the verdict.
 
-    Each is called twice, with the same random numbers, and the second call is timed: the first
-    compiles kernels and starts processes. Nothing of the first is kept for the second.
+    Each aligner is called twice with the same random numbers, and the second call is timed. The
+    first call compiles kernels and starts processes.
     """
     map_a, map_b = read_map(path_a), read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
@@ -206,7 +213,7 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
 
 
 def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
-    """What became of an estimate (a row of `align`) in the end, and what is to be said of it."""
+    """Return the final status of a row of `align`, and the reason."""
     status = Status(row["verdict"])
     if row["status"] in NOT_RUN:
         status = Status(row["status"])
@@ -216,7 +223,13 @@ def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
 
 
 def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
-    """Fuse maps by the alignments of each with each, a pair in the order of its robots' names."""
+    """Align all pairs of maps and fuse the maps.
+
+    The maps of a pair are in the order of their robots' names.
+
+    Raises:
+        InputError: there are fewer than two maps, a map cannot be read, or the aligner is unknown.
+    """
     if len(paths) < 2:
         raise InputError("merge: give two maps or more")
     name, entries = settings.merge.aligner, {each.name: each for each in settings.align.aligners}
@@ -230,11 +243,11 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         offered = match(maps[a], maps[b], settings.align.match)
         ready = registration.on(maps[a], maps[b], offered)
         done = ready.register(rng)
-        sureness = done.verdict.log10_false_alarms
-        pairs.append(AlignedPair(a, b, done.applied, offered, sureness))
+        false_alarms = done.verdict.log10_false_alarms
+        pairs.append(AlignedPair(a, b, done.applied, offered, false_alarms))
         if done.applied.status is Status.AMBIGUOUS and ready.judge is not None:
             rivals = ready.judge.rivals_of(done.refined)
-            pairs += [AlignedPair(a, b, rival, offered, sureness) for rival in rivals]
+            pairs += [AlignedPair(a, b, rival, offered, false_alarms) for rival in rivals]
     chosen = settings.merge
     fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))
     return MergeResult(fusion, pairs)
@@ -248,10 +261,21 @@ def write_drives(
     jobs: int,
     on_progress: OnProgress,
 ) -> list[Path]:
-    """Simulate, and write what each robot sees into `output`; returns what can be imported.
+    """Simulate, and write images, odometry and truth of each robot as a dataset.
+
+    Args:
+        scenario: the simulation.
+        format_name: name of the dataset format.
+        output: folder of the datasets.
+        results: folder of the store.
+        jobs: number of processes.
+        on_progress: is told of finished tasks and frames.
+
+    Returns:
+        The paths that `mapfusion import` reads.
 
     Raises:
-        InputError: an unknown format, or a scenario of recorded logs.
+        InputError: the format is unknown, or the scenario is a recording.
     """
     if format_name not in EXPORTERS:
         known = ", ".join(["log", *EXPORTERS])
@@ -259,29 +283,24 @@ def write_drives(
     require_simulation(scenario)
     run = EvaluatedRun.of(scenario, Store.of(results))
     robots = run.pipeline.simulated
-    driven, painted = (_before(robots[0], name) for name in ("drive", "faces"))
-    mending(run.store, lambda: run.execute(jobs, on_progress, [driven, painted]))
-    trajectory = read_trajectory(run.store.path(driven) / TRAJECTORY_FILE)
-    settings = robots[0].features.settings  # camera and renderer are all robots'
-    world = (run.store.path(painted), settings.camera, trajectory.robots, settings.renderer)
+    drive, faces = (robots[0].features.before[name] for name in ("drive", "faces"))
+    assert isinstance(drive, Stage)
+    assert isinstance(faces, Stage)
+    mending(run.store, lambda: run.execute(jobs, on_progress, [drive, faces]))
+    trajectory = read_trajectory(run.store.path(drive) / TRAJECTORY_FILE)
+    settings = robots[0].features.settings  # all robots have the same camera and renderer
+    world = (run.store.path(faces), settings.camera, trajectory.robots, settings.renderer)
     written = []
     with FrameSource(*world) as source:
         for robot in robots:
             label = f"{robot.name}: write {format_name}"
-            drive = _drive_of(robot, trajectory, source)
-            written += export_drive(
-                format_name, output, drive, lambda done, n, label=label: on_progress(label, done, n)
-            )
+            dataset = _stereo_drive(robot, trajectory, source)
+            show = functools.partial(on_progress, label)
+            written += export_drive(format_name, output, dataset, show)
     return written
 
 
-def _before(robot: SimulatedRobotStages, name: str) -> Stage:
-    stage = robot.features.before[name]
-    assert isinstance(stage, Stage)
-    return stage
-
-
-def _drive_of(
+def _stereo_drive(
     robot: SimulatedRobotStages, trajectory: Trajectory, source: FrameSource
 ) -> StereoDrive:
     def pair(k: int) -> tuple[np.ndarray, np.ndarray]:

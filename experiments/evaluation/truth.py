@@ -142,10 +142,3 @@ def why_no_truth(scenario: AnyScenario) -> str:
         if lacking and log.is_dir():
             return f"no truth is known: {log} has no {lacking[0]}.parquet or .csv"
     return ""
-
-
-def truth_of(folder: Path, log: RobotLog) -> RobotTruth:
-    """The truth beside a log; NaN where there is none."""
-    if all(table_path(folder, name).is_file() for name in TRUTH_TABLES):
-        return read_truth(folder)
-    return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
