@@ -21,9 +21,9 @@ def record(
     results: options.Results = options.RESULTS,
     kind: options.Format = "log",
 ) -> None:
-    """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`.
+    """Simulate, and write the log and truth of each robot: `mapfusion record S -o logs`.
 
-    With `--format` what the robots see, count and truly do, for other people's programs, see
+    `--format` writes images, odometry and truth for other programs, see
     experiments/docs/recordings.md.
     """
     from experiments.cli.options import require_folder
@@ -74,7 +74,7 @@ def slam(
     if not as_json:
         layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
     for finding in made.findings:
-        if finding.kind != "gate":  # which makes the map unusable, see below
+        if finding.kind != "gate":  # this finding makes the map unusable, see below
             options.print_to_stderr(f"warning: {log}: {finding.text}")
     if made.unusable:
         options.print_to_stderr(f"{log}: {made.unusable}")
