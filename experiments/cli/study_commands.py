@@ -277,7 +277,7 @@ def calibrate(
     seed: options.Seed = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Calibrate the odometry of logs and correct it: `mapfusion study calibrate raw/robot* -o logs`."""
+    """Calibrate and correct odometry of logs: `mapfusion study calibrate raw/robot* -o logs`."""
     from experiments.cli.options import require_folder
     from experiments.evaluation.odometry_calibration import calibrate_logs
     from experiments.reports import json_document
