@@ -1,8 +1,8 @@
-"""Commands that turn recordings in foreign formats into robot logs, one a format."""
+"""Commands that convert recordings in other formats into robot logs, one for each format."""
 
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,11 +68,11 @@ LevelOf = Annotated[
     ),
 ]
 _CUT = re.compile(r"(?:(?P<name>[^=]*)=)?(?P<rows>-?\d*:-?\d*(?::\d*)?)")
-_NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_-]{0,40}")  # as scenarios have it
+_NAME = re.compile("[A-Za-z0-9][A-Za-z0-9_-]{0,40}")  # the same names as in scenarios
 
 
 def _log_command(format_name: str) -> Callable[..., None]:
-    """The command that reads logs of one format; `--param` takes what its settings have."""
+    """Return the command that imports logs of a format."""
 
     def command(folder: Folder, output: options.Output, overrides: options.ImportOverrides) -> None:
         from experiments.cli.options import require_folder
@@ -87,7 +87,7 @@ def _log_command(format_name: str) -> Callable[..., None]:
 
 
 def _stereo_command(format_name: str) -> Callable[..., None]:
-    """The command that makes logs of stereo pictures of one format."""
+    """Return the command that makes logs of the stereo images of a format."""
 
     def command(
         folders: Folders,
@@ -131,36 +131,29 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
             for finding in log.findings
         ]
         for robot, finding in findings:
-            options.complain(f"warning: {robot}: {finding.text}")
+            options.print_to_stderr(f"warning: {robot}: {finding.text}")
         if too_little := [line for one in done for line in one.too_little]:
-            options.complain(too_little[0])
+            options.print_to_stderr(too_little[0])
             raise typer.Exit(options.EXIT_FAILED)
         if any(finding.kind == "odometry" for _, finding in findings):
             remedy = "maps of these logs would be wrong; --odometry images takes the pictures' own"
-            options.complain(f"odometry and pictures contradict each other: {remedy}")
+            options.print_to_stderr(f"odometry and pictures contradict each other: {remedy}")
             raise typer.Exit(options.EXIT_FAILED)
 
-    return _with_options(command, IMPORTERS[format_name].options)
-
-
-def _with_options(command: Callable[..., None], own: Mapping[str, str]) -> Callable[..., None]:
-    """A command that takes, in place of its `**chosen`, options with these names and helps."""
+    # Typer reads the signature: replace `**chosen` by the options of the format.
     *shared, _ = inspect.signature(command).parameters.values()
-    kind = inspect.Parameter.KEYWORD_ONLY
-    named = [
-        inspect.Parameter(
-            name, kind, default=None, annotation=Annotated[str | None, typer.Option(help=told)]
-        )
-        for name, told in own.items()
-    ]
-    parameters = [*shared, *named]
+    parameters = list(shared)
+    for name, text in IMPORTERS[format_name].options.items():
+        annotation = Annotated[str | None, typer.Option(help=text)]
+        kind = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(name, kind, default=None, annotation=annotation))
     command.__annotations__ = {each.name: each.annotation for each in parameters}
     setattr(command, "__signature__", inspect.Signature(parameters))  # noqa: B010
     return command
 
 
 def _cuts(recording: str, frames: Sequence[str]) -> "list[RecordingPart]":
-    """Robots by what `--frames` says; raises InputError."""
+    """Return the robots that `--frames` cuts a recording into; raise InputError."""
     from mapfusion.datasets.stereo_import import RecordingPart
 
     if not frames:

@@ -1,4 +1,4 @@
-"""The command `mapfusion`: its list of commands, and what becomes of their failures."""
+"""The command `mapfusion`: its subcommands, and the handling of their errors."""
 
 import io
 import os
@@ -17,7 +17,7 @@ from experiments.cli.options import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
     STEPS,
-    complain,
+    print_to_stderr,
 )
 from mapfusion.errors import InputError, one_line
 
@@ -37,75 +37,78 @@ for commands in (run_commands, study_commands, step_commands):
 app.add_typer(import_commands.app, name="import", rich_help_panel=STEPS)
 
 
-def _tell_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"mapfusion {mapfusion.__version__}")
         raise typer.Exit
 
 
+_Version = Annotated[
+    bool,
+    typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True),
+]
+
+
 @app.callback()
-def _options(
-    version: Annotated[
-        bool,
-        typer.Option("--version", help="Tell the version.", callback=_tell_version, is_eager=True),
-    ] = False,
-) -> None:
+def _options(version: _Version = False) -> None:
     pass
 
 
 def main() -> None:
-    """Run the command; every failure a user can cause is one line and an exit code."""
+    """Run the command; print one line and set the exit code for errors that users can cause."""
     from experiments.pipeline.code_version import use_kernel_cache
     from experiments.pipeline.workers import saved_defect
 
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # None without a terminal
-            stream.reconfigure(errors="replace")  # whatever the terminal's encoding lacks
-    # Work is bound to one thread anyway, and those that BLAS starts when it is imported wait in a
-    # loop. To be said before that.
+            stream.reconfigure(errors="replace")  # characters that the encoding lacks
+    # Each process works in one thread, and further threads of BLAS would wait in a busy loop. Must
+    # be set before BLAS is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a name unknown here ends the import
-    _mend_thread_counts()
-    _tell_warnings()
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; an unknown name would fail the import
+    _repair_thread_counts()
+    _show_warnings_in_one_line()
     try:
         use_kernel_cache()
         code = app(prog_name="mapfusion", standalone_mode=False) or 0
     except InputError as error:
         for line in str(error).splitlines():
-            complain(line)
+            print_to_stderr(line)
         code = EXIT_BAD_INPUT
     except BrokenPipeError:
         code = EXIT_FAILED
-    except OSError as error:  # a full disk, a folder that is a file or not ours
+    except OSError as error:  # a full disk, no permission, a file in place of a folder
         where = "" if error.filename is None else f"{error.filename}: "
-        complain(one_line(f"{where}cannot be read or written ({error.strerror or error})"))
+        print_to_stderr(one_line(f"{where}cannot be read or written ({error.strerror or error})"))
         code = EXIT_BAD_INPUT
     except MemoryError:
         kept = "what was finished is kept; --jobs 1 needs least"
-        complain(f"this machine has too little memory for this ({kept})")
+        print_to_stderr(f"this machine has too little memory for this ({kept})")
         code = EXIT_BAD_INPUT
-    except KeyboardInterrupt:  # before or after what the command itself guards
+    except KeyboardInterrupt:  # outside the part of the command that handles it
         code = EXIT_INTERRUPTED
     except Exception as error:
-        # Typer keeps its usage errors' classes private; all of them can tell their message.
+        # The classes of Typer's usage errors are private; all have `format_message`.
         message = getattr(error, "format_message", None)
         if message is None:
-            complain(saved_defect(error))
+            print_to_stderr(saved_defect(error))
             code = EXIT_DEFECT
         else:
-            if message():  # empty where the help was shown instead
-                complain(f"{message()} (see mapfusion --help)")
+            if message():  # empty if the help was shown
+                print_to_stderr(f"{message()} (see mapfusion --help)")
             code = EXIT_BAD_INPUT
     if code == EXIT_INTERRUPTED:
-        complain("interrupted; what was finished is kept, the same command goes on from there")
+        print_to_stderr(
+            "interrupted; what was finished is kept, the same command goes on from there"
+        )
     sys.exit(code)
 
 
-def _mend_thread_counts() -> None:
-    """Take one thread where a variable names no number of them, and say so.
+def _repair_thread_counts() -> None:
+    """Set invalid environment variables of thread counts to 1, with a warning.
 
-    Libraries read these variables when they are imported, and some fail then. OpenMP allows a list
-    with a number for each level of nesting; other libraries do not.
+    Libraries read these variables when they are imported, and some fail on invalid values. OpenMP
+    allows a list with a number for each level of nesting; other libraries do not.
     """
     for name in _THREAD_COUNTS:
         given = os.environ.get(name)
@@ -115,23 +118,25 @@ def _mend_thread_counts() -> None:
             continue
         os.environ[name] = first if is_count else "1"
         if not is_count:
-            complain(f"warning: {name}={one_line(given)}: is no number of threads; 1 is taken")
+            print_to_stderr(
+                f"warning: {name}={one_line(given)}: is no number of threads; 1 is taken"
+            )
 
 
-def _tell_warnings() -> None:
-    """Show each of our warnings in one line; others keep Python's own form."""
+def _show_warnings_in_one_line() -> None:
+    """Show warnings for the user in one line; other warnings keep Python's format."""
     from mapfusion.errors import TellingWarning
 
     show = warnings.showwarning
 
-    def tell(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+    def show_ours(message: Warning | str, category: type[Warning], *rest: Any) -> None:
         if issubclass(category, TellingWarning):
-            complain(f"warning: {message}")
+            print_to_stderr(f"warning: {message}")
         else:
             show(message, category, *rest)
 
-    warnings.showwarning = tell
-    warnings.simplefilter("always", TellingWarning)  # two stages may be damaged in one way
+    warnings.showwarning = show_ours
+    warnings.simplefilter("always", TellingWarning)  # the same warning may concern two stages
 
 
 if __name__ == "__main__":

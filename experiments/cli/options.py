@@ -1,7 +1,7 @@
 """Options, exit codes and output checks that several commands share.
 
-An output is apart from the inputs: it is none of them, under whatever name, and no folder around
-one. The ending of a file decides its format.
+An output must not be an input, under any name or link, and no folder that contains an input. The
+suffix of a file decides its format.
 """
 
 import os
@@ -22,14 +22,14 @@ from mapfusion.viewing import viewing_paths
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 EXIT_DEFECT = 70  # EX_SOFTWARE of sysexits.h: an error of ours
 RESULTS = Path("results")
-# Panels of the help, in the order of a user's day.
+# Panels of the help, in the order of use.
 RUN, LOOK, STEPS = "Run", "Look and compare", "Your own maps, logs and recordings"
-# Those that this process may use.
+# CPU cores that this process may use.
 ALL_CORES = (
     len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 )
 
-# Those without a default in a command's signature have theirs here.
+# Options with a mutable default have it here, not in the signature of a command.
 ScenarioNames = Annotated[
     list[str],
     typer.Argument(metavar="SCENARIO...", help="Scenario files, or names or tags of the suite."),
@@ -84,33 +84,33 @@ DocumentFile = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead.")]
 
 
-def complain(text: str) -> None:
-    """Tell what is wrong, in one line whatever was quoted."""
-    # to this stream, which replaces what the terminal lacks; `err=True` may open another
+def print_to_stderr(text: str) -> None:
+    """Print a message in one line, also if it quotes text with line breaks."""
+    # `sys.stderr` replaces characters that the terminal lacks; `err=True` may open another stream
     typer.echo(f"mapfusion: {plain(' '.join(text.split()))}", file=sys.stderr)
 
 
 DOCUMENT, JUNIT, REPORT = (".json",), (".xml",), (".html", ".htm")
-# Endings of files that commands write: a folder of such a name is a mistake.
+# Suffixes of files that commands write; a folder with such a name is a mistake.
 _OF_FILES = {*MAP_ENDINGS, *DOCUMENT, *JUNIT, *REPORT, ".yaml", ".ply", ".g2o", ".tum", ".bag"}
 _OF_RESULTS = {".ply", ".g2o", ".tum", ".rrd"}
 # Tables of a robot log, as Parquet or CSV.
 _OF_LOGS = {"frames", "observations", "truth_poses", "truth_points"}
 _OF_LOGS |= {"odometry_covariance", "attitude"}
-_COMPANIONS = (".joint", ".viewing", ".frames")  # ends of the stems of files beside a map
+_COMPANIONS = (".joint", ".viewing", ".frames")  # ends of the stems of files that belong to a map
 _RESULT = ("scenario.json", "world.json", "provenance.json", "tables", "keyframes")
 
 
 def require_file(
     option: str, path: Path | None, endings: Sequence[str], inputs: Iterable[Path | str | None] = ()
 ) -> None:
-    """Raise InputError unless a file can be written as one of these formats, apart from the inputs.
+    """Raise InputError unless a file can be written and is no input.
 
     Args:
-        option: that names the file, for messages.
-        path: of the file; None for none.
-        endings: that it may have.
-        inputs: files and folders that are read, and words that may be names of files.
+        option: name of the command's option, for messages.
+        path: the file; None passes.
+        endings: allowed suffixes.
+        inputs: files and folders that are read; words that are no paths are ignored.
     """
     if path is None:
         return
@@ -134,12 +134,12 @@ def require_file(
 
 
 def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: int = 1) -> None:
-    """Raise InputError unless so many maps, PATH, PATH.2 and so on, can be written.
+    """Raise InputError unless `n_maps` maps, PATH, PATH.2 and so on, can be written.
 
-    The files beside a Parquet map, of its joint covariance and viewing evidence, must not be those
-    of an input either.
+    The files of joint covariance and viewing evidence that belong to a Parquet map must not be
+    files of an input either.
     """
-    from experiments.evaluation.single_steps import numbered
+    from experiments.evaluation.single_steps import numbered_path
 
     require_file("--output", path, MAP_ENDINGS, inputs)
     companion = next((each for each in _COMPANIONS if path.stem.lower().endswith(each)), None)
@@ -150,7 +150,7 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     known = _paths(inputs)
     read = [*known, *(each for one in known for each in _beside(one) if each.is_file())]
     for k in range(1, n_maps + 1):
-        of_map = numbered(path, k)
+        of_map = numbered_path(path, k)
         for written in (of_map, *_beside(of_map)):
             for each in read:
                 if _is_same(written, each):
@@ -161,10 +161,9 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
 
 
 def require_folder(path: Path | None, inputs: Iterable[Path | str | None] = ()) -> None:
-    """Raise InputError unless a folder can be written, apart from the inputs.
+    """Raise InputError unless a folder can be written, is no input and contains no input folder.
 
-    It must be no input, and hold no folder that is one. Files in it that are inputs, as a scenario
-    beside which results are put, stay.
+    It may contain input files, such as the scenario whose results are written.
     """
     if path is None:
         return
@@ -183,9 +182,9 @@ def require_folder(path: Path | None, inputs: Iterable[Path | str | None] = ()) 
 
 
 def require_result_folder(path: Path | None) -> None:
-    """Raise InputError for a folder that holds something else than a result.
+    """Raise InputError for a folder with other files than a result.
 
-    A run removes outdated maps and images from its folder.
+    A run removes outdated maps and images from its folder, so other files would be at risk.
     """
     require_folder(path)
     if path is None or not path.is_dir():

@@ -30,8 +30,8 @@ def run(
 ) -> None:
     """Simulate, map, align, merge, evaluate and draw: `mapfusion run scenarios/quick.yaml`.
 
-    Finished stages are reused; an interrupted run goes on where it was. Exit code 1 if no robot's
-    map can be used.
+    Finished stages are reused, so an interrupted run continues. Exit code 1 if no robot's map can
+    be used.
     """
     from experiments.cli.options import require_result_folder
     from experiments.evaluation.checks import load_checked
@@ -42,7 +42,7 @@ def run(
     if output is not None and len(checked) > 1:
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
-    # What draws takes time to import: a scenario is refused before.
+    # The imports for drawing are slow: wrong scenarios are refused before.
     from experiments.evaluation.criteria import nothing_merged
     from experiments.evaluation.evaluated_run import finding_lines, has_usable_map
     from experiments.evaluation.result import add_times, run_scenario
@@ -60,11 +60,13 @@ def run(
         add_times(folder, start | {"figures": drawn.elapsed_s})
         run_screen.print_result(folder, drawn.skipped)
         for line in finding_lines(folder):
-            options.complain(f"warning: {line}")
+            options.print_to_stderr(f"warning: {line}")
         if nothing := nothing_merged(folder):
-            options.complain(f"warning: {nothing.text}")
+            options.print_to_stderr(f"warning: {nothing.text}")
         if not has_usable_map(folder):
-            options.complain(f"{folder}: no robot's map can be used: all are empty or contradicted")
+            options.print_to_stderr(
+                f"{folder}: no robot's map can be used: all are empty or contradicted"
+            )
             unusable = True
     if unusable:
         raise typer.Exit(options.EXIT_FAILED)
@@ -111,7 +113,7 @@ def export(
 ) -> None:
     """Write a result in other programs' formats: `mapfusion export results/quick-0 --format tum`.
 
-    What files, frames and keys mean, experiments/docs/export.md says.
+    For files, frames and keys see experiments/docs/export.md.
     """
     from experiments.cli.options import require_folder
     from experiments.reports.result_export import export_result
@@ -125,7 +127,7 @@ def export(
 def inspect_command(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A file or folder of mapfusion's.")],
 ) -> None:
-    """Tell what a file or folder of mapfusion's holds: `mapfusion inspect R1.parquet`."""
+    """Show the content of a file or folder of mapfusion: `mapfusion inspect R1.parquet`."""
     from experiments.reports.inspect import inspect
 
     inspect(path)
@@ -144,10 +146,10 @@ def check(
     output: options.DocumentFile = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Hold runs to their `expect` blocks, exit code 1 if one fails: `mapfusion check ci`.
+    """Check the metrics that scenarios expect, exit code 1 if one fails: `mapfusion check ci`.
 
-    A run that merges no two maps although some share ground fails, too.
-    Exit code 2 if a scenario cannot be read, and then none is run, or if it cannot be run.
+    A run that merges no two maps although some have common ground fails, too. Exit code 2 if a
+    scenario cannot be run. No scenario runs if one of them cannot be read.
     """
     from experiments.cli.options import DOCUMENT, JUNIT, require_file
     from experiments.evaluation.checks import CheckedScenario, check_all
@@ -171,7 +173,7 @@ def check(
         for checked in check_all(scenarios, parse_seeds(seeds), overrides, run_one):
             checks.append(checked)
             if checked.error:
-                options.complain(checked.error)
+                options.print_to_stderr(checked.error)
         if not as_json:
             run_screen.print_checks(checks)
         json_document.publish("check", json_document.of_checks(checks), as_json, output)

@@ -21,15 +21,15 @@ def record(
     results: options.Results = options.RESULTS,
     kind: options.Format = "log",
 ) -> None:
-    """Simulate only: one robot log (with its truth) per robot: `mapfusion record S -o logs`.
+    """Simulate, and write the log and truth of each robot: `mapfusion record S -o logs`.
 
-    With `--format` what the robots see, count and truly do, for other people's programs, see
+    `--format` writes images, odometry and truth for other programs, see
     experiments/docs/recordings.md.
     """
     from experiments.cli.options import require_folder
     from experiments.evaluation import single_steps as single
     from experiments.evaluation.checks import load_checked
-    from experiments.evaluation.dataset_export import write_drives
+    from experiments.evaluation.single_steps import write_drives
     from experiments.reports.terminal.layout import print_paths, progress
     from experiments.scenario.suite import one_scenario
 
@@ -74,10 +74,10 @@ def slam(
     if not as_json:
         layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
     for finding in made.findings:
-        if finding.kind != "gate":  # which makes the map unusable, see below
-            options.complain(f"warning: {log}: {finding.text}")
+        if finding.kind != "gate":  # this finding makes the map unusable, see below
+            options.print_to_stderr(f"warning: {log}: {finding.text}")
     if made.unusable:
-        options.complain(f"{log}: {made.unusable}")
+        options.print_to_stderr(f"{log}: {made.unusable}")
         raise typer.Exit(options.EXIT_FAILED)
 
 
@@ -141,7 +141,7 @@ def merge(
     if not paths:
         if not as_json:
             print_unmerged(merged, maps)
-        options.complain(f"no two maps were merged; {output} is not written")
+        options.print_to_stderr(f"no two maps were merged; {output} is not written")
         raise typer.Exit(options.EXIT_FAILED)
     if not as_json:
         for path, fused in zip(paths, merged.fusion.fused, strict=True):

@@ -29,15 +29,16 @@ def refusal(
         int, typer.Option(help="Pairs of maps of different seeds, of each kind.", min=1)
     ] = 200,
     every: Annotated[
-        int, typer.Option(help="Of each run's evaluated iterations, one of so many.", min=1)
+        int, typer.Option(help="Interval between the iterations of a run that are used.", min=1)
     ] = 1,
     seeds: options.Seeds = "0",
     jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
 ) -> None:
-    """Cross the maps of several worlds: are those without common ground refused, and only those?
+    """Measure false merges and refusals on maps with and without common ground.
 
-    For example, after a sweep of them: `mapfusion study refusal full --seeds 0..2 -o refusal`.
+    Maps of different worlds have no common ground. For example, after a sweep of these worlds:
+    `mapfusion study refusal full --seeds 0..2 -o refusal`.
     """
     import numpy as np
 
@@ -77,7 +78,7 @@ def sweep(
             "--set",
             metavar="KEY=VALUE,...",
             help="Values to try, e.g. slam.filter.n_particles=50,200; several give all "
-            "combinations. Commas inside brackets part nothing.",
+            "combinations. Commas inside brackets do not separate values.",
         ),
     ] = None,
     jobs: options.Jobs = options.ALL_CORES,
@@ -88,7 +89,7 @@ def sweep(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder; RESULTS/sweeps/NAME by default.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count what is to do.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count the work.")] = False,
     timings: Annotated[
         bool, typer.Option("--timings", help="At the end, time the aligners one after the other.")
     ] = False,
@@ -96,8 +97,8 @@ def sweep(
 ) -> None:
     """Run all combinations: `mapfusion sweep scenarios/quick.yaml --seeds 0..9 --set KEY=A,B`.
 
-    What is finished is kept, also in the middle of a run; the same command goes on from there, and
-    with more seeds or values adds to the same tables. Exit code 1 if a run failed.
+    Finished stages are kept, also of an interrupted run, and the same command continues. With more
+    seeds or values it adds to the same tables. Exit code 1 if a run failed.
     """
     from experiments.cli.options import require_folder
     from experiments.reports.terminal import layout, study_screen
@@ -125,7 +126,7 @@ def statistics(
     output: options.OutputFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Success, errors and consistency over many runs: `mapfusion statistics results/quick-*`."""
+    """Summarise success, errors and consistency of runs: `mapfusion statistics results/quick-*`."""
     from experiments.cli.options import require_folder
     from experiments.reports.study_files import run_statistics
 
@@ -135,9 +136,13 @@ def statistics(
 
 @app.command(rich_help_panel=options.LOOK)
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="FIRST", help="Result or sweep of the one.")],
-    second: Annotated[Path, typer.Argument(metavar="SECOND", help="And of the other version.")],
-    show_all: Annotated[bool, typer.Option("--all", help="Show also what did not change.")] = False,
+    first: Annotated[
+        Path, typer.Argument(metavar="FIRST", help="Result or sweep of the first version.")
+    ],
+    second: Annotated[
+        Path, typer.Argument(metavar="SECOND", help="Result or sweep of the second version.")
+    ],
+    show_all: Annotated[bool, typer.Option("--all", help="Show unchanged values, too.")] = False,
     output: options.OutputFolder = None,
     apart_from: Annotated[
         list[str] | None,
@@ -149,9 +154,10 @@ def compare(
         bool, typer.Option("--fail-if-worse", help="Exit code 1 if anything got worse.")
     ] = False,
 ) -> None:
-    """What got better or worse between two versions: `mapfusion compare old/quick-0 new/quick-0`.
+    """Compare the results of two versions: `mapfusion compare old/quick-0 new/quick-0`.
 
-    Runs are matched by scenario, seed and settings; a verdict means more than noise.
+    Runs are matched by scenario, seed and settings. Values are called better or worse only if the
+    difference exceeds the noise.
     """
     from experiments.cli.options import require_folder
     from experiments.reports.export import write_tables
@@ -174,7 +180,7 @@ def benchmark(
         list[str] | None,
         typer.Option("--method", metavar="NAME", help="Only this method; may be repeated."),
     ] = None,
-    trials: Annotated[int, typer.Option(help="Of each method in each cell.", min=1)] = 100,
+    trials: Annotated[int, typer.Option(help="Trials of each method in a cell.", min=1)] = 100,
     pairs: Annotated[
         list[int] | None, typer.Option(help="Numbers of pairs; may be repeated.", min=3)
     ] = None,
@@ -185,14 +191,14 @@ def benchmark(
     seed: options.Seed = None,
     scenario: options.SettingsOf = None,
     budget_s: Annotated[
-        float, typer.Option(help="A cell that took longer ends with the trials it has.", min=0)
+        float, typer.Option(help="Time limit of a cell; it keeps its finished trials.", min=0)
     ] = 600.0,
     output: options.OutputFolder = None,
     results: options.Results = options.RESULTS,
 ) -> None:
-    """Success, error and time of all methods on made-up maps: `mapfusion study benchmark`.
+    """Measure success, error and time of all methods on random maps: `mapfusion study benchmark`.
 
-    Serial, so that times can be compared; finished cells are reused.
+    Trials run one after the other, so that times can be compared. Finished cells are reused.
     """
     from experiments.cli.options import require_folder
     from experiments.pipeline.store import Store
@@ -226,7 +232,7 @@ def independence(
         str | None,
         typer.Option(
             metavar="N,...",
-            help="Sizes of teams, 3,5: the first so many robots of the scenario; all by default.",
+            help="Sizes of teams, e.g. 3,5: the first N robots of the scenario; all by default.",
         ),
     ] = None,
     overrides: options.Overrides,
@@ -234,10 +240,10 @@ def independence(
     jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
 ) -> None:
-    """Time, memory, bytes and errors of maps made alone and fused, and of one smoother of all logs.
+    """Compare independent mapping with fusion to a joint smoother of all logs.
 
-    For example: `mapfusion study independence paper --seeds 0..2`. What is measured is measured
-    serially; finished pieces are reused.
+    Measures time, memory, bytes and errors. For example: `mapfusion study independence paper
+    --seeds 0..2`. Measurements run one after the other. Finished measurements are reused.
     """
     from experiments.cli.options import require_folder
     from experiments.pipeline.store import Store
@@ -253,7 +259,7 @@ def independence(
     loaded = [load_scenario(path, overrides, seed) for seed in parse_seeds(seeds)]
     sizes = independence_trial.team_sizes(robots, loaded[0])
     folder = output or results / f"independence-{loaded[0].name}"
-    require_folder(folder)  # hours before it is written
+    require_folder(folder)  # before measurements that take hours
     with layout.progress() as show:
         store = Store.of(results)
         found = independence_trial.run_independence(loaded, sizes, store, jobs, show)
@@ -271,9 +277,9 @@ def calibrate(
     seed: options.Seed = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Correct odometry by what logs say of it: `mapfusion study calibrate raw/robot* -o logs`."""
+    """Calibrate and correct odometry of logs: `mapfusion study calibrate raw/robot* -o logs`."""
     from experiments.cli.options import require_folder
-    from experiments.evaluation.odometry_calibration import calibrated
+    from experiments.evaluation.odometry_calibration import calibrate_logs
     from experiments.reports import json_document
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of
@@ -281,7 +287,7 @@ def calibrate(
     require_folder(output, [*logs, scenario])
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
-        found = calibrated(logs, output, settings, show)
+        found = calibrate_logs(logs, output, settings, show)
     written = [] if output is None else [output / each.robot for each in found.robots]
     made = study_screen.document(found, written)
     json_document.publish("calibrate", made, as_json)

@@ -1,4 +1,4 @@
-"""Errors and times of alignments: rows of the tables `errors` and `aligner_timings`."""
+"""Errors and times of alignments: the tables `errors` and `aligner_timings`."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -38,32 +38,47 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.registration import Aligner
 from mapfusion.verification.verdict import Judge
 
-_MEETING = ["robot_a", "robot_b", "iteration"]
+_MAP_PAIR = ["robot_a", "robot_b", "iteration"]
 
 
 @dataclass(frozen=True)
 class EvaluatedRobot:
-    """What is known of one robot when its maps are judged; maps and true points by iteration."""
+    """Maps of one robot with the truth.
+
+    Attributes:
+        name: name of the robot.
+        maps: maps by iteration.
+        points_world_m: true points of the landmarks of each map, shape (N, 3).
+        path: true path.
+    """
 
     name: str
     maps: Mapping[int, LandmarkMap]
-    points_world_m: dict[int, Float]  # (N, 3) for each map
+    points_world_m: dict[int, Float]
     path: PathTruth
 
     def at(self, iteration: int) -> tuple[LandmarkMap, Float]:
-        """Map and true points at an iteration (the last ones of a log that ended earlier)."""
+        """Return map and true points at an iteration; the last ones if the log ended earlier."""
         return known_at(self.maps, iteration), known_at(self.points_world_m, iteration)
 
     def in_map_frame(self, points_world_m: Float) -> Float:
-        """Points (..., 3) of the world in the frame of this robot's maps."""
+        """Transform world points (..., 3) into the frame of this robot's maps."""
         return se2.transform_points(se2.inverse(self.path.T_world_map), points_world_m)
 
 
 @dataclass(frozen=True)
-class MetMaps:
-    """Maps of two robots at one iteration, what aligners were offered, and what they answered.
+class MapPair:
+    """Maps of two robots at one iteration, with correspondences and estimates.
 
-    With the rival motions that were found for them.
+    Attributes:
+        a: first robot.
+        b: second robot.
+        iteration: iteration of the maps.
+        maps: maps of a and b.
+        points_world_m: true points of their landmarks, shapes (N, 3) and (M, 3).
+        offered: correspondences that all aligners were given.
+        estimates: rows of the table `estimates`.
+        rivals: rows of the table `rivals`: other motions that align the maps as well.
     """
 
     a: EvaluatedRobot
@@ -72,61 +87,67 @@ class MetMaps:
     maps: tuple[LandmarkMap, LandmarkMap]
     points_world_m: tuple[Float, Float]
     offered: Correspondences
-    estimates: Sequence[Mapping[str, Any]]  # rows of the table of that name
+    estimates: Sequence[Mapping[str, Any]]
     rivals: pd.DataFrame
 
     @property
-    def names(self) -> dict[str, Any]:
-        """Columns that tell it from others."""
-        return dict(zip(_MEETING, (self.a.name, self.b.name, self.iteration), strict=True))
+    def keys(self) -> dict[str, Any]:
+        """Values of the columns that identify this pair of maps."""
+        return dict(zip(_MAP_PAIR, (self.a.name, self.b.name, self.iteration), strict=True))
 
     def is_true(self, radius_m: float) -> np.ndarray:
-        """Which of the correspondences are true."""
+        """Return, shape (N,), True for correspondences of the same world point."""
         pairs = self.offered
         return true_pairs(*self.points_world_m, pairs.index_a, pairs.index_b, radius_m)
 
     def aligned(self, aligner: str, a: int, b: int) -> AlignedPair:
-        """What maps are merged by: repetitions are for the spread of a method, not for the map.
+        """Return the alignment that a merge uses: the first repetition of an aligner.
 
-        The two are the `a`th and the `b`th of those that are merged.
+        Args:
+            aligner: name of the aligner.
+            a: index of the first map among the maps that are merged.
+            b: index of the second map.
         """
-        ours = (row for row in self.estimates if row["aligner"] == aligner)
-        row = next(row for row in ours if row["repetition"] == 0)
+        rows = (row for row in self.estimates if row["aligner"] == aligner)
+        row = next(row for row in rows if row["repetition"] == 0)
         alignment = alignment_of(row, len(self.offered))
         return AlignedPair(a, b, alignment, self.offered, row["log10_false_alarms"])
 
 
-def met_maps(
+def join_map_pairs(
     robots: Sequence[EvaluatedRobot],
     estimates: pd.DataFrame,
     correspondences: pd.DataFrame,
     rivals: pd.DataFrame,
-) -> list[MetMaps]:
-    """All pairs and iterations of the tables of these names, in their order."""
+) -> list[MapPair]:
+    """Return all pairs of maps of the tables `estimates`, `correspondences` and `rivals`.
+
+    The order is that of `estimates`.
+    """
     by_name = {robot.name: robot for robot in robots}
-    offered, rival = (dict(iter(rows.groupby(_MEETING))) for rows in (correspondences, rivals))
-    said: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
-    for row in records(estimates):  # a group of a frame takes as long as all of these
-        said.setdefault((row["robot_a"], row["robot_b"], row["iteration"]), []).append(row)
-    met = []
-    for key, rows in said.items():
+    offered, rival = (dict(iter(rows.groupby(_MAP_PAIR))) for rows in (correspondences, rivals))
+    estimated: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for row in records(estimates):  # much faster than `groupby` for many small groups
+        estimated.setdefault((row["robot_a"], row["robot_b"], row["iteration"]), []).append(row)
+    map_pairs = []
+    for key, rows in estimated.items():
         name_a, name_b, iteration = key
         a, b = by_name[name_a], by_name[name_b]
         (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
         pairs = correspondences_of(offered.get(key, correspondences.iloc[:0]))
         maps, points = (map_a, map_b), (points_a, points_b)
         others = rival.get(key, rivals.iloc[:0])
-        met.append(MetMaps(a, b, iteration, maps, points, pairs, rows, others))
-    return met
+        map_pairs.append(MapPair(a, b, iteration, maps, points, pairs, rows, others))
+    return map_pairs
 
 
 def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> Float:
-    """Squared Mahalanobis distances (...) of alignments to the truth; 3 degrees of freedom.
+    """Return the NEES (...) of alignments; chi-square with 3 degrees of freedom if consistent.
 
     Args:
-        T_estimate: (..., 3).
-        covariance: (..., 3, 3) of these; NaN, and so the distance, where there is none.
-        T_true: (3,).
+        T_estimate: estimated motions, shape (..., 3).
+        covariance: covariances of the estimates, shape (..., 3, 3). NaN gives NaN.
+        T_true: true motion, shape (3,).
     """
     error = T_estimate - T_true
     error[..., 2] = se2.wrap(error[..., 2])
@@ -136,16 +157,19 @@ def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> Float
     return nees
 
 
-def error_rows(met: MetMaps, judge: Judge, radius_m: float) -> pd.DataFrame:
-    """Rows of the table `errors` of one pair of maps, the oracle's first."""
-    is_true, pairs = met.is_true(radius_m), Pairs(*met.maps, met.offered)
+def error_rows(map_pair: MapPair, judge: Judge, radius_m: float) -> pd.DataFrame:
+    """Return the rows of the table `errors` of one pair of maps; the first is the oracle's.
+
+    The oracle is the aligner that is given the true correspondences.
+    """
+    is_true, pairs = map_pair.is_true(radius_m), Pairs(*map_pair.maps, map_pair.offered)
     oracle = Oracle(judge.refinement).align(pairs, is_true)
-    evidence = evidence_of(met.rivals, met.maps, judge.evidence)
-    row = met.names | {"aligner": ORACLE, "repetition": 0}
+    evidence = evidence_of(map_pair.rivals, map_pair.maps, judge.evidence)
+    row = map_pair.keys | {"aligner": ORACLE, "repetition": 0}
     row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).judge(oracle))
-    rows = [row, *met.estimates]
+    rows = [row, *map_pair.estimates]
     alignments = [alignment_of(each, len(pairs)) for each in rows]
-    T_true = se2.between(met.a.path.T_world_map, met.b.path.T_world_map)
+    T_true = se2.between(map_pair.a.path.T_world_map, map_pair.b.path.T_world_map)
     T_refined = np.array([alignment.T_a_b for alignment in alignments])
     inlier = np.array([alignment.inlier for alignment in alignments])
     covariance = np.array([alignment.covariance for alignment in alignments])
@@ -162,28 +186,31 @@ def error_rows(met: MetMaps, judge: Judge, radius_m: float) -> pd.DataFrame:
         "oracle_distance_m": oracle_m,
         "oracle_distance_rad": np.abs(oracle_rad),
         "n_true": is_true.sum(),
-        "n_common": common_landmarks(*met.points_world_m, radius_m),
+        "n_common": common_landmarks(*map_pair.points_world_m, radius_m),
         "n_inliers": n_inliers,
         "precision": n_hits / np.where(n_inliers, n_inliers, np.nan),
         "recall": n_hits / (is_true.sum() or np.nan),
         "alignment_nees": alignment_nees(T_refined, covariance, T_true),
     }
-    # all columns at once: pandas takes as long to add one as to make a frame
+    # one DataFrame of all columns: adding columns one by one is slow in pandas
     return pd.DataFrame({name: [each[name] for each in rows] for name in row} | errors)
 
 
-def _motion_errors(T: Float, T_right: Float) -> tuple[Float, Float]:
-    """How far off motions (N, 3) are, in m and, signed, in rad."""
-    error = T - T_right
+def _motion_errors(T: Float, T_true: Float) -> tuple[Float, Float]:
+    """Return translation errors in m and signed rotation errors in rad of motions (N, 3)."""
+    error = T - T_true
     return np.hypot(error[:, 0], error[:, 1]), se2.wrap(error[:, 2])
 
 
 def first_shared_iteration(robots: Sequence[EvaluatedRobot], radius_m: float) -> int | None:
-    """The first evaluated iteration at which the maps of any two have common ground; None if never.
+    """Return the first evaluated iteration at which any two maps have common ground.
 
     Args:
-        robots: all of a team.
-        radius_m: landmarks whose true points lie this near are one.
+        robots: robots of a team.
+        radius_m: distance of true points below which two landmarks are the same.
+
+    Returns:
+        The iteration; None if no two maps ever have common ground.
     """
     for k in sorted({k for robot in robots for k in robot.maps}):
         points = [robot.at(k)[1] for robot in robots]
@@ -194,63 +221,66 @@ def first_shared_iteration(robots: Sequence[EvaluatedRobot], radius_m: float) ->
 
 
 _PERCENTILES = {"elapsed_low_s": 10, "elapsed_s": 50, "elapsed_high_s": 90}
-_WARM_UP = "warm-up"  # names the generators of calls that are not timed
+_WARM_UP = "warm-up"  # name of the random generators of calls that are not timed
 
 
 @dataclass(frozen=True)
 class AlignerTiming:
-    """Aligners made ready to be timed on the maps of one pair of robots.
+    """Aligners ready for timing on the maps of one pair of robots.
 
     Attributes:
-        seed: of the scenario.
-        repeats: timings of each aligner on each maps.
-        aligners: by name; what they run is compiled and loaded.
-        maps: evenly spread over the run.
-        n_common: landmarks that truly correspond, of each of these; UNKNOWN without truth.
+        seed: seed of the scenario.
+        repeats: number of timings of each aligner on each pair of maps.
+        aligners: aligners by name; their kernels are compiled and their processes run.
+        maps: pairs of maps, evenly spread over the run.
+        n_common: number of common landmarks of each pair of maps; UNKNOWN without truth.
     """
 
     seed: int
     repeats: int
     aligners: Mapping[str, Aligner]
-    maps: Sequence[MetMaps]
+    maps: Sequence[MapPair]
     n_common: Sequence[int]
 
     @classmethod
-    def of(cls, scenario: AnyScenario, met: Sequence[MetMaps]) -> "AlignerTiming":
-        """Of the pair's maps at all iterations; other work may go on beside."""
+    def of(cls, scenario: AnyScenario, map_pairs: Sequence[MapPair]) -> "AlignerTiming":
+        """Choose pairs of maps of two robots and warm up all aligners.
+
+        Other processes may be busy meanwhile.
+        """
         settings = scenario.evaluate
-        spread = np.linspace(0, len(met) - 1, settings.timing_points)
-        maps = [met[k] for k in np.unique(spread.round().astype(int))]
+        spread = np.linspace(0, len(map_pairs) - 1, settings.timing_points)
+        maps = [map_pairs[k] for k in np.unique(spread.round().astype(int))]
         aligners = {
             entry.name: callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
             for entry in scenario.align.aligners
         }
-        n_common = [_n_common(each, settings.true_pair_radius_m) for each in maps]
+        n_common = []
+        for pair in maps:
+            points = pair.points_world_m
+            known = all(np.isfinite(own).any() for own in points)
+            radius_m = settings.true_pair_radius_m
+            n_common.append(common_landmarks(*points, radius_m) if known else tables.UNKNOWN)
         ready = cls(scenario.seed, settings.timing_repeats, aligners, maps, n_common)
-        for fewest_or_most in (maps[0], maps[-1]):  # of little, some turn to other code
+        for smallest_or_largest in (maps[0], maps[-1]):  # some aligners treat few pairs apart
             for name in aligners:
-                ready._call(name, fewest_or_most, _WARM_UP)
+                ready._call(name, smallest_or_largest, _WARM_UP)
         return ready
 
     def rows(self) -> list[dict[str, Any]]:
-        """Rows of the table `aligner_timings`; nothing else may be running."""
+        """Return the rows of the table `aligner_timings`; nothing else may run meanwhile."""
         rows, elapsed_s = [], []
         for maps, n_common in zip(self.maps, self.n_common, strict=True):
-            self._call(next(iter(self.aligners)), maps, _WARM_UP)  # the maps into the caches
-            of_all = {"n_correspondences": len(maps.offered), "n_common": n_common}
+            self._call(next(iter(self.aligners)), maps, _WARM_UP)  # load the maps into CPU caches
+            counts = {"n_correspondences": len(maps.offered), "n_common": n_common}
             for name in self.aligners:
-                rows.append(maps.names | of_all | {"aligner": name})
+                rows.append(maps.keys | counts | {"aligner": name})
                 elapsed_s.append([self._call(name, maps, k) for k in range(self.repeats)])
         times = np.percentile(elapsed_s, list(_PERCENTILES.values()), axis=1).T
         named = (dict(zip(_PERCENTILES, each, strict=True)) for each in times.tolist())
         return [row | each for row, each in zip(rows, named, strict=True)]
 
-    def _call(self, name: str, maps: MetMaps, repeat: int | str) -> float:
-        """Seconds that an aligner takes."""
+    def _call(self, name: str, maps: MapPair, repeat: int | str) -> float:
+        """Call an aligner and return its time in s."""
         rng = generator(self.seed, "timing", name, repeat)
         return self.aligners[name].align(*maps.maps, maps.offered, rng).elapsed_s
-
-
-def _n_common(maps: MetMaps, radius_m: float) -> int:
-    known = all(np.isfinite(points).any() for points in maps.points_world_m)
-    return common_landmarks(*maps.points_world_m, radius_m) if known else tables.UNKNOWN

@@ -1,4 +1,4 @@
-"""Ground-truth checks: `expect` blocks of scenarios held against runs over several seeds."""
+"""Checks of the metrics that scenarios expect, over runs with several seeds."""
 
 import math
 import time
@@ -25,21 +25,30 @@ def load_checked(
     seed: int | None = None,
     content: dict[str, Any] | None = None,
 ) -> AnyScenario:
-    """A scenario as `load_scenario` gives it.
+    """Load a scenario whose expected metrics can be computed; arguments as of `load_scenario`.
 
-    Raises InputError also where the truth is unknown that an expected metric needs.
+    Raises:
+        InputError: the scenario is wrong, or an expected metric needs a truth that is unknown.
     """
     scenario = load_scenario(path, overrides, seed, content)
-    judged = [name for name in scenario.expect if name not in metrics.WITHOUT_TRUTH]
-    if judged and (reason := why_no_truth(scenario)):
-        name = judged[0]
+    needing_truth = [name for name in scenario.expect if name not in metrics.WITHOUT_TRUTH]
+    if needing_truth and (reason := why_no_truth(scenario)):
+        name = needing_truth[0]
         raise InputError(f"{path}: expect.{name}: {reason}; leave `expect` out, or add the file")
     return scenario
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One expectation, measured."""
+    """Value of an expected metric.
+
+    Attributes:
+        scenario: name of the scenario.
+        metric: name of the metric.
+        value: value over all seeds.
+        bound: range of the expectation.
+        per_seed: values by seed.
+    """
 
     scenario: str
     metric: str
@@ -49,31 +58,31 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        """Whether the value was measured and lies within the bound."""
+        """True if the value is finite and within the bound."""
         low = -math.inf if self.bound.min is None else self.bound.min
         high = math.inf if self.bound.max is None else self.bound.max
         return math.isfinite(self.value) and low <= self.value <= high
 
     @property
     def bound_text(self) -> str:
-        """The bound as a person writes it."""
+        """Bound as an inequality of x."""
         low = "" if self.bound.min is None else f"{self.bound.min:g} <= "
         high = "" if self.bound.max is None else f" <= {self.bound.max:g}"
         return f"{low}x{high}"
 
 
 def check(scenario: AnyScenario, results: Mapping[int, Path]) -> list[Outcome]:
-    """Measure every expectation of a scenario over its results by seed."""
-    own: dict[int, dict[str, pd.DataFrame]] = {seed: {} for seed in results}
+    """Compute the expected metrics of a scenario from its result folders by seed."""
+    by_seed: dict[int, dict[str, pd.DataFrame]] = {seed: {} for seed in results}
     for seed, result in results.items():
         for name in metrics.USED_TABLES:
             rows = tables.read(tables.table_path(result, name), name)
-            own[seed][name] = rows.assign(seed=seed)
-    parts = {name: [held[name] for held in own.values()] for name in metrics.USED_TABLES}
+            by_seed[seed][name] = rows.assign(seed=seed)
+    parts = {name: [own[name] for own in by_seed.values()] for name in metrics.USED_TABLES}
     pooled = {name: pd.concat(each, ignore_index=True) for name, each in parts.items()}
     outcomes = []
     for name, bound in scenario.expect.items():
-        per_seed = {seed: metrics.compute(name, held) for seed, held in own.items()}
+        per_seed = {seed: metrics.compute(name, own) for seed, own in by_seed.items()}
         value = metrics.compute(name, pooled)
         outcomes.append(Outcome(scenario.name, name, value, bound, per_seed))
     return outcomes
@@ -81,11 +90,16 @@ def check(scenario: AnyScenario, results: Mapping[int, Path]) -> list[Outcome]:
 
 @dataclass(frozen=True)
 class CheckedScenario:
-    """A scenario's outcomes, or the error that kept it from having any.
+    """Outcomes of a scenario, or an error.
 
-    `elapsed_s` are seconds on the clock by seed, of all that were begun: an error is of the last.
-    Without any of the three it was not begun, since another scenario cannot be read. `unmerged` are
-    the seeds whose maps were not merged though they should have been.
+    A scenario without outcomes, error and times was not run, because another one cannot be read.
+
+    Attributes:
+        scenario: name of the scenario.
+        outcomes: values of the expected metrics.
+        error: message if the scenario cannot be read or run; the error belongs to the last seed.
+        elapsed_s: wall-clock time by seed, of all runs that were started.
+        unmerged: seeds whose maps should have been merged but were not.
     """
 
     scenario: str
@@ -96,7 +110,7 @@ class CheckedScenario:
 
     @property
     def passed(self) -> bool:
-        """Whether it ran, all that it expects holds, and what can be merged was."""
+        """True if all runs finished, all bounds hold and maps were merged where possible."""
         ran = bool(self.elapsed_s) and not self.error
         return ran and not self.unmerged and all(outcome.passed for outcome in self.outcomes)
 
@@ -107,42 +121,43 @@ def check_all(
     overrides: Sequence[str],
     run: Callable[[AnyScenario], Path],
 ) -> Iterator[CheckedScenario]:
-    """Check scenarios asked for by file, name or tag; `run` gives the result folder of one.
+    """Run and check scenarios.
 
-    Where one cannot be read none is run. What else goes wrong ends its own scenario alone; if it
-    is no `InputError`, it is raised again once it is told.
+    No scenario runs if one of them cannot be read. A failed run ends its own scenario. Errors
+    other than `InputError` are raised again after the result of the scenario was yielded.
+
+    Args:
+        words: files, names or tags of scenarios.
+        seeds: seeds of the runs of each scenario.
+        overrides: entries `key.sub=value` that replace values of the scenarios.
+        run: runs a scenario and returns its result folder.
     """
-    read = [each for word in words for each in _read(word, seeds, overrides)]
-    if any(isinstance(each, CheckedScenario) for each in read):
-        for each in read:
-            untold = isinstance(each, CheckedScenario)
-            yield each if untold else CheckedScenario(each[0].name)
-        return
-    for runs in read:
-        assert not isinstance(runs, CheckedScenario)
-        yield from _checked(runs, run)
-
-
-def _read(
-    word: str, seeds: Sequence[int], overrides: Sequence[str]
-) -> Iterator[CheckedScenario | list[AnyScenario]]:
-    """For each scenario that a word stands for its runs by seed, or why it cannot be read."""
-    try:
-        paths = scenarios_of([word])
-    except InputError as error:
-        yield CheckedScenario(word, error=str(error))
-        return
-    for path in paths:
+    loaded: list[CheckedScenario | list[AnyScenario]] = []
+    for word in words:
         try:
-            yield [load_checked(path, overrides, seed) for seed in seeds]
+            paths = scenarios_of([word])
         except InputError as error:
-            yield CheckedScenario(path.stem, error=str(error))
+            loaded.append(CheckedScenario(word, error=str(error)))
+            continue
+        for path in paths:
+            try:
+                loaded.append([load_checked(path, overrides, seed) for seed in seeds])
+            except InputError as error:
+                loaded.append(CheckedScenario(path.stem, error=str(error)))
+    unreadable = any(isinstance(each, CheckedScenario) for each in loaded)
+    for each in loaded:
+        if isinstance(each, CheckedScenario):
+            yield each
+        elif unreadable:
+            yield CheckedScenario(each[0].name)
+        else:
+            yield from _run_and_check(each, run)
 
 
-def _checked(
+def _run_and_check(
     runs: Sequence[AnyScenario], run: Callable[[AnyScenario], Path]
 ) -> Iterator[CheckedScenario]:
-    """One scenario over its seeds."""
+    """Yield the outcomes of one scenario, given for each of its seeds."""
     name, folders, elapsed_s = runs[0].name, dict[int, Path](), dict[int, float]()
     try:
         for scenario in runs:
@@ -151,7 +166,12 @@ def _checked(
                 folders[scenario.seed] = run(scenario)
             finally:
                 elapsed_s[scenario.seed] = time.perf_counter() - started_s
-        outcomes, unmerged = check(runs[0], folders), _unmerged(runs[0], folders)
+        outcomes, unmerged = check(runs[0], folders), dict[int, NothingMerged]()
+        if MERGED_ROBOTS not in runs[0].expect:  # else the scenario itself bounds this number
+            for seed, folder in folders.items():
+                nothing = nothing_merged(folder)
+                if nothing is not None and nothing.failed:
+                    unmerged[seed] = nothing
     except InputError as error:
         yield CheckedScenario(name, error=str(error), elapsed_s=elapsed_s)
     except Exception as error:
@@ -159,14 +179,3 @@ def _checked(
         raise
     else:
         yield CheckedScenario(name, outcomes, elapsed_s=elapsed_s, unmerged=unmerged)
-
-
-def _unmerged(scenario: AnyScenario, folders: Mapping[int, Path]) -> dict[int, NothingMerged]:
-    """Of the runs by seed those that fail by having merged nothing.
-
-    A scenario that bounds the number of merged robots has said itself what is to come out.
-    """
-    if MERGED_ROBOTS in scenario.expect:
-        return {}
-    found = {seed: nothing_merged(folder) for seed, folder in folders.items()}
-    return {seed: each for seed, each in found.items() if each is not None and each.failed}

@@ -1,8 +1,11 @@
-"""Criteria of the evaluation: correct alignment, shared ground, false merge, missed merge.
+"""Criteria of correct alignments, and summaries of alignments by pair of maps and method.
 
-Metrics, statistics, comparisons, figures and reports all ask here. Their denominators are these:
-shares (right, accepted) are of maps with common ground, median errors are over answerable maps, and
-ratios to the oracle over rich ones.
+Metrics, statistics, comparisons, figures and reports use these criteria. Shares (right, accepted)
+count pairs of maps with common ground. Median errors use answerable pairs, and ratios to the oracle
+use rich pairs.
+
+Statistics start from the summary of each run: a pair of maps counts once, however often a method
+was repeated on it. The summary is also much smaller than the table `errors`.
 """
 
 import math
@@ -10,26 +13,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from experiments.evaluation import tables
+from experiments.evaluation.tables import SHOWN
 
-ORACLE = "oracle"  # the aligner that is given the true pairs
-# An alignment is right within the reach of the refinement, by its default gate: from there the
-# least squares that follows every method finds the true pairs; what is farther off it cannot mend,
-# and a merge would double every wall of a room. The drift of two maps is several times less (0.05
-# to 0.2 m, 0.01 rad). The limits are the same whatever gate a scenario sets, since no setting of a
-# method may decide how the method is judged.
+ORACLE = "oracle"  # the aligner that is given the true correspondences
+# An alignment is right if the refinement can correct it: the limit is the default gate of the
+# refinement. From a smaller error the least squares of the refinement finds the true pairs. A
+# larger error remains, and the fused map has every wall twice. The drift of maps is much smaller.
+# The limits do not depend on the scenario: a setting of a method must not change its evaluation.
 RIGHT_WITHIN_M = 0.5
-# A rotation moves a landmark in proportion to its distance: by as much at 5 m, half the width of
-# the ground that indoor maps share.
+# Rotation that moves a landmark by the same distance at 5 m, half the width of the common ground of
+# indoor maps.
 RIGHT_WITHIN_RAD = RIGHT_WITHIN_M / 5.0
-# Landmarks of both maps that are one point of the world: two determine a motion, a third confirms
-# it. With fewer there is nothing to be right about, and to refuse is right.
+# Landmarks of both maps that are the same point of the world. Two determine a motion, a third
+# confirms it. With fewer no alignment is right, and a refusal is correct.
 COMMON_LANDMARKS = 3
-# True pairs among the correspondences that were offered. With fewer than 3 not even the oracle has
-# much to go by; with 20 a robust method finds the motion, and refusing it is a miss; with fewer
-# than 30 chance dominates a method's error and the oracle's alike, and so their ratio.
+# True pairs among the correspondences. With fewer than 3 the oracle has no answer either. With 20 a
+# robust method finds the motion, and a refusal is a missed merge. With fewer than 30 chance
+# dominates the errors of the method and of the oracle, and therefore their ratio.
 ANSWERABLE_PAIRS = 3
 MERGEABLE_PAIRS = 20
 RICH_PAIRS = 30
@@ -37,88 +41,86 @@ _ROBOT_PAIR = ("run_id", "seed", "robot_a", "robot_b")
 
 
 def is_right(translation_m: pd.Series, rotation_rad: pd.Series) -> pd.Series:
-    """Whether errors count as right; a missing estimate never does."""
+    """Return True for errors within the limits; False for missing estimates."""
     return (translation_m <= RIGHT_WITHIN_M) & (rotation_rad.abs() <= RIGHT_WITHIN_RAD)
 
 
 def right_as_estimated(rows: pd.DataFrame) -> pd.Series:
-    """Bool per row of `errors`: the method's own estimate is right."""
+    """Return True for rows of `errors` whose estimate is right before refinement."""
     return is_right(rows["translation_error_m"], rows["rotation_error_rad"])
 
 
 def right_refined(rows: pd.DataFrame) -> pd.Series:
-    """Bool per row of `errors`: what the least squares made of the estimate is right."""
+    """Return True for rows of `errors` whose refined estimate is right."""
     return is_right(rows["refined_translation_error_m"], rows["refined_rotation_error_rad"])
 
 
-def how_far_off(rows: pd.DataFrame, columns: Sequence[str]) -> dict[str, pd.Series]:
-    """Columns of errors, without their sign; what has no estimate is infinitely far off.
+def absolute_errors(rows: pd.DataFrame, columns: Sequence[str]) -> dict[str, pd.Series]:
+    """Return absolute values of error columns; infinite for missing estimates.
 
-    Whatever sums up errors starts here: over the estimates that happen to exist a median flatters
-    the methods that fail.
+    A median over existing estimates alone would favour methods that often fail.
     """
     return {name: rows[name].abs().fillna(math.inf) for name in columns}
 
 
 def has_common_ground(rows: pd.DataFrame) -> pd.Series:
-    """Bool per row: whether the two maps share enough landmarks for an alignment to be right."""
+    """Return True for rows whose maps share enough landmarks for a right alignment."""
     return rows["n_common"] >= COMMON_LANDMARKS
 
 
 def is_false_merge(rows: pd.DataFrame) -> pd.Series:
-    """Bool per row of `errors`: accepted though refined it is wrong, or without common ground."""
+    """Return True for accepted alignments that are wrong or lack common ground."""
     return (rows["accepted"] == 1) & ~(right_refined(rows) & has_common_ground(rows))
 
 
 def answerable(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with enough true pairs for an answer."""
+    """Return the rows with enough true pairs for an estimate."""
     return rows[rows["n_true"] >= ANSWERABLE_PAIRS]
 
 
 def mergeable(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with so many true pairs that a refusal is a miss."""
+    """Return the rows with so many true pairs that a refusal is a missed merge."""
     return rows[rows["n_true"] >= MERGEABLE_PAIRS]
 
 
 def rich(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows with so many true pairs that errors can be held against the oracle's."""
+    """Return the rows with enough true pairs for a ratio to the oracle's error."""
     return rows[rows["n_true"] >= RICH_PAIRS]
 
 
 def at_the_end(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows at the last iteration of each robot pair of each run."""
+    """Return the rows at the last iteration of each robot pair of each run."""
     return rows[rows["iteration"] == _of_robot_pair(rows, "iteration")]
 
 
-def that_ever_meet(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows of robot pairs that come to share ground in their run.
+def with_common_ground_at_any_time(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of robot pairs that have common ground at any iteration of their run.
 
-    Where several scenarios are pooled: errors of pairs that never meet are far off for everyone,
-    and would cover what the others have to say.
+    For pools of several scenarios: large errors of pairs without common ground would hide the
+    differences between methods.
     """
     return rows[_of_robot_pair(rows, "n_common") >= COMMON_LANDMARKS]
 
 
 def _of_robot_pair(rows: pd.DataFrame, column: str) -> pd.Series:
-    """The largest value that each row's robot pair has in its run."""
+    """Return for each row the largest value of its robot pair in its run."""
     keys = [name for name in _ROBOT_PAIR if name in rows]
     return rows.groupby(keys)[column].transform("max")
 
 
 @dataclass(frozen=True)
 class NothingMerged:
-    """No two maps of a run became one.
+    """Run in which no two maps were merged.
 
     Attributes:
-        common_ground: whether any two of the last maps share enough landmarks for an alignment to
-            be right; None where no truth is known.
+        common_ground: True if any two of the last maps have common ground; None without truth.
     """
 
     common_ground: bool | None
 
     @property
     def text(self) -> str:
-        """The same in one line."""
+        """Message for the user."""
         if self.common_ground is None:
             return "no two maps were merged (no truth: whether they share ground is unknown)"
         share = "though some share ground" if self.common_ground else "and none share ground"
@@ -126,18 +128,18 @@ class NothingMerged:
 
     @property
     def failed(self) -> bool:
-        """Whether a check fails by it: only the truth can say that there was nothing to merge."""
+        """True if this fails a check: with common ground, and without truth."""
         return self.common_ground is not False
 
 
 def merged_robots(tx_m: pd.Series) -> int:
-    """How many of a run's maps became one, by its `fused_motions`; 0 where none were."""
+    """Return the number of merged maps from column `tx_m` of `fused_motions`; 0 if none were."""
     n_placed = int(tx_m.notna().sum())
-    return n_placed if n_placed > 1 else 0  # one is the first map alone
+    return n_placed if n_placed > 1 else 0  # a single map is not merged
 
 
 def nothing_merged(result: Path) -> NothingMerged | None:
-    """What a result folder says; None where maps were merged, or there is only one robot."""
+    """Return the failure to merge of a result; None if maps were merged, or for one robot."""
     motions = tables.read(tables.table_path(result, "fused_motions"), "fused_motions")
     if motions.empty or merged_robots(motions["tx_m"]):
         return None
@@ -145,3 +147,80 @@ def nothing_merged(result: Path) -> NothingMerged | None:
     if errors.empty:
         return NothingMerged(None)
     return NothingMerged(bool(has_common_ground(at_the_end(errors)).any()))
+
+
+RUN_KEYS = ("run_id", "scenario", "seed")
+MAP_KEYS = ("robot_a", "robot_b", "iteration")
+MAP_PAIR = ["run_id", *MAP_KEYS]  # keys of two maps that all aligners were given
+_ERRORS = ("translation_error_m", "rotation_error_rad")
+ERROR_COLUMNS = (*_ERRORS, *(f"refined_{name}" for name in _ERRORS))
+COUNTS = ("n_correspondences", "n_true", "n_common")
+NEEDED = (*MAP_KEYS, "aligner", "repetition", *ERROR_COLUMNS, *COUNTS)
+_COMPUTED = ("estimated_share", "refined_share")
+# Columns that tables of earlier versions may lack.
+OPTIONAL = tuple(name for name in SHOWN if name not in (*NEEDED, *_COMPUTED))
+
+
+def summarise_alignments(errors: pd.DataFrame) -> pd.DataFrame:
+    """Summarise rows of the table `errors` of one or more runs over the repetitions.
+
+    Returns:
+        One row per run, pair of maps and aligner. Columns:
+
+        - the columns of the run, robot_a, robot_b, iteration, aligner, n_repetitions;
+        - shares of the repetitions: estimated_success and refined_success (NaN without common
+          ground), estimated_share and refined_share (an estimate exists), accepted, false_accepted
+          (see `is_false_merge`) and refused_apart (refused without common ground, else NaN). The
+          last three are NaN for runs without an acceptance test;
+        - median absolute errors, infinite if most repetitions gave no estimate;
+        - further columns that screens show;
+        - n_correspondences, n_true, n_common and outlier_share.
+    """
+    ground = has_common_ground(errors)
+    accepted = errors.get("accepted", pd.Series(np.nan, errors.index)).astype(float)
+    false = is_false_merge(errors.assign(accepted=accepted))
+    shares = {
+        "estimated_success": right_as_estimated(errors).astype(float).where(ground),
+        "refined_success": right_refined(errors).astype(float).where(ground),
+        "estimated_share": errors["translation_error_m"].notna().astype(float),
+        "refined_share": errors["refined_translation_error_m"].notna().astype(float),
+        "accepted": accepted,
+        "false_accepted": false.astype(float).where(accepted.notna()),
+        "refused_apart": (1.0 - accepted).where(~ground),
+    }
+    of_errors = [name for name in SHOWN if name in errors and SHOWN[name].kind == "error"]
+    of_errors = list(dict.fromkeys([*ERROR_COLUMNS, *of_errors]))
+    evaluated = errors.assign(**shares, **absolute_errors(errors, of_errors))
+    further = [name for name in SHOWN if name in errors and name not in (*shares, *of_errors)]
+    keys = [name for name in RUN_KEYS if name in errors]
+    keys += [*setting_columns(errors), *MAP_KEYS, "aligner"]
+    groups = evaluated.groupby(keys, sort=False, dropna=False)
+    parts = [groups.size().rename("n_repetitions"), groups[[*shares, *further]].mean()]
+    parts += [groups[of_errors].median(), groups[list(COUNTS)].first()]
+    maps = pd.concat(parts, axis=1).reset_index()
+    n_offered = maps["n_correspondences"]
+    false_share = 1 - maps["n_true"] / n_offered.where(n_offered > 0)
+    return maps.assign(outlier_share=false_share.fillna(1.0))
+
+
+def error_over_oracle(maps: pd.DataFrame, column: str) -> pd.Series:
+    """Return by aligner the median of a translation error over the oracle's refined median.
+
+    Args:
+        maps: rows of `summarise_alignments`; should be rich.
+        column: name of the translation error.
+    """
+    of_oracle = maps.loc[maps["aligner"] == ORACLE, "refined_translation_error_m"].median()
+    medians = maps.groupby("aligner", sort=False)[column].median()
+    return medians / (of_oracle if of_oracle > 0 else np.nan)
+
+
+def setting_columns(frame: pd.DataFrame) -> list[str]:
+    """Return the columns of settings that a sweep varied; their names contain a dot."""
+    return [name for name in frame.columns if "." in name]
+
+
+def methods_in(maps: pd.DataFrame, oracle: bool = False) -> list[str]:
+    """Return the aligners in order of appearance; the oracle, if wanted, last."""
+    found = maps["aligner"].drop_duplicates().tolist()
+    return [name for name in found if name != ORACLE] + [ORACLE] * (oracle and ORACLE in found)

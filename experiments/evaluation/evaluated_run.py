@@ -1,4 +1,4 @@
-"""Run with its evaluation: all stages of a scenario, the store, and findings about its logs."""
+"""Run of a scenario with its evaluation, and findings about its logs."""
 
 import time
 from collections import defaultdict
@@ -13,10 +13,15 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import pair_evaluation, tables
-from experiments.evaluation.alignment_errors import AlignerTiming, EvaluatedRobot, MetMaps, met_maps
+from experiments.evaluation.alignment_errors import (
+    AlignerTiming,
+    EvaluatedRobot,
+    MapPair,
+    join_map_pairs,
+)
 from experiments.evaluation.fused_landmarks import FusedTeam, MergeSettings
-from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
-from experiments.evaluation.pair_evaluation import ALIGNED, JudgeSettings
+from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
+from experiments.evaluation.pair_evaluation import ALIGNED, EvaluationSettings
 from experiments.evaluation.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.evaluation.truth import why_no_truth
 from experiments.pipeline.memory import require_memory
@@ -39,72 +44,85 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log, read_true_poses
 
-TABLES_PART = "tables"  # of a run outside its stages
-_JUDGED = {"errors", "fusion"}  # the other tables of pairs come from the aligners
+TABLES_PART = "tables"  # part of a run outside its stages, in the table `timings`
+_EVALUATION_TABLES = {"errors", "fusion"}  # the stage `align` writes the other tables of pairs
 
 
 @dataclass(frozen=True)
-class JudgedRun:
-    """A scenario's stages in a store: those up to the estimates, and a judgement of each pair."""
+class EvaluatedRun:
+    """Stages of a scenario and of its evaluation, and their store.
+
+    Attributes:
+        pipeline: stages up to the estimates and fused maps.
+        settings: settings of the evaluation.
+        evaluations: stages that compare each pair's estimates with the truth, in the order of the
+            pipeline's pairs; none without truth.
+        store: store of the stages.
+        no_truth: reason why nothing can be evaluated; empty if the truth is known.
+    """
 
     pipeline: Pipeline
-    settings: JudgeSettings
-    judgements: tuple[Stage, ...]  # in the order of the pipeline's pairs; none without truth
+    settings: EvaluationSettings
+    evaluations: tuple[Stage, ...]
     store: Store
-    no_truth: str  # why nothing can be judged; empty where the truth is known
+    no_truth: str
 
     @classmethod
-    def of(cls, scenario: AnyScenario, store: Store) -> "JudgedRun":
-        """Lay out a scenario; nothing is computed."""
-        pipeline, chosen = lay_out(scenario), scenario.merge
-        merge = MergeSettings(chosen.aligner, chosen.parameters)
-        align, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
-        settings = JudgeSettings(align.judge, merge, radius_m)
+    def of(cls, scenario: AnyScenario, store: Store) -> "EvaluatedRun":
+        """Lay out the stages of a scenario, without any computation."""
+        pipeline = lay_out(scenario)
+        merge = MergeSettings(scenario.merge.aligner, scenario.merge.parameters)
+        radius_m = scenario.evaluate.true_pair_radius_m
+        settings = EvaluationSettings(scenario.align.judge, merge, radius_m)
         no_truth = why_no_truth(scenario)
-        judged = () if no_truth else pipeline.pairs
-        judgements = tuple(_judgement(settings, pair) for pair in judged)
-        return cls(pipeline, settings, judgements, store, no_truth)
+        evaluations, label, writes = [], "compare with the truth", pair_evaluation.WRITES
+        for pair in () if no_truth else pipeline.pairs:
+            before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
+            before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
+            stage = Stage("judge", label, settings, pair_evaluation.run, writes, before)
+            evaluations.append(stage)
+        return cls(pipeline, settings, tuple(evaluations), store, no_truth)
 
     @property
     def scenario(self) -> AnyScenario:
-        """What is run."""
+        """The scenario of the run."""
         return self.pipeline.scenario
 
     def stages(self) -> list[Stage]:
-        """All stages, each after those before it."""
-        return [*self.pipeline.stages(), *self.judgements]
+        """Return all stages, each after the stages that it needs."""
+        return [*self.pipeline.stages(), *self.evaluations]
 
     def folders(self) -> list[StageFolder]:
-        """Where all stages are kept."""
+        """Return the folders of all stages."""
         return [self.store.folder(stage) for stage in self.stages()]
 
     @cached_property
     def tasks(self) -> dict[str, Task]:
-        """All tasks by name, each after those it needs."""
+        """All tasks by name, each after the tasks that it needs."""
         return tasks_of(self.stages(), self.store)
 
     def robot_folders(self, robot: RobotStages) -> RobotFolders:
-        """Where a robot's log and maps are."""
+        """Return the folders of a robot's log and maps."""
         return RobotFolders(self.store.path(robot.log), self.store.path(robot.slam))
 
     @cached_property
     def logs(self) -> dict[str, RobotLog]:
-        """All robots' logs by name."""
+        """Logs of all robots by name."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
         return {name: read_log(each.log) for name, each in folders.items()}
 
     def load_robots(self) -> list[EvaluatedRobot]:
-        """All robots' maps joined with the truth, without viewing evidence: no table reads it."""
+        """Load the maps of all robots with the truth, without the viewing evidence."""
         folders = map(self.robot_folders, self.pipeline.robots)
         return [pair_evaluation.load_robot(each, viewing=False) for each in folders]
 
     def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
-        """All robots' maps at an iteration as they were stored, by name."""
+        """Return the stored maps of all robots at an iteration, by robot."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
         return {name: known_at(stored_maps(each), iteration) for name, each in folders.items()}
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
-        """What the smoother made of all robots' logs, joined with the truth."""
+        """Load the smoothed maps and paths of all robots with the truth."""
         return [
             load_smoothed(
                 robot,
@@ -117,31 +135,26 @@ class JudgedRun:
 
     def load_fusions(
         self, robots: Sequence[EvaluatedRobot], smoothed: Sequence[SmoothedRobot]
-    ) -> list[JudgedFusion]:
-        """All fusers' maps at all iterations that maps are fused at, joined with the truth."""
-        names, found = [robot.name for robot in robots], []
+    ) -> list[EvaluatedFusion]:
+        """Load the fused maps of all fusers and iterations with the truth."""
+        names, fusions = [robot.name for robot in robots], []
         for fuser, stage in self.pipeline.fusers.items():
-            folder, takes = self.store.path(stage), make_fuser(fuser).smoothed
-            beside = smoothed if takes else [None] * len(robots)
+            folder, takes_smoothed = self.store.path(stage), make_fuser(fuser).smoothed
+            smoothed_or_none = smoothed if takes_smoothed else [None] * len(robots)
             for k, fusion in read_fusions(folder, names).items():
-                given = [GivenMap.at(*both, k) for both in zip(robots, beside, strict=True)]
-                found.append(JudgedFusion(fuser, k, fusion, given))
-        return found
-
-    def load_team(self) -> FusedTeam:
-        """All robots' last maps, merged by the paper's fuser."""
-        robots = self.load_robots()
-        met = met_maps(robots, *map(self.pair_table, ALIGNED))
-        return FusedTeam.of(robots, met, self.settings.merge)
+                pairs = zip(robots, smoothed_or_none, strict=True)
+                given = [GivenMap.at(robot, own, k) for robot, own in pairs]
+                fusions.append(EvaluatedFusion(fuser, k, fusion, given))
+        return fusions
 
     @cached_property
     def outside_s(self) -> defaultdict[str, float]:
-        """Seconds of work outside the stages so far, by the part of the run."""
+        """Time in s outside the stages so far, by part of the run."""
         return defaultdict(float)
 
     @contextmanager
     def timed(self, part: str) -> Iterator[None]:
-        """Count the seconds of a `with` block to a part of the run outside its stages."""
+        """Add the time of a `with` block to a part of the run outside its stages."""
         started_s = time.perf_counter()
         try:
             yield
@@ -150,108 +163,117 @@ class JudgedRun:
 
     @cached_property
     def team(self) -> FusedTeam:
-        """What `load_team` gives; it stays in memory."""
-        return self.load_team()
+        """Last maps of all robots, merged by the paper's fuser."""
+        robots = self.load_robots()
+        map_pairs = join_map_pairs(robots, *map(self.pair_table, ALIGNED))
+        return FusedTeam.of(robots, map_pairs, self.settings.merge)
 
     @cached_property
     def timings(self) -> dict[tuple[str, str], AlignerTiming]:
-        """The aligners made ready to be timed, by the names of a pair's robots."""
-        met: dict[tuple[str, str], list[MetMaps]] = {}
-        for each in self.team.met:
-            met.setdefault((each.a.name, each.b.name), []).append(each)
-        return {pair: AlignerTiming.of(self.scenario, maps) for pair, maps in met.items()}
+        """Aligners ready for timing, by the names of a pair's robots."""
+        by_robots: dict[tuple[str, str], list[MapPair]] = {}
+        for each in self.team.map_pairs:
+            by_robots.setdefault((each.a.name, each.b.name), []).append(each)
+        return {pair: AlignerTiming.of(self.scenario, maps) for pair, maps in by_robots.items()}
 
     def untimed(self) -> Iterator[tuple[PairStages, Path]]:
-        """The pairs on whose maps aligners are yet to be timed, and the tables this goes to."""
+        """Yield robot pairs without a table `aligner_timings`, and the path of this table."""
         for pair in self.pipeline.pairs:
             path = self.store.path(pair.estimates) / "aligner_timings.parquet"
             if not path.is_file():
                 yield pair, path
 
-    def _load(self) -> None:
-        """Have in memory what is wanted when all tasks are done."""
-        with self.timed(TABLES_PART):
-            _ = self.team
-            if any(self.untimed()):
-                _ = self.timings
-
-    def _load_task(self) -> Task:
-        read = [robot.slam for robot in self.pipeline.robots]
-        read += [pair.estimates for pair in self.pipeline.pairs]
-        needs = tuple(name for stage in read for name in task_names(stage))
-        return Task("team", "load the maps", self._load, (), (), needs)
-
     def pair_table(self, name: str) -> pd.DataFrame:
-        """A table of robot pairs, of all pairs."""
-        made = self.judgements if name in _JUDGED else [p.estimates for p in self.pipeline.pairs]
-        parts = [tables.read(self.store.path(s) / f"{name}.parquet", name) for s in made]
-        return pd.concat(parts, ignore_index=True) if parts else tables.framed(name, [])
-
-    def _collected(self) -> list[Stage]:
-        """Return the stages whose files the tables and maps of a result are made from."""
-        found = [each for robot in self.pipeline.robots for each in (robot.slam, robot.smooth)]
-        found += [each for robot in self.pipeline.simulated for each in (robot.observed, robot.log)]
-        found += [pair.estimates for pair in self.pipeline.pairs]
-        return [*found, *self.judgements, *self.pipeline.fusers.values()]
+        """Return a table of robot pairs, of all pairs."""
+        of_evaluation = name in _EVALUATION_TABLES
+        stages = (
+            self.evaluations if of_evaluation else [pair.estimates for pair in self.pipeline.pairs]
+        )
+        parts = [tables.read(self.store.path(s) / f"{name}.parquet", name) for s in stages]
+        return pd.concat(parts, ignore_index=True) if parts else tables.as_table(name, [])
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
-        """Do what is not in the store yet, in `jobs` processes; of `only` these stages, if any.
+        """Run the stages that are not in the store yet.
 
-        Of all stages `team` and `timings` are made beside the last tasks.
+        A run of all stages also computes `team` and `timings`, at the same time as the last tasks.
+
+        Args:
+            jobs: number of processes.
+            on_progress: is told of finished tasks.
+            only: stages that are needed; empty for all stages.
 
         Raises:
-            InputError: something that was given cannot be used, or this machine has too little
-                memory for it.
-            DamagedFileError: a file of the store is not as it was written.
+            InputError: an input cannot be used, or the machine has too little memory.
+            DamagedFileError: a file of the store was changed.
         """
         require_memory(self.pipeline, jobs)
         wanted = only or self.stages()
         left = unfinished(self.tasks, [name for stage in wanted for name in task_names(stage)])
+
+        def load() -> None:
+            with self.timed(TABLES_PART):
+                _ = self.team
+                if any(self.untimed()):
+                    _ = self.timings
+
+        robots, estimates = self.pipeline.robots, [p.estimates for p in self.pipeline.pairs]
+        loaded = [*(robot.slam for robot in robots), *estimates]
+        needs = tuple(name for stage in loaded for name in task_names(stage))
+        load_task = Task("team", "load the maps", load, (), (), needs)
         try:
             with workers(jobs) as pool:
-                run_tasks(left, pool, on_progress, None if only else self._load_task())
-        except DamagedFileError:  # `mending` wants to know which
+                run_tasks(left, pool, on_progress, None if only else load_task)
+        except DamagedFileError:  # `mending` repairs the stage that the error names
             raise
         except InputError as error:
             raise InputError(f"scenario {self.scenario.name}: {error}") from error
         for folder in map(self.store.folder, wanted):
             if not folder.finished:
                 raise InputError(f"{folder.path}: was removed while it was being made; run again")
-        for stage in only or self._collected():
+        # stages whose files become tables and maps of the result
+        simulated, fusers = self.pipeline.simulated, self.pipeline.fusers.values()
+        collected = [each for robot in robots for each in (robot.slam, robot.smooth)]
+        collected += [each for robot in simulated for each in (robot.observed, robot.log)]
+        collected += [*estimates, *self.evaluations, *fusers]
+        for stage in only or collected:
             require_sound(self.store.path(stage))
 
 
-def _judgement(settings: JudgeSettings, pair: PairStages) -> Stage:
-    before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
-    before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
-    label = "compare with the truth"
-    return Stage("judge", label, settings, pair_evaluation.run, pair_evaluation.WRITES, before)
+def finding_rows(run: EvaluatedRun) -> list[dict[str, Any]]:
+    """Return the rows of the table `findings`.
 
-
-def finding_rows(run: JudgedRun) -> list[dict[str, Any]]:
-    """Rows of the table `findings`; the truth of recorded logs is compared with their odometry."""
+    In a recording the truth is compared with the odometry, too.
+    """
     rows, recorded = [], isinstance(run.scenario, Recording)
     for robot in run.pipeline.robots:
         folders, log = run.robot_folders(robot), run.logs[robot.name]
-        known = read_findings(folders.slam)
-        found = known[["check", "iteration", "finding"]].assign(robot=robot.name)
-        rows += found.to_dict("records")
+        found = read_findings(folders.slam)
+        named = found[["check", "iteration", "finding"]].assign(robot=robot.name)
+        rows += named.to_dict("records")
         poses = read_true_poses(folders.log) if recorded else None
         if poses is not None and len(poses) == len(log):
-            sound = not (known["check"] == "odometry").any()
-            one = finding_of_truth(log, poses, run.scenario.slam.filter.motion, sound)
-            if one is not None:
-                told = {"check": one.kind, "iteration": one.frame, "finding": one.text}
-                rows.append({"robot": robot.name} | told)
+            sound = not (found["check"] == "odometry").any()
+            finding = finding_of_truth(log, poses, run.scenario.slam.filter.motion, sound)
+            if finding is not None:
+                row = {"robot": robot.name, "check": finding.kind}
+                rows.append(row | {"iteration": finding.frame, "finding": finding.text})
     return rows
 
 
 def finding_of_truth(
     log: RobotLog, T_world_robot: Float, noise: MotionNoise, sound: bool
 ) -> Finding | None:
-    """Compare a log's true poses (T, 3) with its odometry if that is `sound`.
+    """Compare the true poses of a log with its odometry or observations.
 
-    If it is not, they are compared with the motions that the observations show.
+    Args:
+        log: the log.
+        T_world_robot: true poses, shape (T, 3).
+        noise: noise of the odometry.
+        sound: whether the odometry is usable. Otherwise the truth is compared with the motions
+            that the observations show.
+
+    Returns:
+        The finding; None if there is no truth or no contradiction.
     """
     if not np.isfinite(T_world_robot).all(axis=1).any():
         return None
@@ -263,19 +285,19 @@ def finding_of_truth(
 
 
 def finding_lines(result: Path) -> Iterator[str]:
-    """A line for each finding of a result folder; none of one that was written without them."""
+    """Yield a line for each finding of a result; none if its version wrote no findings."""
     path = tables.table_path(result, "findings")
     if path.exists():
-        yield from lines_of(tables.read(path, "findings"))
+        yield from finding_row_lines(tables.read(path, "findings"))
 
 
-def lines_of(rows: pd.DataFrame) -> Iterator[str]:
-    """A line for each row of the table `findings`."""
+def finding_row_lines(rows: pd.DataFrame) -> Iterator[str]:
+    """Yield a line for each row of the table `findings`."""
     yield from (f"{row.robot}: {row.finding}" for row in rows.itertuples(index=False))
 
 
 def has_usable_map(result: Path) -> bool:
-    """Return True if a result has landmarks of a robot whose observations agree with its map."""
+    """Return True if any robot has landmarks that agree with its observations."""
     mapped, found = (
         tables.read(tables.table_path(result, name), name) for name in ("landmarks", "findings")
     )

@@ -1,11 +1,11 @@
-"""Errors and coverage of fused maps: one row per fuser and iteration.
+"""Errors and coverage of fused maps: the tables `fusers` and `fuser_coverage`.
 
-A fused landmark's true point is the mean of those of the landmarks it was made of. What is gross,
-and what consistency is, `map_consistency.py` defines.
+The true point of a fused landmark is the mean of the true points of its parents. `map_consistency`
+defines gross landmarks, which are left out, and consistency.
 
-Of the maps before fusing too, with the landmarks of all robots together. The landmarks are those
-of `map_consistency.py`: gross ones are left out. A share below its probability is of maps that are
-too sure, one above of maps that know more than they say.
+Coverage is the share of landmarks whose confidence ellipse contains the true point. It is computed
+for fused maps, and for the landmarks of all robots before fusion. A coverage below the nominal
+probability shows an overconfident map, one above it a conservative map.
 """
 
 import itertools
@@ -22,8 +22,8 @@ from experiments.evaluation.fused_landmarks import FusedTeam
 from experiments.evaluation.map_consistency import (
     Consistency,
     FittedMap,
-    both_consistencies,
-    fitted,
+    consistencies,
+    fit_to_truth,
     rmse,
 )
 from experiments.evaluation.smoothed_robots import SmoothedRobot
@@ -36,20 +36,20 @@ from mapfusion.landmark_map import LandmarkMap
 
 _MOTION_FIGURES = ("alignment_error_m", "alignment_error_rad")
 _MOTION_FIGURES += ("alignment_sigma_m", "alignment_sigma_rad", "alignment_nees_per_dof")
-_LEAST = 3  # landmarks in common: two fit any two
+_LEAST = 3  # common landmarks: a rigid fit of two is always exact
 
 
 @dataclass(frozen=True)
 class GivenMap:
-    """What a robot gave to a fuser.
+    """Map of a robot that a fuser was given.
 
     Attributes:
-        robot: whose map it is.
-        landmarks: the map.
-        points_world_m: (N, 3) true points.
-        of_filter: the filter's map at that iteration.
-        of_filter_world_m: (L, 3) its true points.
-        fallback: which map stands in for the smoothed one, and why; empty if none does.
+        robot: the robot.
+        landmarks: the map, of the filter or smoothed.
+        points_world_m: its true points, shape (N, 3).
+        of_filter: map of the filter at the same iteration.
+        of_filter_world_m: its true points, shape (L, 3).
+        fallback: map that replaces a missing smoothed map, with the reason; else empty.
     """
 
     robot: EvaluatedRobot
@@ -61,12 +61,12 @@ class GivenMap:
 
     @classmethod
     def at(cls, robot: EvaluatedRobot, smoothed: SmoothedRobot | None, k: int) -> "GivenMap":
-        """At an iteration, as the stage `fuse` chooses it (`given_teams`).
+        """Choose the map at an iteration as the stage `fuse` does (`given_teams`).
 
         Args:
-            robot: whose map it is.
-            smoothed: for a fuser that takes smoothed maps: the last one until then is given, the
-                filter's where there is none.
+            robot: the robot.
+            smoothed: its smoothed maps, for a fuser of smoothed maps. The last one until the
+                iteration is chosen, or the filter's map if there is none.
             k: the iteration.
         """
         filtered = robot.at(k)
@@ -80,14 +80,14 @@ class GivenMap:
 
 
 @dataclass(frozen=True)
-class JudgedFusion:
-    """A fused map with what went into it.
+class EvaluatedFusion:
+    """Fused map with the maps that it was made of.
 
     Attributes:
-        fuser: its name.
-        iteration: of the maps.
-        fusion: the map of the most robots.
-        given: of all M robots.
+        fuser: name of the fuser.
+        iteration: iteration of the maps.
+        fusion: fused map of the most robots.
+        given: maps of all M robots.
     """
 
     fuser: str
@@ -96,7 +96,7 @@ class JudgedFusion:
     given: Sequence[GivenMap]
 
     def team(self) -> FusedTeam:
-        """The same as a team of robots with the maps that were given."""
+        """Return the fusion as a team of robots with the maps that the fuser was given."""
         k, robots = self.iteration, []
         for given in self.given:
             maps, points = {k: given.landmarks}, {k: given.points_world_m}
@@ -105,24 +105,26 @@ class JudgedFusion:
 
     @property
     def fallback(self) -> str:
-        """Replacement of the fuser or of a smoothed map, with the reason; else empty."""
+        """Fallback fuser or map with the reason; else empty."""
         own = f"a simpler fuser stands in: {self.fusion.fallback}" if self.fusion.fallback else ""
         maps = (self.given[k].fallback for k in self.fusion.members)
         return "; ".join(filter(None, (own, *maps)))
 
     @cached_property
     def fit(self) -> FittedMap:
-        """The fused map against the truth in its frame."""
+        """Fit of the true points to the fused map."""
         frame = self.given[self.fusion.members[0]].robot
-        return fitted(self.fusion.landmarks, frame.in_map_frame(self.team().truth_of(self.fusion)))
+        return fit_to_truth(
+            self.fusion.landmarks, frame.in_map_frame(self.team().truth_of(self.fusion))
+        )
 
     @cached_property
     def consistency(self) -> tuple[Consistency, Consistency]:
-        """Of the fused map after the best rigid fit, and in its frame."""
-        return both_consistencies(self.fusion.landmarks, self.fit)
+        """Consistency of the fused map after the rigid fit, and in its frame."""
+        return consistencies(self.fusion.landmarks, self.fit)
 
     def row(self) -> dict[str, Any]:
-        """Its row of the table `fusers`."""
+        """Return the row of the table `fusers`."""
         landmarks, fit = self.fusion.landmarks, self.fit
         lengths = np.linalg.norm(fit.error_m[~fit.gross], axis=1)
         relative, in_frame = self.consistency
@@ -135,8 +137,8 @@ class JudgedFusion:
             "fitted_rmse_m": fit.rmse_m,
             "fitted_median_m": np.median(lengths) if len(lengths) else np.nan,
             "gross_share": fit.gross_share,
-            "over_better_parent": self._over_better(fit, of_filter=False),
-            "over_better_filter": self._over_better(fit, of_filter=True),
+            "over_better_parent": self._over_better_map(of_filter=False),
+            "over_better_filter": self._over_better_map(of_filter=True),
             "nees_per_dof": relative.nees_per_dof,
             "marginal_nees_per_dof": relative.marginal_nees_per_dof,
             "coverage_95": relative.coverage_95,
@@ -144,16 +146,37 @@ class JudgedFusion:
             "frame_coverage_95": in_frame.coverage_95,
             "duplicate_share": self.fusion.duplicate_share,
             "fallback": self.fallback,
-        } | self._motions()
+        } | self._motion_errors()
 
-    def _over_better(self, fit: FittedMap, of_filter: bool) -> float:
-        """RMS error of landmarks that two robots have, over that of the better of their maps.
+    def _over_better_map(self, of_filter: bool) -> float:
+        """Return the error of the fused map over the error of the better of two robots' maps.
 
-        Each map is fitted to the truth as a whole; the median over pairs of robots.
+        The errors are RMS values over the common landmarks of two robots, after a rigid fit of
+        each map. The result is the median over pairs of robots.
+
+        Args:
+            of_filter: compare with the maps of the filter; else with the maps of the fuser.
         """
-        parents = self._filter_rows() if of_filter else self.fusion.parents
-        errors = {k: self._parent_errors(k, of_filter) for k in self.fusion.members}
-        fused = np.full(len(parents), np.nan)
+        parents, errors = self.fusion.parents, {}
+        if of_filter:
+            # rows of the same landmarks in the filter's maps, found by their first observation
+            parents = np.full_like(self.fusion.parents, ABSENT)
+            for k, given in enumerate(self.given):
+                origin = given.of_filter.source_observation
+                row_of = pd.Series(np.arange(len(origin)), index=origin)
+                has = self.fusion.parents[:, k] != ABSENT
+                own = given.landmarks.source_observation[self.fusion.parents[has, k]]
+                parents[has, k] = row_of.reindex(own).fillna(ABSENT).to_numpy(dtype=np.int64)
+        for k in self.fusion.members:
+            # errors of a robot's map; NaN for gross landmarks and unknown true points
+            given = self.given[k]
+            landmarks, points = given.landmarks, given.points_world_m
+            if of_filter:
+                landmarks, points = given.of_filter, given.of_filter_world_m
+            own_fit, errors[k] = fit_to_truth(landmarks, points), np.full(len(landmarks), np.nan)
+            length_m = np.linalg.norm(own_fit.error_m, axis=1)
+            errors[k][own_fit.rows] = np.where(own_fit.gross, np.nan, length_m)
+        fused, fit = np.full(len(parents), np.nan), self.fit
         fused[fit.rows[~fit.gross]] = np.linalg.norm(fit.error_m[~fit.gross], axis=1)
         ratios = []
         for a, b in itertools.combinations(self.fusion.members, 2):
@@ -166,103 +189,72 @@ class JudgedFusion:
                 ratios.append(rms[0] / min(rms[1:]) if min(rms[1:]) > 0 else np.nan)
         return float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else np.nan
 
-    def _parent_errors(self, k: int, of_filter: bool) -> Float:
-        """Errors (N,) in m of a robot's map after its best fit; NaN of gross and unknown ones."""
-        given = self.given[k]
-        landmarks, points = given.landmarks, given.points_world_m
-        if of_filter:
-            landmarks, points = given.of_filter, given.of_filter_world_m
-        fit, errors = fitted(landmarks, points), np.full(len(landmarks), np.nan)
-        errors[fit.rows] = np.where(fit.gross, np.nan, np.linalg.norm(fit.error_m, axis=1))
-        return errors
-
-    def _filter_rows(self) -> np.ndarray:
-        """The parents' rows in the filter's maps: of the same origin in the log."""
-        parents = np.full_like(self.fusion.parents, ABSENT)
-        for k, given in enumerate(self.given):
-            origin = given.of_filter.source_observation
-            row_of = pd.Series(np.arange(len(origin)), index=origin)
-            has = self.fusion.parents[:, k] != ABSENT
-            mine = given.landmarks.source_observation[self.fusion.parents[has, k]]
-            parents[has, k] = row_of.reindex(mine).fillna(ABSENT).to_numpy(dtype=np.int64)
-        return parents
-
-    def _motions(self) -> dict[str, float]:
-        """How far off the robots' maps were moved, and how far that is for its covariance."""
+    def _motion_errors(self) -> dict[str, float]:
+        """Return median errors, standard deviations and NEES of the motions of the robots' maps."""
         first, *others = self.fusion.members
         errors = []
         for k in others:
             T_true = se2.between(
                 self.given[first].robot.path.T_world_map, self.given[k].robot.path.T_world_map
             )
-            off = self.fusion.T_first_map[k] - T_true
-            off[2] = se2.wrap(off[2])
+            error = self.fusion.T_first_map[k] - T_true
+            error[2] = se2.wrap(error[2])
             covariance = self.fusion.motion_covariance[k]
             nees = alignment_nees(self.fusion.T_first_map[k], covariance, T_true)
-            stated = se2.motion_sigma(covariance)
-            errors.append([np.hypot(off[0], off[1]), abs(off[2]), *stated, nees / 3])
-        middle = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
-        return dict(zip(_MOTION_FIGURES, middle.tolist(), strict=True))
-
-
-def fuser_rows(fusions: Sequence[JudgedFusion]) -> list[dict[str, Any]]:
-    """Rows of the table `fusers`."""
-    return [fusion.row() for fusion in fusions]
+            sigma = se2.motion_sigma(covariance)
+            errors.append([np.hypot(error[0], error[1]), abs(error[2]), *sigma, nees / 3])
+        medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
+        return dict(zip(_MOTION_FIGURES, medians.tolist(), strict=True))
 
 
 def last_fused(rows: pd.DataFrame) -> pd.DataFrame:
-    """The rows of the table `fusers` at each fuser's last iteration, of each run."""
+    """Return the rows of the table `fusers` at the last iteration of each fuser and run."""
     keys = [name for name in ("run_id", "fuser") if name in rows]
     return rows[rows["iteration"] == rows.groupby(keys)["iteration"].transform("max")]
 
 
-# Shares of the errors that ellipses are to hold; closer together where gates and bounds are set.
-NOMINAL = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-FUSED, FILTERED, SMOOTHED = "fused", "filter", "smoothed"  # of which maps
-_Both = tuple[Consistency, Consistency]  # after the best rigid fit, and in the map's frame
+# Nominal probabilities of confidence ellipses; denser where gates and bounds usually are.
+NOMINAL_COVERAGES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+FUSED, FILTERED, SMOOTHED = "fused", "filter", "smoothed"  # kinds of maps
+_Both = tuple[Consistency, Consistency]  # after the rigid fit, and in the frame of the map
 
 
-def coverage_rows(fusions: Sequence[JudgedFusion]) -> list[dict[str, Any]]:
-    """Rows of the table `fuser_coverage`: what went in at the last iteration, and what came out."""
+def coverage_rows(fusions: Sequence[EvaluatedFusion]) -> list[dict[str, Any]]:
+    """Return the rows of the table `fuser_coverage`: maps before and after the last fusion."""
     last = max((fusion.iteration for fusion in fusions), default=None)
     at_end = [fusion for fusion in fusions if fusion.iteration == last]
-    rows = []
-    for kind, given in _given(at_end).items():
-        rows += _rows(given, at_end[0], {"map": kind, "fuser": ""})
-    for fusion in at_end:
-        named = {"map": FUSED, "fuser": fusion.fuser}
-        rows += _rows([fusion.consistency], fusion, named)
-    return rows
-
-
-def _given(fusions: Sequence[JudgedFusion]) -> dict[str, list[_Both]]:
-    """Each robot's maps of each kind that a fuser was given, held against the truth."""
+    # maps before fusion by kind and robot; several fusers are given the same ones
     maps: dict[str, dict[str, tuple[EvaluatedRobot, LandmarkMap, Float]]] = {}
-    for given in (given for fusion in fusions for given in fusion.given):
+    for given in (given for fusion in at_end for given in fusion.given):
         robot = given.robot
         of_filter = (robot, given.of_filter, given.of_filter_world_m)
         maps.setdefault(FILTERED, {})[robot.name] = of_filter
         if given.landmarks is not given.of_filter:
             own = (robot, given.landmarks, given.points_world_m)
             maps.setdefault(SMOOTHED, {})[robot.name] = own
-    return {kind: [_judged(*each) for each in own.values()] for kind, own in maps.items()}
+    rows = []
+    for kind, by_robot in maps.items():
+        found = []
+        for robot, landmarks, points in by_robot.values():
+            fit = fit_to_truth(landmarks, robot.in_map_frame(points))
+            found.append(consistencies(landmarks, fit))
+        rows += _coverage_of(found, at_end[0], {"map": kind, "fuser": ""})
+    for fusion in at_end:
+        keys = {"map": FUSED, "fuser": fusion.fuser}
+        rows += _coverage_of([fusion.consistency], fusion, keys)
+    return rows
 
 
-def _judged(robot: EvaluatedRobot, landmarks: LandmarkMap, point_world_m: Float) -> _Both:
-    fit = fitted(landmarks, robot.in_map_frame(point_world_m))
-    return both_consistencies(landmarks, fit)
-
-
-def _rows(
-    maps: Sequence[_Both], fusion: JudgedFusion, named: dict[str, Any]
+def _coverage_of(
+    maps: Sequence[_Both], fusion: EvaluatedFusion, keys: dict[str, Any]
 ) -> Iterator[dict[str, Any]]:
-    """One row a probability; none where nothing is known."""
+    """Yield a row for each nominal coverage; none if no true point is known."""
     relative, frame = (
         np.concatenate([each.own_nees for each in both]) for both in zip(*maps, strict=True)
     )
     d = degrees_of_freedom(fusion.fusion.landmarks)
-    for nominal in NOMINAL if len(relative) else ():
+    for nominal in NOMINAL_COVERAGES if len(relative) else ():
         bound = chi_square_bound(nominal, d)
         shares = {"coverage": np.mean(relative <= bound), "frame_coverage": np.mean(frame <= bound)}
         about = {"iteration": fusion.iteration, "n_landmarks": len(relative)}
-        yield named | about | {"nominal": nominal} | shares
+        yield keys | about | {"nominal": nominal} | shares

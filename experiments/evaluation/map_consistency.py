@@ -1,17 +1,17 @@
-"""A map against the truth as a whole: how far off it is, and whether it knows how far.
+"""Errors and consistency of a whole map.
 
-All that is judged so is judged by these definitions. A landmark is gross if it lies more than
-`GROSS_M` from its true point after the best rigid fit of the others; the same ones are left out of
-every figure and counted. The fit is a motion of the plane. What it could explain is no error of the
-relative map: with J the rigid motions (3 n, 3), errors and covariances are projected by
-I - J (J'J)^-1 J' (the gauge is removed). With N a basis of what that leaves,
+A landmark is gross if its distance to its true point exceeds `GROSS_M` after the rigid fit of the
+other landmarks. Gross landmarks are counted, and left out of all other figures. The fit is a motion
+of the plane. An error that such a motion explains is no error of the relative map. Therefore errors
+and covariances are projected by I - J (J'J)^-1 J', where the columns of J (3 n, 3) are the rigid
+motions: the gauge is removed. With a basis N of the remaining space,
 
     N (N' S N)^-1 N' = S^-1 - S^-1 J (J' S^-1 J)^-1 J' S^-1,
 
-so the NEES of the relative map (Bar-Shalom, Li, Kirubarajan 2001, ch. 5.4) needs S^-1 alone. It is
-chi-square distributed with the rank of N as degrees of freedom if the joint covariance S is right.
-S is block diagonal plus low rank, so its inverse is Woodbury's, and nothing dense of its size is
-made.
+so the NEES of the relative map (Bar-Shalom, Li, Kirubarajan 2001, ch. 5.4) needs only S^-1. The
+NEES is chi-square distributed if the joint covariance S is right. Its degrees of freedom are the
+rank of N. S is block diagonal plus low rank and is inverted by the Woodbury identity, without dense
+matrices of its size.
 """
 
 from dataclasses import dataclass, field
@@ -26,24 +26,24 @@ from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 
-# Several times what a map of a room is off by after a fit (0.01 to 0.05 m); another landmark is,
-# where there are as many as cameras see, nearer than twice that only by chance.
+# Several times the error of a map of a room after a fit, and about half the distance between
+# neighbouring landmarks.
 GROSS_M = 0.15
-COVERED = 0.95  # of the errors, by ellipses that are to be counted on
-_LEAST = 3  # landmarks: two fit any two
-_MOST_FITS = 50  # the set of gross ones is stable after a few
+COVERED = 0.95  # nominal probability of the ellipses of `coverage_95`
+_LEAST = 3  # landmarks: a rigid fit of two is always exact
+_MOST_FITS = 50  # the set of gross landmarks is stable after a few fits
 
 
 @dataclass(frozen=True)
 class FittedMap:
-    """A map's landmarks of known truth, beside it after the best rigid fit.
+    """Landmarks with a known true point, and their errors after a rigid fit.
 
     Attributes:
-        rows: (n,) of the map.
-        truth_m: (n, 3) true points, moved by the fit into the frame of the map.
-        error_m: (n, 3) the map's points from there; of planar data without height.
-        frame_error_m: (n, 3) the map's points from the true ones as they were given, likewise.
-        gross: (n,) bool.
+        rows: rows of the map, shape (n,).
+        truth_m: true points, moved by the fit into the frame of the map, shape (n, 3).
+        error_m: positions in the map minus `truth_m`, shape (n, 3). The height of planar maps is 0.
+        frame_error_m: positions in the map minus the true points without a fit, shape (n, 3).
+        gross: True for gross landmarks, shape (n,).
     """
 
     rows: np.ndarray
@@ -54,25 +54,25 @@ class FittedMap:
 
     @property
     def gross_share(self) -> float:
-        """NaN of no landmark."""
+        """Share of gross landmarks; NaN without landmarks."""
         return float(np.mean(self.gross)) if len(self.rows) else np.nan
 
     @property
     def rmse_m(self) -> float:
-        """Of the landmarks that are not gross; NaN of none."""
+        """RMSE of the landmarks that are not gross; NaN without landmarks."""
         return rmse(self.error_m[~self.gross])
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """Whether errors are what a map's covariance says; NaN of fewer than 3 landmarks.
+    """Agreement of a map's errors with its covariance; NaN for fewer than 3 landmarks.
 
     Attributes:
-        nees_per_dof: squared Mahalanobis distance of all landmarks at once over its degrees of
-            freedom: 1 if the joint covariance is right.
-        marginal_nees_per_dof: the mean of the landmarks' own.
-        coverage_95: share of the landmarks whose 95 % ellipse holds the true point.
-        own_nees: (n,) each landmark's own squared Mahalanobis distance.
+        nees_per_dof: NEES of all landmarks together over its degrees of freedom; near 1 if the
+            joint covariance is right.
+        marginal_nees_per_dof: mean NEES of single landmarks over its degrees of freedom.
+        coverage_95: share of landmarks whose 95 % ellipse contains the true point.
+        own_nees: NEES of each landmark, shape (n,).
     """
 
     nees_per_dof: float
@@ -85,16 +85,20 @@ UNKNOWN = Consistency(np.nan, np.nan, np.nan)
 
 
 def rmse(error_m: Float) -> float:
-    """Root mean square length of errors (n, D); NaN of none."""
+    """Return the root mean square length of errors (n, D); NaN for n = 0."""
     return float(np.sqrt(np.mean(np.sum(error_m**2, axis=1)))) if len(error_m) else np.nan
 
 
-def fitted(landmarks: LandmarkMap, point_m: Float) -> FittedMap:
-    """The best rigid fit of the true points (N, 3), NaN where unknown, to a map.
+def fit_to_truth(landmarks: LandmarkMap, point_m: Float) -> FittedMap:
+    """Fit the true points rigidly to a map, without gross landmarks.
 
-    It is the least-squares motion of the landmarks that are not gross, found by turns with these.
-    The farthest are left out first, those beyond half of the largest error, a quarter, ...: few
-    that are metres off move the first fit so far that all others look gross.
+    The motion and the set of gross landmarks are computed alternately. A few errors of metres can
+    shift the first fit so much that all landmarks look gross. Therefore the limit starts at half of
+    the largest error and is halved until it reaches `GROSS_M`.
+
+    Args:
+        landmarks: map of N landmarks.
+        point_m: true points, shape (N, 3); NaN where unknown.
     """
     rows = np.flatnonzero(np.isfinite(point_m).all(axis=1))
     position, truth = landmarks.position_m[rows], point_m[rows]
@@ -110,8 +114,8 @@ def fitted(landmarks: LandmarkMap, point_m: Float) -> FittedMap:
         before, gross = gross, length_m > limit_m
         if limit_m == GROSS_M and np.array_equal(before, gross):
             break
-    off, frame_off = (_error(landmarks, position, points) for points in (moved, truth))
-    return FittedMap(rows, moved, off, frame_off, gross)
+    error, frame_error = (_error(landmarks, position, points) for points in (moved, truth))
+    return FittedMap(rows, moved, error, frame_error, gross)
 
 
 def _error(landmarks: LandmarkMap, position_m: Float, truth_m: Float) -> Float:
@@ -122,21 +126,27 @@ def _error(landmarks: LandmarkMap, position_m: Float, truth_m: Float) -> Float:
 
 
 def relative_consistency(landmarks: LandmarkMap, fit: FittedMap) -> Consistency:
-    """Of the map as such: gauge removed, gross landmarks left out."""
-    return both_consistencies(landmarks, fit)[0]
+    """Return the consistency of the relative map: gauge removed, without gross landmarks."""
+    return consistencies(landmarks, fit)[0]
 
 
-def both_consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, Consistency]:
-    """The relative one, and that of the map in the frame that its truth was given in.
+def consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, Consistency]:
+    """Return the consistency of the relative map, and of the map in the frame of its truth.
 
-    Both without the gross landmarks; what takes long is the same for both.
+    Both leave out gross landmarks. The solution of the linear system is shared.
     """
     kept = ~fit.gross
     rows = fit.rows[kept]
     if len(rows) < _LEAST:
         return UNKNOWN, UNKNOWN
     d = degrees_of_freedom(landmarks)
-    joint = _joint_of(landmarks, rows, d)
+    # without a joint covariance, errors of landmarks are taken to be independent
+    known = landmarks.joint
+    if known is None:
+        known = JointCovariance(landmarks.covariance_m2, np.zeros((len(landmarks), 0, 3)))
+    own, common = known.own_m2[rows, :d, :d], known.common_m[rows, :, :d]
+    common_flat = common.transpose(1, 0, 2).reshape(known.rank, d * len(rows))
+    joint = _LowRankCovariance(own, common_flat)
     error, frame_error = fit.error_m[kept, :d], fit.frame_error_m[kept, :d]
     J = rigid_motions(fit.truth_m[kept], d)
     columns = [error[..., None], J, frame_error[..., None]]
@@ -148,21 +158,43 @@ def both_consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consiste
     )
 
 
-def _consistency(joint: "_LowRank", error: Float, J: Float, solved: Float) -> Consistency:
-    """Of errors (n, D) without what lies along J (n, D, k), by S^-1 of both (n D, 1 + k)."""
-    d = error.shape[1]
+def _consistency(joint: "_LowRankCovariance", error: Float, J: Float, solved: Float) -> Consistency:
+    """Return the consistency of errors without their components along J.
+
+    Args:
+        joint: joint covariance S of the errors.
+        error: errors, shape (n, D).
+        J: directions to remove, shape (n, D, k); k may be 0.
+        solved: S^-1 applied to the errors and J, shape (n D, 1 + k).
+    """
+    n, d = error.shape
     J_flat = J.reshape(error.size, -1)
+    # the NEES by the identity above
     pull, stiffness = J_flat.T @ solved[:, 0], J_flat.T @ solved[:, 1:]
     nees = error.ravel() @ solved[:, 0] - pull @ np.linalg.solve(stiffness, pull)
-    left, marginal = _projected(joint, error, J_flat)
-    own = squared_mahalanobis(left, marginal)
+    # errors and marginal covariances, projected by I - Q Q' with an orthonormal basis Q of J
+    projected, marginal = error, joint.marginals
+    if J_flat.shape[1]:
+        Q = np.linalg.qr(J_flat)[0]
+        SQ = joint.times(Q)
+        projected = (error.ravel() - Q @ (Q.T @ error.ravel())).reshape(n, d)
+        Q_of, SQ_of = Q.reshape(n, d, -1), SQ.reshape(n, d, -1)
+        mixed = SQ_of @ np.swapaxes(Q_of, 1, 2)
+        both = Q_of @ (Q.T @ SQ) @ np.swapaxes(Q_of, 1, 2)
+        marginal = marginal - mixed - np.swapaxes(mixed, 1, 2) + both
+    own = squared_mahalanobis(projected, marginal)
     inside = np.mean(own <= chi_square_bound(COVERED, d))
     dof = error.size - J_flat.shape[1]
     return Consistency(float(nees / dof), float(np.mean(own) / d), float(inside), own)
 
 
 def rigid_motions(point_m: Float, n_dimensions: int) -> Float:
-    """J (n, D, 3): how x, y and a rotation of the frame move points (n, 3), about their mean."""
+    """Return the derivatives J (n, D, 3) of points by x, y and rotation about their mean.
+
+    Args:
+        point_m: points, shape (n, 3).
+        n_dimensions: D, 2 or 3.
+    """
     J = np.zeros((len(point_m), n_dimensions, 3))
     x, y = (point_m - point_m.mean(axis=0))[:, :2].T
     J[:, 0, 0] = J[:, 1, 1] = 1.0
@@ -171,25 +203,30 @@ def rigid_motions(point_m: Float, n_dimensions: int) -> Float:
 
 
 @dataclass(frozen=True)
-class _LowRank:
-    """S of n landmarks in D dimensions: block diagonal `own` (n, D, D) plus C' C, C (R, n D)."""
+class _LowRankCovariance:
+    """Joint covariance S of n landmarks in D dimensions: block diagonal plus low rank.
+
+    Attributes:
+        own: diagonal blocks, shape (n, D, D).
+        common: C, shape (R, n D), where C' C is the low-rank part.
+    """
 
     own: Float
     common: Float
 
     @property
     def _by_landmark(self) -> Float:
-        """(n, D, R)."""
+        """C' by landmark, shape (n, D, R)."""
         return self.common.T.reshape(*self.own.shape[:2], len(self.common))
 
     def times(self, flat: Float) -> Float:
-        """S x, for x (n D, k)."""
+        """Return S x for x (n D, k)."""
         n, d, _ = self.own.shape
         by_landmark = (self.own @ flat.reshape(n, d, -1)).reshape(n * d, -1)
         return by_landmark + self.common.T @ (self.common @ flat)
 
     def solve(self, x: Float) -> Float:
-        """S^-1 x, for x (n, D, k), by Woodbury: small blocks, and a matrix (R, R)."""
+        """Return S^-1 x for x (n, D, k) by the Woodbury identity."""
         n, d, k = x.shape
         C = self._by_landmark
         by_own = np.linalg.solve(self.own, np.concatenate([x, C], axis=2)).reshape(n * d, -1)
@@ -202,29 +239,6 @@ class _LowRank:
 
     @property
     def marginals(self) -> Float:
-        """(n, D, D)."""
+        """Marginal covariances of the landmarks, shape (n, D, D)."""
         C = self._by_landmark
         return self.own + C @ np.swapaxes(C, 1, 2)
-
-
-def _joint_of(landmarks: LandmarkMap, rows: np.ndarray, d: int) -> _LowRank:
-    """The joint covariance of some landmarks; without one, errors are taken for independent."""
-    joint = landmarks.joint
-    if joint is None:
-        joint = JointCovariance(landmarks.covariance_m2, np.zeros((len(landmarks), 0, 3)))
-    own, common = joint.own_m2[rows, :d, :d], joint.common_m[rows, :, :d]
-    return _LowRank(own, common.transpose(1, 0, 2).reshape(joint.rank, d * len(rows)))
-
-
-def _projected(joint: _LowRank, error: Float, J: Float) -> tuple[Float, Float]:
-    """Errors (n, D), and marginal covariances (n, D, D), without what lies along J (n D, k)."""
-    n, d = error.shape
-    if not J.shape[1]:
-        return error, joint.marginals
-    Q = np.linalg.qr(J)[0]
-    SQ = joint.times(Q)
-    left = error.ravel() - Q @ (Q.T @ error.ravel())
-    Q_of, SQ_of = Q.reshape(n, d, -1), SQ.reshape(n, d, -1)
-    mixed = SQ_of @ np.swapaxes(Q_of, 1, 2)
-    both = Q_of @ (Q.T @ SQ) @ np.swapaxes(Q_of, 1, 2)
-    return left.reshape(n, d), joint.marginals - mixed - np.swapaxes(mixed, 1, 2) + both

@@ -1,4 +1,4 @@
-"""Odometry calibration of a user's logs, and corrected logs."""
+"""Odometry calibration of a user's logs, and logs with corrected odometry."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -22,41 +22,55 @@ from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.tables import NO_LABEL
 
 
-def calibrated(
+def calibrate_logs(
     logs: Sequence[Path], output: Path | None, settings: Scenario, on_progress: OnProgress
 ) -> Calibration:
-    """Calibrate logs, one a robot; write them with corrected odometry into `output`, if given.
+    """Calibrate the odometry of logs, and write corrected logs.
 
-    Landmarks are told apart by labels where all observations have them, else by FastSLAM with the
-    scenario's settings. The truth, where there is one, is passed on unread.
+    Landmarks are identified by labels if all observations have one, else by FastSLAM with the
+    settings of the scenario. The truth is copied, but not read.
+
+    Args:
+        logs: folders of logs, one for each robot.
+        output: folder of the corrected logs; None writes nothing.
+        settings: settings of the filter and of the smoother.
+        on_progress: is told of finished frames and steps.
 
     Raises:
-        InputError: a log cannot be read or calibrated.
+        InputError: a log cannot be read or calibrated, or a corrected log cannot be written.
     """
-    known = [read_log(path) for path in logs]
-    names = [log.robot for log in known]
+    loaded = [read_log(path) for path in logs]
+    names = [log.robot for log in loaded]
     for path, name in zip(logs, names, strict=True):
         if names.count(name) > 1:
             raise InputError(f"{path}: robot {name} has more than one log here")
-    found = [_associations(log, settings, on_progress) for log in known]
+    associations = [_associations(log, settings, on_progress) for log in loaded]
     parameters = SmootherParameters(
         stray_m=settings.smooth.stray_m, min_count=settings.slam.min_count
     )
     calibration = calibrate(
-        known,
-        [landmark for landmark, _ in found],
-        [path for _, path in found],
+        loaded,
+        [landmark for landmark, _ in associations],
+        [path for _, path in associations],
         parameters,
         lambda done, most: on_progress("calibrate", done, most),
     )
     if output is not None:
-        for source, log, robot in zip(logs, known, calibration.robots, strict=True):
-            _write(output / log.robot, robot.error.corrected_log(log), source)
+        for source, log, robot in zip(logs, loaded, calibration.robots, strict=True):
+            folder = output / log.robot
+            try:
+                write_log(folder, robot.error.corrected_log(log))
+                for name in (*TRUTH_FILES, ATTITUDE_FILE):
+                    (folder / name).unlink(missing_ok=True)
+                    if (source / name).exists():
+                        link_or_copy(source / name, folder / name)
+            except OSError as error:
+                raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
     return calibration
 
 
 def filter_settings(calibration: Calibration) -> dict[str, Any]:
-    """The scenario's section for corrected logs: `slam.filter.motion`."""
+    """Return the section `slam.filter.motion` of a scenario for corrected logs."""
     motion = {name: float(f"{value:.3g}") for name, value in asdict(calibration.motion).items()}
     wanted = {
         *NOISE_PARAMETERS,
@@ -71,7 +85,10 @@ def filter_settings(calibration: Calibration) -> dict[str, Any]:
 def _associations(
     log: RobotLog, settings: Scenario, on_progress: OnProgress
 ) -> tuple[np.ndarray, Float | None]:
-    """Which landmark each observation (N,) is of, and a path (T, 3) where labels do not say."""
+    """Return the landmark of each observation, shape (N,), and FastSLAM's path, shape (T, 3).
+
+    The path is None if all observations have a label.
+    """
     label = log.observations.label
     if label is not None and not np.any(label == NO_LABEL):
         return label.astype(np.int64), None
@@ -82,14 +99,3 @@ def _associations(
     if frame is None:
         raise InputError(f"log {log.robot}: holds no frame")
     return frame.slam.best_associations(), frame.slam.best_path()
-
-
-def _write(folder: Path, log: RobotLog, source: Path) -> None:
-    try:
-        write_log(folder, log)
-        for name in (*TRUTH_FILES, ATTITUDE_FILE):
-            (folder / name).unlink(missing_ok=True)
-            if (source / name).exists():
-                link_or_copy(source / name, folder / name)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written ({error.strerror})") from error

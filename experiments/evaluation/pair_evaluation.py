@@ -1,52 +1,50 @@
-"""Stage: estimates of one robot pair compared with the truth."""
+"""Stage that compares the estimates of one robot pair with the truth."""
 
 import functools
 from dataclasses import dataclass
-from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from experiments.evaluation import tables
-from experiments.evaluation.alignment_errors import EvaluatedRobot, error_rows, met_maps
+from experiments.evaluation.alignment_errors import EvaluatedRobot, error_rows, join_map_pairs
 from experiments.evaluation.fused_landmarks import MergeSettings, fusion_rows
-from experiments.evaluation.truth import PathTruth, landmark_truth
+from experiments.evaluation.truth import PathTruth, landmark_truth, truth_or_unknown
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages.slam import RobotFolders, folders_of_both
 from experiments.pipeline.stages.snapshots import ROBOTS_KEPT, stored_maps
 from mapfusion.errors import InputError
-from mapfusion.robot_log import TRUTH_TABLES, RobotLog, RobotTruth, read_log, read_truth
-from mapfusion.tables import table_path
+from mapfusion.robot_log import read_log
 from mapfusion.verification.verdict import Judge
 
 WRITES = ("errors.parquet", "fusion.parquet")
-ALIGNED = ("estimates", "correspondences", "rivals")  # tables of the align stage, per pair of maps
+# Tables of the stage `align`, in the order of the arguments of `join_map_pairs`.
+ALIGNED = ("estimates", "correspondences", "rivals")
 
 
 @dataclass(frozen=True)
-class JudgeSettings:
-    """All that the judgement depends on, beside maps, estimates and truth."""
+class EvaluationSettings:
+    """Settings of the evaluation of alignments."""
 
     judge: Judge
     merge: MergeSettings
     true_pair_radius_m: float
 
 
-def truth_of(folder: Path, log: RobotLog) -> RobotTruth:
-    """The truth beside a log; NaN where there is none."""
-    if all(table_path(folder, name).is_file() for name in TRUTH_TABLES):
-        return read_truth(folder)
-    return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
-
-
 @functools.lru_cache(maxsize=ROBOTS_KEPT)
 def load_robot(folders: RobotFolders, viewing: bool = True) -> EvaluatedRobot:
-    """A robot's maps joined with the truth beside its log, which is NaN where it is unknown.
+    """Load a robot's maps with the true points of their landmarks; NaN where unknown.
 
-    They stay in memory as `stored_maps` do, with or without viewing evidence.
+    The result stays in memory, as that of `stored_maps`.
+
+    Args:
+        folders: folders of the log and of the maps.
+        viewing: whether to load the viewing evidence of the maps.
+
+    Raises:
+        InputError: the truth and the log differ in their number of rows.
     """
     log = read_log(folders.log)
-    truth = truth_of(folders.log, log)
+    truth = truth_or_unknown(folders.log, log)
     poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
     for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):
         if len(true) != len(logged):
@@ -57,12 +55,12 @@ def load_robot(folders: RobotFolders, viewing: bool = True) -> EvaluatedRobot:
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
 
 
-def run(settings: JudgeSettings, job: Job) -> None:
+def run(settings: EvaluationSettings, job: Job) -> None:
     """Write the pair's `errors.parquet` and `fusion.parquet`."""
     robots = [load_robot(folders) for folders in folders_of_both(job)]
     aligned = [tables.read(job.inputs["align"] / f"{name}.parquet", name) for name in ALIGNED]
-    met, radius_m = met_maps(robots, *aligned), settings.true_pair_radius_m
-    errors = pd.concat([error_rows(maps, settings.judge, radius_m) for maps in met])
+    map_pairs, radius_m = join_map_pairs(robots, *aligned), settings.true_pair_radius_m
+    errors = pd.concat([error_rows(pair, settings.judge, radius_m) for pair in map_pairs])
     tables.write(job.output / "errors.parquet", "errors", errors)
-    fusion = fusion_rows(met, settings.merge, radius_m)
+    fusion = fusion_rows(map_pairs, settings.merge, radius_m)
     tables.write(job.output / "fusion.parquet", "fusion", fusion)

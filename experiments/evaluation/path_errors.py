@@ -1,10 +1,10 @@
-"""Errors of paths at each frame, and absolute and relative ones with evo's seven statistics.
+"""Errors of paths: absolute trajectory error (ATE) and relative pose error (RPE).
 
-ATE and RPE as Sturm et al. (2012) define them, in the plane; numbers equal evo's (its `evo_ape -a`
-and `evo_rpe --pairs_from_reference`), which the tests hold them to.
+Both are defined as in Sturm et al. (2012), in the plane. The tests compare them with evo (`evo_ape
+-a` and `evo_rpe --pairs_from_reference`), whose seven statistics are used.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -17,9 +17,9 @@ from mapfusion.files import POSE_FIELDS
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 
-SMOOTHED = "smoothed"  # a path that not every robot has
+SMOOTHED = "smoothed"  # path of the smoother; some robots have none
 SOURCES = ("final", "online", "odometry", SMOOTHED)
-# From frame to frame, and along a metre of the way: what a filter step and a short drive add.
+# Frames and metres between the two poses of an RPE: the errors of a step and of a short drive.
 RPE_DELTA = 1
 STATISTICS: dict[str, Callable[[Float], float]] = {
     "rmse": lambda errors: np.sqrt(np.mean(errors**2)),
@@ -29,35 +29,46 @@ STATISTICS: dict[str, Callable[[Float], float]] = {
 
 
 def seven_statistics(errors: Float) -> dict[str, float]:
-    """Evo's statistics of errors (N,); NaN where there is none. `std` is the population's."""
+    """Return the statistics of evo of errors (N,); NaN for N = 0. `std` is the population's."""
     return {name: of(errors) if len(errors) else np.nan for name, of in STATISTICS.items()}
 
 
 def rms(values: pd.Series) -> float:
-    """Root mean square of what is known; NaN of nothing."""
+    """Return the root mean square of the known values; NaN if none is known."""
     return float(np.sqrt(np.mean(np.square(values.dropna())))) if values.notna().any() else np.nan
 
 
 def path_rms(robots: pd.DataFrame, by: Sequence[str] = ("robot",)) -> pd.DataFrame:
-    """RMS position errors over a run, of FastSLAM's online path and of odometry alone.
+    """Return RMS position errors of FastSLAM's online paths and of odometry alone.
 
-    `by` names a robot of a run. Columns: those of `by`; path_m, odometry_m, over_odometry (their
-    ratio); n_landmarks at the end and n_frames.
+    Args:
+        robots: rows of the table `robots`.
+        by: columns that identify a robot of a run.
+
+    Returns:
+        One row for each robot. Columns: those of `by`, path_m, odometry_m, over_odometry (their
+        ratio), n_landmarks at the end and n_frames.
     """
     groups = robots.groupby(list(by), sort=False)
     path_m, odometry_m = (groups[f"{of}_error_m"].agg(rms) for of in ("path", "odometry"))
-    found = {"path_m": path_m, "odometry_m": odometry_m, "n_frames": groups.size()}
-    found |= {"over_odometry": path_m / odometry_m.where(odometry_m > 0)}
+    columns = {"path_m": path_m, "odometry_m": odometry_m, "n_frames": groups.size()}
+    columns |= {"over_odometry": path_m / odometry_m.where(odometry_m > 0)}
     if "n_landmarks" in robots:
-        found |= {"n_landmarks": groups["n_landmarks"].last()}
-    return pd.DataFrame(found).reset_index()
+        columns |= {"n_landmarks": groups["n_landmarks"].last()}
+    return pd.DataFrame(columns).reset_index()
 
 
 def ate_m(path: Float, truth: Float, fit: bool = True) -> Float:
-    """Distances (N,) of a path's positions to the true ones; both are poses (N, 3), all known.
+    """Return the absolute trajectory errors: distances to the true positions.
 
-    A fit moves the path onto the truth first by the least-squares motion without scale (Umeyama
-    1991; in the plane the closed form of `fit_rigid`). Without it both start where they start.
+    Args:
+        path: estimated poses, shape (N, 3).
+        truth: true poses, shape (N, 3), all known.
+        fit: move the path onto the truth by the least-squares rigid motion without scale (Umeyama
+            1991; in the plane the closed form of `fit_rigid`).
+
+    Returns:
+        Errors in m, shape (N,).
     """
     positions = path[:, :2]
     if fit and len(path) > 1:
@@ -67,10 +78,15 @@ def ate_m(path: Float, truth: Float, fit: bool = True) -> Float:
 
 
 def rpe(path: Float, truth: Float, pairs: np.ndarray) -> tuple[Float, Float]:
-    """Relative pose errors of pairs of poses: lengths (P,) in m and angles (P,) in rad.
+    """Return the relative pose errors E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), Sturm et al. (2012), eq. 2.
 
-    E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), Sturm et al. (2012), eq. 2, of a path P (N, 3) and the truth Q
-    (N, 3); pairs (P, 2) are rows i and j of both.
+    Args:
+        path: estimated poses P, shape (N, 3).
+        truth: true poses Q, shape (N, 3).
+        pairs: rows i and j of both, shape (M, 2).
+
+    Returns:
+        Lengths in m and angles in rad of E, shape (M,) each.
     """
     i, j = pairs.T
     error = se2.between(se2.between(truth[i], truth[j]), se2.between(path[i], path[j]))
@@ -78,9 +94,14 @@ def rpe(path: Float, truth: Float, pairs: np.ndarray) -> tuple[Float, Float]:
 
 
 def pairs_by_frames(known: np.ndarray, delta: int) -> np.ndarray:
-    """Rows (P, 2) that are `delta` frames apart and follow on each other, both of them known.
+    """Return consecutive pairs of known poses that are `delta` frames apart.
 
-    Rows count the `known` (T,) poses only, frames count all.
+    Args:
+        known: True for known poses, shape (T,).
+        delta: number of frames.
+
+    Returns:
+        Rows among the known poses, shape (P, 2).
     """
     first = np.arange(0, len(known) - delta, delta)
     row = np.cumsum(known) - 1
@@ -89,20 +110,23 @@ def pairs_by_frames(known: np.ndarray, delta: int) -> np.ndarray:
 
 
 def pairs_by_length(positions_m: Float, delta_m: float) -> np.ndarray:
-    """Rows (P, 2) between which the way is at least `delta_m` long, one after the other."""
-    ends, gone = [0], 0.0
-    for row, step in enumerate(np.linalg.norm(np.diff(positions_m, axis=0), axis=1), start=1):
-        gone += step
-        if gone >= delta_m:
+    """Return consecutive pairs of rows (P, 2) between which the path is at least `delta_m` long."""
+    ends, length_m = [0], 0.0
+    for row, step_m in enumerate(np.linalg.norm(np.diff(positions_m, axis=0), axis=1), start=1):
+        length_m += step_m
+        if length_m >= delta_m:
             ends.append(row)
-            gone = 0.0
+            length_m = 0.0
     return np.array([ends[:-1], ends[1:]], dtype=np.int64).T
 
 
 def robot_paths(poses: pd.DataFrame, odometry: Float, truth: PathTruth) -> pd.DataFrame:
-    """Rows of the tables `paths` and `robots` of one robot, from what the SLAM stage tells.
+    """Return the rows of the tables `paths` and `robots` of one robot.
 
-    Odometry (T, 3) are the motions from frame to frame.
+    Args:
+        poses: poses of the stage `slam`.
+        odometry: motions from frame to frame, shape (T, 3).
+        truth: true path.
     """
     dead_reckoned = np.array([*accumulate(odometry[1:], se2.compose, initial=np.zeros(3))])
     rows = poses.copy()
@@ -115,9 +139,10 @@ def robot_paths(poses: pd.DataFrame, odometry: Float, truth: PathTruth) -> pd.Da
 
 
 def path_statistics_rows(paths: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows of the table `path_statistics` from those of the table `paths`.
+    """Return the rows of the table `path_statistics`.
 
-    These may have a smoothed path beside the columns of the table.
+    Args:
+        paths: rows of the table `paths`, and optionally columns of the smoothed path.
     """
     rows = []
     for robot, own in paths.groupby("robot", sort=False):
@@ -130,21 +155,20 @@ def path_statistics_rows(paths: pd.DataFrame) -> list[dict[str, Any]]:
         truth = all_poses.pop("truth", np.full((len(own), 3), np.nan))
         known = np.asarray(np.isfinite(truth).all(axis=1))
         truth = truth[known]
-        for source in all_poses:
-            for quantity, delta, unit, errors in _errors(all_poses[source][known], truth, known):
-                what = {"quantity": quantity, "delta": delta, "delta_unit": unit, "n": len(errors)}
-                rows.append({"robot": robot, "source": source} | what | seven_statistics(errors))
+        by_frames = pairs_by_frames(known, RPE_DELTA)
+        by_length = pairs_by_length(truth[:, :2], RPE_DELTA)
+        for source, poses in all_poses.items():
+            path = poses[known]
+            measured = [
+                ("ate_m", np.nan, "", ate_m(path, truth)),
+                ("ate_from_start_m", np.nan, "", ate_m(path, truth, fit=False)),
+            ]
+            for unit, pairs in (("frames", by_frames), ("m", by_length)):
+                length_m, angle_rad = rpe(path, truth, pairs)
+                measured.append(("rpe_m", RPE_DELTA, unit, length_m))
+                measured.append(("rpe_rad", RPE_DELTA, unit, angle_rad))
+            for quantity, delta, unit, errors in measured:
+                key = {"robot": robot, "source": source, "quantity": quantity}
+                key |= {"delta": delta, "delta_unit": unit, "n": len(errors)}
+                rows.append(key | seven_statistics(errors))
     return rows
-
-
-def _errors(
-    path: Float, truth: Float, known: np.ndarray
-) -> Iterator[tuple[str, float, str, Float]]:
-    """What is measured of one path, over how many of which unit, and the errors."""
-    yield "ate_m", np.nan, "", ate_m(path, truth)
-    yield "ate_from_start_m", np.nan, "", ate_m(path, truth, fit=False)
-    by_frames, along = pairs_by_frames(known, RPE_DELTA), pairs_by_length(truth[:, :2], RPE_DELTA)
-    for unit, pairs in (("frames", by_frames), ("m", along)):
-        length_m, angle_rad = rpe(path, truth, pairs)
-        yield "rpe_m", RPE_DELTA, unit, length_m
-        yield "rpe_rad", RPE_DELTA, unit, angle_rad

@@ -1,8 +1,9 @@
-"""Result folder of a run: tables, maps and images that figures, checks and users read.
+"""Result folder of a run: tables, maps and images for figures, checks and users.
 
-`RESULT/tables/*.parquet`, `maps/` (one file a robot, the fused map, and `fused.2` and so on for
-robots that only each other's alignments connect), `keyframes/`, `figures/`, `scenario.json`
-(resolved), `world.json`, `provenance.json`.
+A result folder has `tables/*.parquet`, `maps/`, `keyframes/`, `figures/`, `scenario.json`
+(resolved), `world.json` and `provenance.json`. The folder `maps/` has one file for each robot and
+the fused map. Further fused maps, `fused.2` and so on, are of groups of robots that no accepted
+alignment connects to the first.
 """
 
 import platform
@@ -18,14 +19,14 @@ import pandas as pd
 
 from experiments.evaluation import fused_landmarks, tables
 from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.evaluated_run import TABLES_PART, JudgedRun, finding_rows
+from experiments.evaluation.evaluated_run import TABLES_PART, EvaluatedRun, finding_rows
 from experiments.evaluation.fused_landmarks import (
     FusedTeam,
     fused_history_rows,
     map_history_rows,
     true_pair_rows,
 )
-from experiments.evaluation.fused_map_errors import JudgedFusion, coverage_rows, fuser_rows
+from experiments.evaluation.fused_map_errors import EvaluatedFusion, coverage_rows
 from experiments.evaluation.pair_evaluation import ALIGNED
 from experiments.evaluation.path_errors import path_statistics_rows, robot_paths
 from experiments.evaluation.result_files import RESULT_SCHEMA_VERSION, require_tables
@@ -49,41 +50,45 @@ from mapfusion.files import (
     write_json,
 )
 from mapfusion.fusion.fusers import make_fuser
-from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import joint_path, write_map
 from mapfusion.viewing import viewing_paths
 from sim.floorplan import Wall
 from sim.renderer import renderer_name
 
-Maker = Callable[[], Any]
-_LONG = ("fused_map", "fusers", "fuser_coverage")  # to make, of those that figures read
+TableMaker = Callable[[], Any]  # returns the rows of a table
+_SLOW = ("fused_map", "fusers", "fuser_coverage")  # tables of figures that take long to compute
 _IN_NO_FIGURE = ("map_history", "fused_history", "path_statistics", "timings")
 
 
 def all_tables(
-    run: JudgedRun, team: FusedTeam, only: Collection[str] = tuple(tables.ALL)
+    run: EvaluatedRun, team: FusedTeam, only: Collection[str] = tuple(tables.ALL)
 ) -> dict[str, pd.DataFrame]:
-    """The tables of a finished run's last maps, paths, estimates and errors, by their names.
+    """Return tables of a finished run by name, without those of `history_table_makers`.
 
-    Of `only` those, if it is given: a sweep of short runs spends its time on the others.
+    Args:
+        run: the run.
+        team: its last maps, merged.
+        only: names of the tables that are needed.
     """
-    made_by = makers(run, team).items()
-    return {name: tables.framed(name, make()) for name, make in made_by if name in only}
+    makers = table_makers(run, team).items()
+    return {name: tables.as_table(name, make()) for name, make in makers if name in only}
 
 
-def in_order(made: Mapping[str, Maker]) -> tuple[dict[str, Maker], dict[str, Maker]]:
-    """Those that figures read, what takes long last, and those that no figure reads.
+def ordered_for_figures(
+    makers: Mapping[str, TableMaker],
+) -> tuple[dict[str, TableMaker], dict[str, TableMaker]]:
+    """Return the makers in two groups: tables that figures read, and the other tables.
 
-    In this order they are to be written: figures are drawn meanwhile, from what is there.
+    Figures are drawn while tables are written, so slow tables are at the end of the first group.
     """
-    of_figures = (name for name in made if name not in _IN_NO_FIGURE)
-    first = {name: made[name] for name in sorted(of_figures, key=_LONG.__contains__)}
-    return first, {name: made[name] for name in _IN_NO_FIGURE}
+    of_figures = (name for name in makers if name not in _IN_NO_FIGURE)
+    first = {name: makers[name] for name in sorted(of_figures, key=_SLOW.__contains__)}
+    return first, {name: makers[name] for name in _IN_NO_FIGURE}
 
 
-def makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:
-    """What makes these tables, by their names."""
-    settings = run.settings
+def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
+    """Return functions that compute the tables of last maps, paths, estimates and errors."""
+    settings, scenario = run.settings, run.scenario
 
     @cache
     def smoothed() -> list[SmoothedRobot]:
@@ -91,56 +96,108 @@ def makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:
 
     @cache
     def paths() -> pd.DataFrame:
-        return _paths(run, smoothed())
+        """Return the rows of `paths` and `robots`, with the smoothed path."""
+        parts = []
+        for stages, each in zip(run.pipeline.robots, smoothed(), strict=True):
+            poses = read_rows(run.store.path(stages.slam) / "poses.parquet", slam.POSES)
+            poses, log = poses.assign(robot=each.robot.name), run.logs[stages.name]
+            rows = robot_paths(poses, log.odometry, each.robot.path)
+            names = [f"smoothed_{name}" for name in POSE_FIELDS]
+            parts.append(rows.assign(**named_columns(names, each.last_path)))
+        return pd.concat(parts, ignore_index=True)
 
     @cache
-    def fusions() -> list[JudgedFusion]:
+    def fusions() -> list[EvaluatedFusion]:
         return run.load_fusions(team.robots, smoothed())
 
+    def fused_map() -> pd.DataFrame:
+        own = [fusion for fusion in fusions() if fusion.fuser == scenario.merge.fuser]
+        last = max(own, key=lambda fusion: fusion.iteration, default=None)
+        return pd.DataFrame() if last is None else fused_landmarks.fused_rows(last.team())
+
+    def team_paths() -> list[dict[str, Any]]:
+        # The last fusion of smoothed maps, if possible by `merge.fuser`, places smoothed paths.
+        smoothing = [fusion for fusion in fusions() if make_fuser(fusion.fuser).smoothed]
+        own = [fusion for fusion in smoothing if fusion.fuser == scenario.merge.fuser]
+        last = max(own or smoothing, key=lambda fusion: fusion.iteration, default=None)
+        return team_rows(team, paths(), None if last is None else last.fusion.T_first_map)
+
+    def clouds() -> pd.DataFrame:
+        parts = []
+        for robot in run.pipeline.robots:
+            rows = read_rows(run.store.path(robot.slam) / "clouds.parquet", slam.CLOUDS)
+            parts.append(rows.assign(robot=robot.name))
+        return pd.concat(parts, ignore_index=True)
+
+    def frame_times() -> pd.DataFrame:
+        parts = [
+            pd.DataFrame({"robot": name, "iteration": np.arange(len(log)), "time_s": log.time_s})
+            for name, log in run.logs.items()
+        ]
+        return pd.concat(parts, ignore_index=True)
+
+    def timings() -> list[dict[str, Any]]:
+        of_stages = [
+            timing_row(stage.name, stage.key, seconds, figure)
+            for stage in run.folders()
+            for figure, seconds in stage.figures().items()
+        ]
+        return of_stages + [timing_row(part, "run", s) for part, s in run.outside_s.items()]
+
+    def landmarks() -> pd.DataFrame:
+        iteration, rows = team.iteration, fused_landmarks.landmark_rows
+        parts = [rows(robot, *robot.at(iteration)) for robot in team.robots]
+        return pd.concat(parts, ignore_index=True)
+
+    def team_pairs() -> pd.DataFrame:
+        return team_pair_rows(team, run.pair_table("errors"), settings.merge.aligner)
+
+    def landmark_nees() -> list[dict[str, Any]]:
+        return fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m)
+
     of_pairs = ("errors", *ALIGNED, "fusion")
-    of_all: dict[str, Maker] = {name: partial(run.pair_table, name) for name in of_pairs}
-    of_all |= {
-        "landmarks": lambda: pd.concat(
-            [fused_landmarks.landmark_rows(r, *r.at(team.iteration)) for r in team.robots],
-            ignore_index=True,
-        ),
+    makers: dict[str, TableMaker] = {name: partial(run.pair_table, name) for name in of_pairs}
+    makers |= {
+        "landmarks": landmarks,
         "paths": paths,
         "robots": paths,
-        "clouds": lambda: _clouds(run),
+        "clouds": clouds,
         "smoothed_paths": lambda: smoothed_path_rows(smoothed()),
         "fused": lambda: fused_landmarks.fused_rows(team),
         "fused_motions": lambda: fused_landmarks.fused_motion_rows(team),
-        "fused_map": lambda: _fused_map_rows(run, fusions()),
+        "fused_map": fused_map,
     }
-    judged: dict[str, Maker] = {
-        "fusers": lambda: fuser_rows(fusions()),
+    with_truth: dict[str, TableMaker] = {
+        "fusers": lambda: [fusion.row() for fusion in fusions()],
         "fuser_coverage": lambda: coverage_rows(fusions()),
         "path_statistics": lambda: path_statistics_rows(paths()),
-        "team": lambda: team_rows(team, paths(), _placed_by_smoothed(run, fusions())),
-        "team_pairs": lambda: team_pair_rows(
-            team, run.pair_table("errors"), settings.merge.aligner
-        ),
+        "team": team_paths,
+        "team_pairs": team_pairs,
         "map_fits": lambda: fused_landmarks.map_fit_rows(team),
-        "landmark_nees": lambda: fused_landmarks.landmark_nees_rows(
-            team, settings.true_pair_radius_m
-        ),
+        "landmark_nees": landmark_nees,
     }
-    of_all |= dict.fromkeys(judged, list) if run.no_truth else judged
-    return of_all | {
-        "frame_times": lambda: _frame_times(run),
+    makers |= dict.fromkeys(with_truth, list) if run.no_truth else with_truth
+    return makers | {
+        "frame_times": frame_times,
         "findings": lambda: finding_rows(run),
         "smoother": lambda: smoother_rows(smoothed()),
         "team_edges": lambda: fused_landmarks.team_edge_rows(team),
-        "timings": lambda: _timings(run),
+        "timings": timings,
     }
 
 
-def history_makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:
-    """What makes the tables that a result has beside these, by their names, likewise."""
+def history_table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
+    """Return functions that compute the other tables: tracks, histories, times of aligners."""
+
+    def tracks() -> pd.DataFrame:
+        folders = [run.store.path(robot.observed) for robot in run.pipeline.simulated]
+        parts = [tables.read(folder / "tracks.parquet", "tracks") for folder in folders]
+        return pd.concat([pd.DataFrame(), *parts])
+
     no_truth = {"true_pairs": list} if run.no_truth else {}
     return {
         "aligner_timings": lambda: run.pair_table("aligner_timings"),
-        "tracks": lambda: _tracks(run),
+        "tracks": tracks,
         "true_pairs": lambda: true_pair_rows(team, run.settings.true_pair_radius_m),
         "map_history": lambda: map_history_rows(team),
         "fused_history": lambda: fused_history_rows(team, run.settings.merge),
@@ -148,71 +205,14 @@ def history_makers(run: JudgedRun, team: FusedTeam) -> dict[str, Maker]:
 
 
 def timing_row(stage: str, part: str, seconds: float, figure: str = "elapsed_s") -> dict[str, Any]:
-    """Return a row of the table `timings`, of a part of a stage, or of what is outside them."""
+    """Return a row of the table `timings`, of a stage or of a part of the run outside stages."""
     return {"stage": stage, "name": f"{part}:{figure}", "elapsed_s": seconds}
-
-
-def _timings(run: JudgedRun) -> list[dict[str, Any]]:
-    of_stages = [
-        timing_row(stage.name, stage.key, seconds, figure)
-        for stage in run.folders()
-        for figure, seconds in stage.figures().items()
-    ]
-    return of_stages + [timing_row(part, "run", s) for part, s in run.outside_s.items()]
-
-
-def _fused_map_rows(run: JudgedRun, fusions: Sequence[JudgedFusion]) -> pd.DataFrame:
-    named = [fusion for fusion in fusions if fusion.fuser == run.scenario.merge.fuser]
-    last = max(named, key=lambda fusion: fusion.iteration, default=None)
-    return pd.DataFrame() if last is None else fused_landmarks.fused_rows(last.team())
-
-
-def _placed_by_smoothed(run: JudgedRun, fusions: Sequence[JudgedFusion]) -> Float | None:
-    """T_first_map (M, 3) of the last map of a fuser of smoothed maps; of `merge.fuser` if it is."""
-    takes = [fusion for fusion in fusions if make_fuser(fusion.fuser).smoothed]
-    named = [fusion for fusion in takes if fusion.fuser == run.scenario.merge.fuser]
-    last = max(named or takes, key=lambda fusion: fusion.iteration, default=None)
-    return None if last is None else last.fusion.T_first_map
-
-
-def _paths(run: JudgedRun, smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
-    """Rows of the table `paths`, with the smoothed path beside its columns."""
-    paths = []
-    for stages, each in zip(run.pipeline.robots, smoothed, strict=True):
-        poses = read_rows(run.store.path(stages.slam) / "poses.parquet", slam.POSES)
-        poses, log = poses.assign(robot=each.robot.name), run.logs[stages.name]
-        rows = robot_paths(poses, log.odometry, each.robot.path)
-        names = [f"smoothed_{name}" for name in POSE_FIELDS]
-        paths.append(rows.assign(**named_columns(names, each.last_path)))
-    return pd.concat(paths, ignore_index=True)
-
-
-def _frame_times(run: JudgedRun) -> pd.DataFrame:
-    parts = [
-        pd.DataFrame({"robot": name, "iteration": np.arange(len(log)), "time_s": log.time_s})
-        for name, log in run.logs.items()
-    ]
-    return pd.concat(parts, ignore_index=True)
-
-
-def _clouds(run: JudgedRun) -> pd.DataFrame:
-    folders = ((each.name, run.robot_folders(each).slam) for each in run.pipeline.robots)
-    clouds = [
-        read_rows(folder / "clouds.parquet", slam.CLOUDS).assign(robot=name)
-        for name, folder in folders
-    ]
-    return pd.concat(clouds, ignore_index=True)
-
-
-def _tracks(run: JudgedRun) -> pd.DataFrame:
-    files = [run.store.path(robot.observed) / "tracks.parquet" for robot in run.pipeline.simulated]
-    return pd.concat([pd.DataFrame(), *(tables.read(file, "tracks") for file in files)])
 
 
 OnWritten = Callable[[Path, str], None]
 _SUBFOLDERS = ("tables", "maps", "keyframes", "figures")
 _LABEL = "write the tables"
-_FACE_DECIMALS = 6  # a micrometre: what is beyond is rounding
+_FACE_DECIMALS = 6  # a micrometre; further decimals are rounding errors
 
 
 def require_result(result: Path) -> None:
@@ -232,11 +232,21 @@ def run_scenario(
     output: Path | None = None,
     on_written: OnWritten = lambda folder, part: None,
 ) -> Path:
-    """Run a scenario and write its result, to `RESULTS/NAME-SEED` by default; returns the folder.
+    """Run a scenario and write its result.
 
-    The store is that of `results`. `on_written` is told (folder, part) as `write_result` has it.
+    Args:
+        scenario: the scenario.
+        results: folder of results and of the store.
+        jobs: number of processes.
+        on_progress: is told of finished tasks.
+        fresh: discard stored stages first.
+        output: folder of the result; `results/NAME-SEED` by default.
+        on_written: is called as by `write_result`.
+
+    Returns:
+        The folder of the result.
     """
-    run = JudgedRun.of(scenario, Store.of(results))
+    run = EvaluatedRun.of(scenario, Store.of(results))
     folder = output or results / f"{scenario.name}-{scenario.seed}"
     for place in (run.store.root, folder, *(folder / name for name in _SUBFOLDERS)):
         require_writable(place)
@@ -256,57 +266,61 @@ def run_scenario(
 
 
 def write_result(
-    run: JudgedRun, folder: Path, on_written: OnWritten = lambda folder, part: None
+    run: EvaluatedRun, folder: Path, on_written: OnWritten = lambda folder, part: None
 ) -> None:
-    """Collect a finished plan's tables, maps and images in a result folder.
+    """Write tables, maps and images of a finished run into a result folder.
 
-    `on_written` is told (folder, part) of each table, and of `scenario`, when it is there. World
-    and images are there before the first of them.
+    Args:
+        run: the run.
+        folder: folder of the result.
+        on_written: is called with the folder and the name of each table after it was written, and
+            with `scenario`. World and images are written before the first table.
     """
     with run.timed(TABLES_PART):
         team = run.team
     measure_aligners(run)
     (folder / "provenance.json").unlink(missing_ok=True)  # it lists the files of an earlier run
+
+    def write_table(name: str, make: TableMaker) -> None:
+        tables.write(tables.table_path(folder, name), name, make())
+        on_written(folder, name)
+
     with run.timed(TABLES_PART):
-        made = _write_parts(run, team, folder, on_written)
-    # Times are added to this table later, so the list of files leaves it out.
+        for outdated in ("maps", "keyframes"):  # may have other robots and frames
+            shutil.rmtree(folder / outdated, ignore_errors=True)
+        for robot in run.pipeline.simulated:
+            features = run.store.path(robot.features)
+            require_sound(features, "image_*.png")
+            for path in sorted(features.glob("image_*.png")):
+                iteration = int(path.stem.removeprefix("image_"))
+                link_or_copy(path, folder / "keyframes" / f"{robot.name}_{iteration:05d}.png")
+        write_json(folder / "world.json", _world(run.scenario, team.robots))
+        of_figures, others = ordered_for_figures(
+            table_makers(run, team) | history_table_makers(run, team)
+        )
+        for name, make in of_figures.items():
+            write_table(name, make)
+        write_json(folder / "scenario.json", run.scenario.resolved())
+        on_written(folder, "scenario")
+        make_timings = others.pop("timings")
+        for name, make in others.items():
+            write_table(name, make)
+        _write_maps(run, folder / "maps")
+    # Figures add their times to `timings` later, so the list of files does not include this table.
+    names = [*of_figures, *others]
     files = [folder / "scenario.json", folder / "world.json", *(folder / "maps").glob("*")]
-    files += [tables.table_path(folder, name) for name in made if name != "timings"]
-    tables.write(tables.table_path(folder, "timings"), "timings", made["timings"]())
-    on_written(folder, "timings")
-    about = provenance(run) | {"tables": sorted(made), "files": file_entries(folder, files)}
-    write_json(folder / "provenance.json", about)
-
-
-def _write_parts(
-    run: JudgedRun, team: FusedTeam, folder: Path, on_written: OnWritten
-) -> dict[str, Maker]:
-    """Write images, maps and all tables but `timings`; return the makers of all tables by name."""
-    for outdated in ("maps", "keyframes"):  # of robots or frames that are no longer there
-        shutil.rmtree(folder / outdated, ignore_errors=True)
-    _write_images(run, folder)
-    write_json(folder / "world.json", _world(run.scenario, team.robots))
-
-    def write_tables(made: Mapping[str, Maker]) -> None:
-        for name, make in made.items():
-            tables.write(tables.table_path(folder, name), name, make())
-            on_written(folder, name)
-
-    of_figures, others = in_order(makers(run, team) | history_makers(run, team))
-    write_tables(of_figures)
-    write_json(folder / "scenario.json", run.scenario.resolved())
-    on_written(folder, "scenario")
-    write_tables({name: make for name, make in others.items() if name != "timings"})
-    _write_maps(run, folder / "maps")
-    return of_figures | others
+    files += [tables.table_path(folder, name) for name in names]
+    write_table("timings", make_timings)
+    written = {"tables": sorted([*names, "timings"]), "files": file_entries(folder, files)}
+    write_json(folder / "provenance.json", provenance(run) | written)
 
 
 def add_times(folder: Path, seconds: Mapping[str, Mapping[str, float]]) -> None:
-    """Add the times of what follows the tables to the table `timings`.
+    """Add the times of work after the tables to the table `timings`.
 
     Args:
-        folder: of a result.
-        seconds: of work, by the part of the run and by what it made.
+        folder: folder of a result.
+        seconds: times in s, by part of the run and by name.
     """
     path = tables.table_path(folder, "timings")
     more = [
@@ -317,10 +331,10 @@ def add_times(folder: Path, seconds: Mapping[str, Mapping[str, float]]) -> None:
     tables.write(path, "timings", [*records(tables.read(path, "timings")), *more])
 
 
-def measure_aligners(run: JudgedRun) -> None:
-    """Time every aligner on each pair's maps of growing overlap; a table already there is kept.
+def measure_aligners(run: EvaluatedRun) -> None:
+    """Time every aligner on pairs of maps, unless the table `aligner_timings` exists.
 
-    Serially, when all else is done: nothing else may be running.
+    Aligners run one after the other. No other process may be busy.
     """
     for pair, path in run.untimed():
         with run.timed("timing the aligners"):
@@ -329,7 +343,7 @@ def measure_aligners(run: JudgedRun) -> None:
             tables.write(path, "aligner_timings", timing.rows())
 
 
-def _write_maps(run: JudgedRun, folder: Path) -> None:
+def _write_maps(run: EvaluatedRun, folder: Path) -> None:
     for name, landmarks in run.last_maps(run.team.iteration).items():
         write_map(folder / f"{name}.parquet", landmarks)
     for robot in run.pipeline.robots:
@@ -342,19 +356,19 @@ def _write_maps(run: JudgedRun, folder: Path) -> None:
 
 
 def _put_map(source: Path, target: Path) -> None:
-    """A map as it is stored, with what lies beside it."""
+    """Copy a stored map with the files that belong to it."""
     sources, targets = ((path, joint_path(path), *viewing_paths(path)) for path in (source, target))
-    for own, place in zip(sources, targets, strict=True):
-        if own.is_file():
-            link_or_copy(own, place)
+    for stored, copy in zip(sources, targets, strict=True):
+        if stored.is_file():
+            link_or_copy(stored, copy)
 
 
 def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str, object]:
-    """The truth that figures show as background."""
+    """Return walls and true start poses, the background of figures."""
     plan = scenario.world if isinstance(scenario, Simulation) else None
     walls = plan.walls if plan is not None else []
-    thick = plan.wall_thickness_m if plan is not None else 0.0
-    solid = [Wall(np.array(wall.points), thickness_m=thick) for wall in walls]
+    thickness_m = plan.wall_thickness_m if plan is not None else 0.0
+    solid = [Wall(np.array(wall.points), thickness_m=thickness_m) for wall in walls]
     faces = [edge.round(_FACE_DECIMALS).tolist() for wall in solid for edge in wall.outline()]
     known = [robot for robot in robots if np.isfinite(robot.path.T_world_map).all()]
     starts = {robot.name: robot.path.T_world_map.tolist() for robot in known}
@@ -362,14 +376,14 @@ def _world(scenario: AnyScenario, robots: Sequence[EvaluatedRobot]) -> dict[str,
 
 
 def renderer(scenario: AnyScenario) -> str:
-    """What made the pictures."""
+    """Return the name of the renderer."""
     if isinstance(scenario, Simulation):
         return renderer_name(scenario.render.renderer)
     return "none (imported logs)"
 
 
-def provenance(run: JudgedRun) -> dict[str, Any]:
-    """JSON-able description of a run: enough to make it again, or to see why it cannot be."""
+def provenance(run: EvaluatedRun) -> dict[str, Any]:
+    """Return a description of a run as JSON values, for its reproduction."""
     return {
         "schema_version": RESULT_SCHEMA_VERSION,
         "scenario": run.scenario.name,
@@ -386,11 +400,3 @@ def provenance(run: JudgedRun) -> dict[str, Any]:
         },
         "stages": {f"{folder.name}/{folder.key}": folder.finished for folder in run.folders()},
     }
-
-
-def _write_images(run: JudgedRun, folder: Path) -> None:
-    for robot in run.pipeline.simulated:
-        require_sound(run.store.path(robot.features), "image_*.png")
-        for path in sorted(run.store.path(robot.features).glob("image_*.png")):
-            iteration = int(path.stem.removeprefix("image_"))
-            link_or_copy(path, folder / "keyframes" / f"{robot.name}_{iteration:05d}.png")

@@ -1,4 +1,4 @@
-"""Read the JSON files of a result folder, and check that its files are as the run wrote them."""
+"""JSON files of a result folder, and a check that the files of a result are unchanged."""
 
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ class _World(BaseModel):
 class _Provenance(BaseModel):
     stages: dict[str, Any] = {}
     tables: list[str] = []
-    files: dict[str, FileEntry] = {}  # none in results of earlier versions
+    files: dict[str, FileEntry] = {}  # empty in results of earlier versions
     libraries: dict[str, str] = {}
 
 
@@ -65,7 +65,7 @@ def require_tables(result: Path) -> None:
 
 
 def require_as_written(result: Path) -> None:
-    """Raise DamagedFileError if a table, map or description is not as the run wrote it."""
+    """Raise DamagedFileError if a table, map or JSON file was changed after the run."""
     path = result / "provenance.json"
     if path.is_file():
         require_unchanged(result, _Provenance.model_validate(read_provenance(path)).files)

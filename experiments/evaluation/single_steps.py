@@ -1,11 +1,20 @@
-"""Single steps on a user's files: slam, align, merge."""
+"""Single steps on a user's files: record, export as a dataset, slam, align, merge."""
 
+import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.evaluation.evaluated_run import JudgedRun, finding_of_truth
+import numpy as np
+
+from experiments.evaluation.evaluated_run import EvaluatedRun, finding_of_truth
+from experiments.pipeline.pipeline import SimulatedRobotStages
+from experiments.pipeline.stage import Stage
+from experiments.pipeline.stages.drive import TRAJECTORY_FILE
+from experiments.pipeline.stages.features import rendered
+from experiments.pipeline.stages.log import measured_odometry
+from experiments.pipeline.stages.observed import told_tilt
 from experiments.pipeline.store import Store, link_or_copy, mending
 from experiments.pipeline.tables import estimate_row
 from experiments.pipeline.tasks import OnProgress
@@ -15,6 +24,8 @@ from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Reco
 from mapfusion.align.alignment import NOT_RUN, Pairs, Status
 from mapfusion.align.correspondences import match
 from mapfusion.attitude import read_attitude
+from mapfusion.datasets.export import StereoDrive
+from mapfusion.datasets.formats import EXPORTERS, export_drive
 from mapfusion.datasets.log_consistency import Finding, check_log, gate_finding, without_jumps
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
@@ -26,6 +37,8 @@ from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.registration import Registration
 from mapfusion.robot_log import read_log, read_odometry_covariance, read_true_poses
+from sim.recorder import FrameSource
+from sim.trajectory import Trajectory, read_trajectory
 
 
 def require_simulation(scenario: AnyScenario) -> None:
@@ -38,9 +51,9 @@ def require_simulation(scenario: AnyScenario) -> None:
 def record(
     scenario: AnyScenario, output: Path, results: Path, jobs: int, on_progress: OnProgress
 ) -> list[Path]:
-    """Simulate and write one log a robot into `output`; returns their folders."""
+    """Simulate, and write the log of each robot into `output`; return the folders of the logs."""
     require_simulation(scenario)
-    run = JudgedRun.of(scenario, Store.of(results))
+    run = EvaluatedRun.of(scenario, Store.of(results))
 
     def make() -> None:
         run.execute(jobs, on_progress, [robot.log for robot in run.pipeline.simulated])
@@ -52,12 +65,12 @@ def record(
     return [output / robot.name for robot in run.pipeline.robots]
 
 
-class MadeMap(NamedTuple):
+class SlamResult(NamedTuple):
     """Map of one robot's log.
 
     Attributes:
-        landmarks: the most probable map at its end.
-        findings: what the log says against itself.
+        landmarks: map of the most probable particle at the end.
+        findings: contradictions in the log.
     """
 
     landmarks: LandmarkMap
@@ -65,41 +78,46 @@ class MadeMap(NamedTuple):
 
     @property
     def unusable(self) -> str:
-        """Why nothing can be done with the map; empty where it can be used."""
+        """Reason why the map cannot be used; empty if it can."""
         if not len(self.landmarks):
             return "the map is empty: no landmark was seen often enough where it was expected"
         gate = [finding.text for finding in self.findings if finding.kind == "gate"]
         return f"the map does not describe its log: {gate[0]}" if gate else ""
 
 
-def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> MadeMap:
-    """The most probable map at the end of a log, by a scenario's `slam` section and seed."""
+def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> SlamResult:
+    """Map the log of a robot with the `slam` section and the seed of a scenario.
+
+    Raises:
+        InputError: the log cannot be read or has no frame.
+    """
     robot_log = read_log(log)
     if not len(robot_log):
         raise InputError(f"{log}: frames.parquet holds no frame")
     n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
-    found = check_log(robot_log, settings.slam.filter.motion)
-    own = without_jumps(robot_log, found.jumps, read_odometry_covariance(log, n_frames))
-    wanted, least, made = [n_frames - 1], settings.slam.min_count, None
-    told = own[1], read_attitude(log, n_frames)
-    for frame in run_log(own[0], settings.slam.filter, rng, wanted, least, *told):
+    checked = check_log(robot_log, settings.slam.filter.motion)
+    stated = read_odometry_covariance(log, n_frames)
+    used_log, covariance = without_jumps(robot_log, checked.jumps, stated)
+    kept, min_count, last = [n_frames - 1], settings.slam.min_count, None
+    attitude, parameters = read_attitude(log, n_frames), settings.slam.filter
+    for frame in run_log(used_log, parameters, rng, kept, min_count, covariance, attitude):
         on_progress("FastSLAM", frame.iteration + 1, n_frames)
-        made = frame
-    assert made is not None
-    assert made.landmarks is not None
-    assert made.associations is not None
-    gate = gate_finding(robot_log, made.associations)
-    findings = [*found.findings, *([] if gate is None else [gate])]
-    poses = read_true_poses(log)  # for this check alone, after the map is made
+        last = frame
+    assert last is not None
+    assert last.landmarks is not None
+    assert last.associations is not None
+    gate = gate_finding(robot_log, last.associations)
+    findings = [*checked.findings, *([] if gate is None else [gate])]
+    poses = read_true_poses(log)  # only for this check, after the map is complete
     if poses is not None and len(poses) == n_frames:
         sound = not any(finding.kind == "odometry" for finding in findings)
         truth = finding_of_truth(robot_log, poses, settings.slam.filter.motion, sound)
         findings += [] if truth is None else [truth]
-    return MadeMap(made.landmarks, tuple(findings))
+    return SlamResult(last.landmarks, tuple(findings))
 
 
 def save_map(path: Path, landmarks: LandmarkMap) -> None:
-    """Write a map where the user wants it; raises InputError where that is impossible."""
+    """Write a map; raise InputError if that is impossible."""
     _save(path, map_writes(path, landmarks))
 
 
@@ -110,21 +128,21 @@ def _save(path: Path, writes: Mapping[Path, Write]) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-# Why an alignment that is accepted by itself is not used.
-_OF_THE_TEAM = {
+# Reasons why the team does not use an accepted alignment.
+_TEAM_REASONS = {
     EdgeStatus.UNCONFIRMED: "no other alignment confirms this one",
     EdgeStatus.CONTRADICTED: "other alignments contradict this one",
     EdgeStatus.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
 }
 
 
-class Merged(NamedTuple):
-    """Maps of the user's own made one.
+class MergeResult(NamedTuple):
+    """Result of a merge of a user's maps.
 
     Attributes:
-        fusion: result of the merge.
-        pairs: alignments of every pair of maps in the order of `fusion.edge_status`, including the
-            alternatives of ambiguous ones.
+        fusion: fused maps.
+        pairs: alignments of all pairs of maps, in the order of `fusion.place`; with the
+            alternatives of ambiguous alignments.
     """
 
     fusion: Fusion
@@ -132,35 +150,36 @@ class Merged(NamedTuple):
 
     @property
     def any_merged(self) -> bool:
-        """Return True if two maps or more were merged."""
+        """True if two or more maps were merged."""
         return len(self.fusion.fused[0].members) > 1
 
     def reasons(self) -> dict[tuple[int, int], str]:
-        """Return why each two maps were not merged by their own alignment; empty if they were."""
-        found: dict[tuple[int, int], str] = {}
-        for pair, status in zip(self.pairs, self.fusion.edge_status, strict=True):
-            reason = pair.alignment.reason or _OF_THE_TEAM.get(status, "")
-            if status in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
-                found[pair.a, pair.b] = ""
+        """Return by pair of maps the reason why their alignment is not used; empty if it is."""
+        reasons: dict[tuple[int, int], str] = {}
+        for pair, place in zip(self.pairs, self.fusion.place, strict=True):
+            reason = pair.alignment.reason or _TEAM_REASONS.get(place, "")
+            if place in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
+                reasons[pair.a, pair.b] = ""
             else:
-                found.setdefault((pair.a, pair.b), reason)
-        return found
+                reasons.setdefault((pair.a, pair.b), reason)
+        return reasons
 
 
-def numbered(path: Path, k: int) -> Path:
-    """Return where the k-th of several fused maps goes: `path` itself, then `.2` and so on."""
+def numbered_path(path: Path, k: int) -> Path:
+    """Return the path of the k-th fused map: `path` for k = 1, then `.2` and so on."""
     return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
 
 
-def save_fused(path: Path, merged: Merged) -> list[Path]:
-    """Write the fused maps: that of the most maps to `path`, others beside it, from `.2` on.
+def save_fused(path: Path, merged: MergeResult) -> list[Path]:
+    """Write all fused maps or none, the map of most robots to `path`; see `numbered_path`.
 
-    All are written or none. Where nothing was merged there is none.
+    Returns:
+        The paths of the maps; none if no maps were merged.
     """
     if not merged.any_merged:
         return []
     fused = merged.fusion.fused
-    paths = [numbered(path, k) for k in range(1, len(fused) + 1)]
+    paths = [numbered_path(path, k) for k in range(1, len(fused) + 1)]
     writes: dict[Path, Write] = {}
     for place, each in zip(paths, fused, strict=True):
         writes |= map_writes(place, each.landmarks)
@@ -174,10 +193,10 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
 
 
 def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, Any]]:
-    """Yield every aligner's estimate, its refinement and the verdict on it, a row at a time.
+    """Yield for each aligner a row with its estimate, the refinement and the verdict.
 
-    Each is called twice, with the same random numbers, and the second call is timed: the first
-    compiles kernels and starts processes. Nothing of the first is kept for the second.
+    Each aligner is called twice with the same random numbers, and the second call is timed. The
+    first call compiles kernels and starts processes.
     """
     map_a, map_b = read_map(path_a), read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
@@ -193,8 +212,8 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
         yield row
 
 
-def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:
-    """What became of an estimate (a row of `align`) in the end, and what is to be said of it."""
+def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
+    """Return the final status of a row of `align`, and the reason."""
     status = Status(row["verdict"])
     if row["status"] in NOT_RUN:
         status = Status(row["status"])
@@ -203,8 +222,14 @@ def verdict_on(row: Mapping[str, Any]) -> tuple[Status, str]:
     return status, row["reason"] or row["refined_reason"] or row["acceptance_reason"]
 
 
-def merge(paths: Sequence[Path], settings: Scenario) -> Merged:
-    """Fuse maps by the alignments of each with each, a pair in the order of its robots' names."""
+def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
+    """Align all pairs of maps and fuse the maps.
+
+    The maps of a pair are in the order of their robots' names.
+
+    Raises:
+        InputError: there are fewer than two maps, a map cannot be read, or the aligner is unknown.
+    """
     if len(paths) < 2:
         raise InputError("merge: give two maps or more")
     name, entries = settings.merge.aligner, {each.name: each for each in settings.align.aligners}
@@ -218,11 +243,78 @@ def merge(paths: Sequence[Path], settings: Scenario) -> Merged:
         offered = match(maps[a], maps[b], settings.align.match)
         ready = registration.on(maps[a], maps[b], offered)
         done = ready.register(rng)
-        sureness = done.verdict.log10_false_alarms
-        pairs.append(AlignedPair(a, b, done.applied, offered, sureness))
+        false_alarms = done.verdict.log10_false_alarms
+        pairs.append(AlignedPair(a, b, done.applied, offered, false_alarms))
         if done.applied.status is Status.AMBIGUOUS and ready.judge is not None:
             rivals = ready.judge.rivals_of(done.refined)
-            pairs += [AlignedPair(a, b, rival, offered, sureness) for rival in rivals]
+            pairs += [AlignedPair(a, b, rival, offered, false_alarms) for rival in rivals]
     chosen = settings.merge
     fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))
-    return Merged(fusion, pairs)
+    return MergeResult(fusion, pairs)
+
+
+def write_drives(
+    scenario: AnyScenario,
+    format_name: str,
+    output: Path,
+    results: Path,
+    jobs: int,
+    on_progress: OnProgress,
+) -> list[Path]:
+    """Simulate, and write images, odometry and truth of each robot as a dataset.
+
+    Args:
+        scenario: the simulation.
+        format_name: name of the dataset format.
+        output: folder of the datasets.
+        results: folder of the store.
+        jobs: number of processes.
+        on_progress: is told of finished tasks and frames.
+
+    Returns:
+        The paths that `mapfusion import` reads.
+
+    Raises:
+        InputError: the format is unknown, or the scenario is a recording.
+    """
+    if format_name not in EXPORTERS:
+        known = ", ".join(["log", *EXPORTERS])
+        raise InputError(f"--format {format_name}: unknown; known: {known}")
+    require_simulation(scenario)
+    run = EvaluatedRun.of(scenario, Store.of(results))
+    robots = run.pipeline.simulated
+    drive, faces = (robots[0].features.before[name] for name in ("drive", "faces"))
+    assert isinstance(drive, Stage)
+    assert isinstance(faces, Stage)
+    mending(run.store, lambda: run.execute(jobs, on_progress, [drive, faces]))
+    trajectory = read_trajectory(run.store.path(drive) / TRAJECTORY_FILE)
+    settings = robots[0].features.settings  # all robots have the same camera and renderer
+    world = (run.store.path(faces), settings.camera, trajectory.robots, settings.renderer)
+    written = []
+    with FrameSource(*world) as source:
+        for robot in robots:
+            label = f"{robot.name}: write {format_name}"
+            dataset = _stereo_drive(robot, trajectory, source)
+            show = functools.partial(on_progress, label)
+            written += export_drive(format_name, output, dataset, show)
+    return written
+
+
+def _stereo_drive(
+    robot: SimulatedRobotStages, trajectory: Trajectory, source: FrameSource
+) -> StereoDrive:
+    def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
+        frame = rendered(robot.features.settings, source, trajectory.bodies(k), k)
+        return frame.left, frame.right
+
+    index, tilts = trajectory.index(robot.name), trajectory.tilt_rad
+    return StereoDrive(
+        robot.name,
+        robot.features.settings.camera,
+        trajectory.time_s,
+        trajectory.T_world_robot[index],
+        measured_odometry(robot.log.settings, trajectory),
+        pair,
+        None if tilts is None else tilts[index],
+        told_tilt(robot.observed.settings, trajectory),
+    )

@@ -1,4 +1,4 @@
-"""Smoothed maps and paths compared with the truth and with the filter."""
+"""Smoothed maps and paths, compared with the truth and with the filter."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,10 +10,9 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.map_consistency import fitted, relative_consistency
-from experiments.evaluation.pair_evaluation import truth_of
+from experiments.evaluation.map_consistency import fit_to_truth, relative_consistency
 from experiments.evaluation.path_errors import ate_m
-from experiments.evaluation.truth import landmark_truth
+from experiments.evaluation.truth import landmark_truth, truth_or_unknown
 from experiments.pipeline.stages.slam import RobotFolders, final_path
 from experiments.pipeline.stages.smooth import (
     read_endings,
@@ -29,16 +28,16 @@ from mapfusion.robot_log import RobotLog
 
 @dataclass(frozen=True)
 class SmoothedRobot:
-    """What the smoother made of a robot's log, by the iterations that have a smoothed map.
+    """Smoothed maps and paths of a robot, by iteration, with the truth.
 
     Attributes:
-        robot: its filter's maps, and its true path.
-        filter_path: (T, 3) the filter's whole path at the end.
-        maps: the last one with its joint covariance.
-        points_world_m: (N, 3) true points for each map, NaN where unknown.
-        paths: (k + 1, 3) up to each iteration k.
-        ending: how smoothing ended at the robot's last iteration.
-        not_smoothed: why there is no map, by the iterations that have none.
+        robot: maps of the filter, and true path.
+        filter_path: path of the filter at the end, shape (T, 3).
+        maps: smoothed maps; only the last one has its joint covariance.
+        points_world_m: true points of each map, shape (N, 3), NaN where unknown.
+        paths: smoothed paths until each iteration k, shape (k + 1, 3).
+        ending: convergence of the smoother at the last iteration.
+        not_smoothed: reasons by iteration where smoothing failed.
     """
 
     robot: EvaluatedRobot
@@ -51,16 +50,16 @@ class SmoothedRobot:
 
     @property
     def last_path(self) -> Float:
-        """(T, 3); NaN where the whole log was not smoothed."""
+        """Smoothed path of the whole log, shape (T, 3); NaN if smoothing failed."""
         unknown = np.full_like(self.filter_path, np.nan)
         return self.paths.get(len(self.filter_path) - 1, unknown)
 
     def given_at(self, iteration: int) -> tuple[int | None, str]:
-        """The smoothed map that a fuser is given at an iteration, by the iteration that it is of.
+        """Return the iteration of the smoothed map that a fuser is given at an iteration.
 
         Returns:
-            The last one until then, None for the filter's map where there is none; and why that
-            stands in for a map smoothed until then, empty where there is one.
+            The iteration of the last smoothed map until then, or None: the fuser is given the
+            filter's map. And the reason if smoothing failed at the iteration; else empty.
         """
         at = max((k for k in self.maps if k <= iteration), default=None)
         lacking = max((k for k in self.not_smoothed if k <= iteration), default=-1)
@@ -73,19 +72,26 @@ class SmoothedRobot:
 def load_smoothed(
     robot: EvaluatedRobot, folders: RobotFolders, log: RobotLog, smooth: Path
 ) -> SmoothedRobot:
-    """A robot's smoothed maps joined with the truth beside its log, NaN where it is unknown."""
-    truth, maps = truth_of(folders.log, log), read_smoothed(smooth, last_whole=True)
+    """Load a robot's smoothed maps and paths with the truth; NaN where unknown.
+
+    Args:
+        robot: maps of the filter, and true path.
+        folders: folders of its log and of the stage `slam`.
+        log: its log.
+        smooth: folder of the stage `smooth`.
+    """
+    truth, maps = truth_or_unknown(folders.log, log), read_smoothed(smooth, last_whole=True)
     points = landmark_truth(truth, partial(smoothed_owners, smooth, folders.slam), maps)
     endings = read_endings(smooth)
     reasons = dict(zip(endings["iteration"].tolist(), endings["not_smoothed"], strict=True))
     not_smoothed = {k: str(why) for k, why in reasons.items() if why}
-    whole = {str(name): value for name, value in endings.to_dict("records")[-1].items()}
+    ending = {str(name): value for name, value in endings.to_dict("records")[-1].items()}
     path, paths = final_path(folders.slam), read_smoothed_path(smooth)
-    return SmoothedRobot(robot, path, maps, points, paths, whole, not_smoothed)
+    return SmoothedRobot(robot, path, maps, points, paths, ending, not_smoothed)
 
 
 def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
-    """Rows of the table `smoothed_paths`."""
+    """Return the rows of the table `smoothed_paths`."""
     rows = [
         pd.DataFrame(named_columns(POSE_FIELDS, path)).assign(
             robot=each.robot.name, iteration=k, frame=np.arange(len(path))
@@ -97,11 +103,11 @@ def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
 
 
 def smoother_rows(smoothed: Sequence[SmoothedRobot]) -> list[dict[str, Any]]:
-    """Rows of the table `smoother`: each robot's last maps and whole paths."""
-    return [_row(each) for each in smoothed]
+    """Return the rows of the table `smoother`: last maps and whole paths of the robots."""
+    return [_smoother_row(each) for each in smoothed]
 
 
-def _row(smoothed: SmoothedRobot) -> dict[str, Any]:
+def _smoother_row(smoothed: SmoothedRobot) -> dict[str, Any]:
     robot, last = smoothed.robot, len(smoothed.filter_path) - 1
     path_m, filter_m = (
         path_rmse_m(path, robot.path.T_map_robot)
@@ -110,12 +116,12 @@ def _row(smoothed: SmoothedRobot) -> dict[str, Any]:
     row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
     row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | smoothed.ending
     row["not_smoothed"] = smoothed.given_at(last)[1]
-    of_filter = fitted(robot.maps[last], robot.points_world_m[last])
+    of_filter = fit_to_truth(robot.maps[last], robot.points_world_m[last])
     row |= {"filter_landmark_rmse_m": of_filter.rmse_m, "filter_gross_share": of_filter.gross_share}
     if last not in smoothed.maps:
         return row | {"n_landmarks": 0}
     landmarks = smoothed.maps[last]
-    fit = fitted(landmarks, smoothed.points_world_m[last])
+    fit = fit_to_truth(landmarks, smoothed.points_world_m[last])
     row |= {"landmark_rmse_m": fit.rmse_m, "gross_share": fit.gross_share}
     row |= {"n_landmarks": len(landmarks)}
     consistency = relative_consistency(landmarks, fit)
@@ -124,7 +130,7 @@ def _row(smoothed: SmoothedRobot) -> dict[str, Any]:
 
 
 def path_rmse_m(path: Float, truth: Float) -> float:
-    """RMS distance of the positions both know, from the same start; NaN where there is none."""
+    """Return the RMS position error without a fit; NaN if no pose is known in both paths."""
     known = np.isfinite(path).all(axis=1) & np.isfinite(truth).all(axis=1)
     if not known.any():
         return np.nan

@@ -1,9 +1,9 @@
-"""Schemas of the result tables: what the figures, the checks and other people's scripts read.
+"""Schemas of the result tables, which figures, checks and users' scripts read.
 
-All are Parquet, in `RESULT/tables/`. Units are in the names; rotations are counter-clockwise.
-`elapsed_s` columns live in `timings` and `aligner_timings` alone: every other table is the same,
-bit for bit, whenever the scenario and the seed are. A column's type follows from its name, which
-means the same in all tables: what is not listed in `_NAMES` is a float.
+The tables are Parquet files in `RESULT/tables/`. Names of columns contain the unit. Rotations are
+counter-clockwise. Only `timings` and `aligner_timings` have measured times: all other tables are
+bit for bit the same for the same scenario and seed. A column has the same type in all tables.
+Columns that are not in `_NAMES` are floats.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, schema
 if TYPE_CHECKING:  # as in `frames`
     import pandas as pd
 
-# Names that are no floats.
+# Columns that are not floats.
 _NAMES = {
     tables.TEXT: """acceptance_reason aligner check delta_unit fallback finding fuser landmarks
         left_out map name not_smoothed place quantity reason refined_reason refined_status robot
@@ -30,7 +30,7 @@ _NAMES = {
         n_robots n_steps n_team n_true particle repetition""",
     tables.BOOL: "accepted resampled true_pair",
 }
-# In plan: single precision, for looking at and not for computing with, takes half the size.
+# Columns of a floor plan, for figures: single precision takes half the space.
 _PLAN = ("x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 _OTHER_TYPES = {
     "map_history": dict.fromkeys(_PLAN, pa.float32()),
@@ -38,134 +38,134 @@ _OTHER_TYPES = {
     "true_pairs": {"true_pair": pa.binary()},
 }
 _VERSIONS = {"errors": 4}  # of the others: 1
-UNKNOWN = -1  # a count that only the truth could tell
+UNKNOWN = -1  # a count that needs the truth, without truth
 _POINT = " ".join(POSITION_FIELDS + COVARIANCE_FIELDS)
 _COLUMNS = {
-    # One row per (robot pair, iteration, aligner, repetition), the estimates joined with the truth.
-    # The aligner named "oracle" was given the true pairs; it has one repetition. rotation_error_rad
-    # is signed, estimate minus truth; verdict to acceptance_reason are of the refined alignment
-    # (mapfusion/evidence); oracle_distance: of the refined alignment from the oracle's;
-    # n_true: true ones among the correspondences; n_common: landmarks of the two maps that truly
-    # correspond; precision and recall: of the refined inliers; alignment_nees: refined, 3 degrees
-    # of freedom.
+    # One row per (robot pair, iteration, aligner, repetition): estimates compared with the truth.
+    # The aligner "oracle" is given the true pairs and has one repetition. rotation_error_rad is
+    # signed: estimate minus truth. Columns from verdict to acceptance_reason belong to the refined
+    # alignment (mapfusion/verification). oracle_distance: distance of the refined alignment from
+    # the oracle's. n_true: true pairs among the correspondences. n_common: common landmarks of the
+    # maps. precision, recall: of the refined inliers. alignment_nees: NEES of the refined
+    # alignment, 3 degrees of freedom.
     "errors": """robot_a robot_b iteration aligner repetition status reason
         translation_error_m rotation_error_rad
         refined_status refined_reason refined_translation_error_m refined_rotation_error_rad
         verdict accepted log10_false_alarms log10_evidence n_confirmed n_contradicted
         probability acceptance_reason oracle_distance_m oracle_distance_rad
         n_correspondences n_true n_common n_inliers precision recall alignment_nees""",
-    # One row per (robot, iteration); best particle online, anchored at the start, no fit. spread_m:
-    # root of the trace of the particles' weighted position covariance. n_landmarks: of the best
-    # particle, however often seen; its map holds those that were seen `slam.min_count` times.
+    # One row per (robot, iteration): online path of the best particle and odometry, both from the
+    # true start without a fit. spread_m: root of the trace of the particles' weighted position
+    # covariance. n_landmarks: all landmarks of the best particle, also those that were seen less
+    # than `slam.min_count` times.
     "robots": """robot iteration path_error_m path_error_rad odometry_error_m odometry_error_rad
         effective_sample_size resampled n_landmarks spread_m""",
-    # Paths in the robot's own frame: the best particle's whole path at the end, the online
-    # estimate, odometry alone, and the truth.
+    # Paths in the frame of the robot's map. final: path of the best particle at the end. online:
+    # estimate at each frame. odometry: odometry alone.
     "paths": """robot iteration final_x_m final_y_m final_theta_rad
         online_x_m online_y_m online_theta_rad odometry_x_m odometry_y_m odometry_theta_rad
         truth_x_m truth_y_m truth_theta_rad""",
-    # When the frames of `paths` were, by the robot's log.
+    # Times of the frames of `paths`, from the robot's log.
     "frame_times": "robot iteration time_s",
-    # What the filter loses against a batch: each robot's log smoothed whole, its last map and path;
-    # see evaluation/smoothed_robots.py and map_consistency.py. Paths from the same start;
-    # landmarks after the best rigid fit without the gross ones, which are counted; their
-    # consistency with the gauge removed. filter_: of FastSLAM's last map and final path. The
-    # degrees of freedom are of the Student-t's that observations and tracks' offsets were found to
-    # be of; observation_level is the factor on the observations' stated covariances that the log
-    # told. not_smoothed: why there is nothing, and what stands in (else empty).
+    # Last smoothed map and path of each robot, compared with FastSLAM's (filter_); see
+    # evaluation/smoothed_robots.py and map_consistency.py. Paths have the true start and no fit.
+    # Landmarks are compared after a rigid fit without gross landmarks, which are counted. Their
+    # consistency is computed with the gauge removed. observation_dof, offset_dof: estimated degrees
+    # of freedom of the Student t distributions of observations and of tracks' offsets.
+    # observation_level: estimated factor of the observations' covariances. not_smoothed: reason
+    # why smoothing failed and the map that is used instead; else empty.
     "smoother": """robot n_landmarks path_rmse_m filter_path_rmse_m filter_over_smoother
         landmark_rmse_m gross_share filter_landmark_rmse_m filter_gross_share
         nees_per_dof marginal_nees_per_dof coverage_95
         n_steps observation_dof offset_dof observation_level not_smoothed""",
-    # What each robot's log says against itself, see datasets/log_consistency.py. check: odometry
-    # (as a whole), truth, jump (a single increment, which is not used) or gate (most observations
-    # fell outside that of their landmark); iteration: of a jump, else -1.
+    # Contradictions in each robot's log, see datasets/log_consistency.py. check: odometry (as a
+    # whole), truth, jump (a single increment, which is not used) or gate (most observations are
+    # outside the gate of their landmark). iteration: frame of a jump, else -1.
     "findings": "robot check iteration finding",
-    # The smoothed path, in the robot's own frame, up to each iteration that maps are fused at.
+    # Smoothed paths in the frame of the robot's map, until each iteration with a fusion.
     "smoothed_paths": "robot iteration frame x_m y_m theta_rad",
-    # Particles at the kept iterations, in the robot's own frame.
+    # Particles at the stored iterations, in the frame of the robot's map.
     "clouds": "robot iteration particle x_m y_m theta_rad log_weight",
-    # The robots' last maps, each in its own frame; the true point is given in the same frame.
+    # Last maps of the robots with true points, each in its own frame.
     "landmarks": f"robot landmark {_POINT} count truth_x_m truth_y_m truth_z_m",
-    # The maps fused as the paper does (eq. 12 to 16 with drift, the fuser kalman-drift), in the
-    # frame of the first robot that is in them. The parents are rows of the robots' last maps;
-    # robot_b is empty for a landmark that was carried over from one map.
+    # The last maps, fused by the fuser of the paper (kalman-drift, eq. 12 to 16 with drift), in the
+    # frame of the first robot in the fused map. landmark_a, landmark_b: rows of the parents in the
+    # robots' last maps. robot_b is empty for a landmark of one map.
     "fused": f"""landmark {_POINT} n_parents robot_a landmark_a robot_b landmark_b
         truth_x_m truth_y_m truth_z_m""",
-    # The map that `merge.fuser` made of the robots' last maps, likewise; the parents are rows of
-    # the maps that it was given: the smoothed ones, where it takes these.
+    # The last maps, fused by `merge.fuser`. landmark_a, landmark_b: rows of the maps that the fuser
+    # was given, filtered or smoothed.
     "fused_map": f"""landmark {_POINT} n_parents robot_a landmark_a robot_b landmark_b
         truth_x_m truth_y_m truth_z_m""",
-    # One row per (fuser, iteration): the map of the most robots against the truth; see
-    # evaluation/fused_map_errors.py and map_consistency.py. landmark_rmse_m: in the frame of
-    # the first robot in it; fitted: after the best rigid fit; gross landmarks are left out of both
-    # and counted. over_better_parent: landmarks that two robots have, over the better of the maps
-    # that the fuser was given, over_better_filter: of FastSLAM's, each map fitted for itself;
-    # medians over pairs of robots. nees_per_dof, marginal_nees_per_dof and coverage_95: with the
-    # gauge removed, the first of all landmarks at once; a map that has no joint covariance (all but
-    # the last of each fuser) is taken for one of independent errors. frame_: in the frame, of each
-    # landmark for itself. alignment_: how the other robots' maps were moved, medians; sigma:
-    # as stated, see se2.motion_sigma. fallback: whether a simpler fuser stood in, or another map
-    # for a robot's smoothed one, which and why (else empty).
+    # One row per (fuser, iteration): errors of the fused map of the most robots; see
+    # evaluation/fused_map_errors.py and map_consistency.py. landmark_rmse_m: in the frame of the
+    # first robot in the map. fitted: after a rigid fit. Gross landmarks are counted and left out.
+    # over_better_parent: error of common landmarks of two robots over the error of the better of
+    # their maps that the fuser was given. over_better_filter: likewise for FastSLAM's maps. Each
+    # map is fitted separately; medians over pairs of robots. nees_per_dof (all landmarks together),
+    # marginal_nees_per_dof and coverage_95: with the gauge removed. Only the last map of a fuser
+    # has a joint covariance; errors of other maps are taken to be independent. frame_: in the frame
+    # of the map, of single landmarks. alignment_: medians of the motions of the other robots' maps;
+    # sigma: standard deviations by the covariance, see se2.motion_sigma. fallback: simpler fuser or
+    # other map that was used, with the reason; else empty.
     "fusers": """fuser iteration n_robots n_landmarks landmark_rmse_m fitted_rmse_m fitted_median_m
         gross_share over_better_parent over_better_filter
         nees_per_dof marginal_nees_per_dof coverage_95 frame_nees_per_dof frame_coverage_95
         alignment_error_m alignment_error_rad alignment_sigma_m alignment_sigma_rad
         alignment_nees_per_dof duplicate_share fallback""",
-    # Share of the true points inside the ellipses of a nominal probability, at the last iteration,
-    # of each fuser's map and before: map is fused, or filter or smoothed with no fuser, which are
-    # all robots' maps together. coverage: each map after its best rigid fit, with the gauge
-    # removed; frame_coverage: in its own frame. Without the gross ones, n_landmarks in all.
+    # Share of true points inside the ellipses of a nominal probability, at the last iteration. map:
+    # fused (of a fuser), or filter or smoothed (before fusion, of all robots, fuser empty).
+    # coverage: after a rigid fit of each map, with the gauge removed. frame_coverage: in the frame
+    # of the map. n_landmarks: number of landmarks, without gross ones.
     "fuser_coverage": "map fuser iteration n_landmarks nominal coverage frame_coverage",
-    # What becomes of the alignment of each two robots' last maps in the team: confirmed by a loop
-    # of others, a bridge that nothing confirms, contradicted, ambiguous, unconfirmed or refused.
+    # Role of the alignment of each robot pair in the team: confirmed by a loop of other alignments,
+    # bridge (used without confirmation), contradicted, ambiguous, unconfirmed or refused.
     "team_edges": "robot_a robot_b place",
-    # Each two robots against the truth: the merging aligner's last alignment by itself, as in
-    # `errors`, and T_a_b between the two as all believed alignments together place them; NaN where
-    # they are in no map together.
+    # One row per robot pair. refined_: error of the last alignment of the merging aligner, as in
+    # `errors`. team_: error of T_a_b in the fused map; NaN for robots in different maps.
     "team_pairs": """robot_a robot_b place accepted n_common
         refined_translation_error_m refined_rotation_error_rad
         team_translation_error_m team_rotation_error_rad""",
-    # Position errors of n_robots of a run's n_team: moved into one frame as their maps were, then
-    # all of them by one rigid fit. component: 1 for the fused map of most robots. source: as in
-    # `path_statistics`, smoothed paths as a fuser of smoothed maps moved
-    # these; n: poses.
+    # ATE of the n_robots of a fused map, of n_team robots of the run: paths are moved as the maps
+    # were, then all together by one rigid fit. component: 1 for the fused map of most robots.
+    # source: as in `path_statistics`; a fuser of smoothed maps moves smoothed paths. n: number of
+    # poses.
     "team": "component source n_robots n_team n rmse mean median std min max sse",
-    # How each robot's last map was moved into the fused map, the first robot's own among them; NaN
-    # for a map that was left out, with the reason (else empty). drift_sigma_m: as added to the
-    # landmarks' covariance in x and y.
+    # Motion of each robot's last map into the fused map. left_out: reason why a map is not in the
+    # fused map (the motion is NaN), else empty. drift_sigma_m: standard deviation that was added to
+    # the landmarks in x and y.
     "fused_motions": "robot tx_m ty_m theta_rad drift_sigma_m left_out",
-    # The robots' maps at each evaluated iteration, in plan, each in its own frame. `landmark` is
-    # the row of the map at that iteration, which correspondences of that iteration refer to.
+    # Maps at each evaluated iteration in plan view, each in its own frame. landmark: row of the map
+    # at that iteration, as in `correspondences`.
     "map_history": " ".join(("robot iteration landmark", *_PLAN)),
-    # Landmarks that the merging aligner's inliers joined at that iteration, fused, in robot a's
-    # frame.
+    # Fused inliers of the merging aligner at each iteration, in the frame of robot a.
     "fused_history": " ".join(("robot_a robot_b iteration landmark_a landmark_b", *_PLAN)),
-    # Which of the correspondences are true: one bit each, in their order in `correspondences`.
+    # One bit for each row of `correspondences`, in its order: 1 for true pairs.
     "true_pairs": "robot_a robot_b iteration n_correspondences true_pair",
-    # One row per fused landmark with two parents, per robot pair: was fusing worth it? error_b_m is
-    # moved into frame a by the estimate.
+    # One row per robot pair and fused landmark with two parents: errors before and after fusion.
+    # error_b_m: after the motion into frame a by the estimate.
     "fusion": """robot_a robot_b landmark_a landmark_b error_a_m error_b_m error_fused_m
         nees_with_drift nees_without_drift degrees_of_freedom true_pair""",
-    # Per map, after the best rigid fit to the truth; "fused" is the fused map.
+    # RMSE of each robot's map and of the fused map ("fused"), after a rigid fit to the truth.
     "map_fits": "map n_landmarks rmse_m",
     # Errors of whole paths with evo's seven statistics; see experiments/evaluation/path_errors.py.
-    # source: final, online (as in `paths`) or odometry; quantity: ate_m (after the best rigid fit),
-    # ate_from_start_m, rpe_m or rpe_rad, these over delta (frames or m); n: poses, or pairs of
-    # them.
+    # source: final, online (as in `paths`), odometry or smoothed. quantity: ate_m (after a rigid
+    # fit), ate_from_start_m (without a fit), rpe_m or rpe_rad (over delta frames or m). n: number
+    # of poses or of pairs of poses.
     "path_statistics": """robot source quantity delta delta_unit n
         rmse mean median std min max sse""",
-    # NEES of each map's landmarks (map: a robot, or "fused"), before merging and after; see
-    # evaluation/fused_landmarks.py. landmarks: own, all of a robot's map; before fusing,
-    # those of them that were truly fused; fused, of the merged map, with several parents; carried
-    # over, with one. n_landmarks: with a known truth. share_in_gate: of 95 %.
+    # NEES of the landmarks of each map (a robot or "fused"), before and after fusion; see
+    # evaluation/fused_landmarks.py. landmarks: own (all landmarks of a robot), before fusing (those
+    # that were fused with the same true point), fused (several parents) or carried over (one
+    # parent). n_landmarks: landmarks with a known true point. share_in_gate: share in the 95 %
+    # gate.
     "landmark_nees": """map landmarks n_landmarks degrees_of_freedom
         nees_mean nees_median share_in_gate""",
-    # Seconds of work by stage; what a run needs beside its stages (start, tables, timing the
-    # aligners, figures) has rows named like stages.
+    # Times of stages, and of parts of the run outside stages (start, tables, timing the aligners,
+    # figures).
     "timings": "stage name elapsed_s",
-    # Serial, warmed, repeated: figure 6. Median of the repeats, 10th and 90th percentile; n_common
-    # is -1 where the truth is unknown.
+    # Times of aligners, one after the other and after a warm-up call, for figure 6: median, 10th
+    # and 90th percentile of the repetitions. n_common is -1 without truth.
     "aligner_timings": """robot_a robot_b iteration aligner n_correspondences n_common
         elapsed_s elapsed_low_s elapsed_high_s""",
 }
@@ -184,11 +184,13 @@ ALL |= {name: _schema(name) for name in _COLUMNS}
 
 
 class Shown(NamedTuple):
-    """How screens and reports show a column of `errors`, one figure a method.
+    """Presentation of a column of `errors` on screens and in reports, one value for each method.
 
-    What follows a line break in the label goes to its second line. An `error` is shown as the
-    median of its absolute value over answerable maps, where no estimate is infinitely far off, and
-    beside it the share of `given` estimates; a `share` as the mean over maps with common ground.
+    Attributes:
+        label: header; a line break separates its two lines.
+        layout: format of the value.
+        kind: `error`: median absolute error over answerable pairs, infinite for missing estimates;
+            `given`: share of estimates; `share`: mean over pairs with common ground.
     """
 
     label: str
@@ -208,24 +210,24 @@ SHOWN = {
 
 
 def table_path(result: Path, name: str) -> Path:
-    """Where a result folder keeps the table of that name."""
+    """Return the path of a table in a result folder."""
     return result / "tables" / f"{name}.parquet"
 
 
-def framed(name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> pd.DataFrame:
-    """Rows with the columns of the table of that name alone; of no rows, columns of any type."""
+def as_table(name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> pd.DataFrame:
+    """Return rows as a DataFrame with the columns of a table; other columns are dropped."""
     import pandas as pd
 
     return pd.DataFrame(rows if len(rows) else [], columns=pd.Index(ALL[name].names))
 
 
 def write(path: Path, name: str, rows: pd.DataFrame | list[dict[str, Any]]) -> None:
-    """Write rows as the table of that name."""
-    tables.write_rows(path, ALL[name], framed(name, rows))
+    """Write rows as a table."""
+    tables.write_rows(path, ALL[name], as_table(name, rows))
 
 
 def read(path: Path, name: str) -> pd.DataFrame:
-    """Read the table of that name; raises InputError that names the file."""
+    """Read a table; raise InputError with the name of the file."""
     return tables.read_rows(path, ALL[name])
 
 

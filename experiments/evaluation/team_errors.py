@@ -1,8 +1,8 @@
-"""Errors of a whole team: paths in one frame, and the accepted alignments.
+"""Errors of a team of robots: paths in a common frame, and alignments that the team uses.
 
-The ATE of a team moves the paths of all its robots by the motions that merged their maps, and then
-all of them by one rigid fit to the truth: what the robots are off against each other counts. Of one
-robot it is evo's.
+The ATE of a team is computed in two steps. First each path is moved as the robot's map was moved
+into the fused map. Then one rigid fit moves all paths together onto the truth. So relative errors
+between robots count. For one robot the value is the ATE of evo.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,17 +21,25 @@ from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 
 _PAIR = ["robot_a", "robot_b"]
-# What a pair of robots takes over from its row of `errors`.
-_ALONE = ["accepted", "n_common", "refined_translation_error_m", "refined_rotation_error_rad"]
+# Columns of `team_pairs` from the row of `errors` of the pair.
+_OWN_ALIGNMENT = [
+    "accepted",
+    "n_common",
+    "refined_translation_error_m",
+    "refined_rotation_error_rad",
+]
 
 
 def team_rows(
     team: FusedTeam, paths: pd.DataFrame, T_first_smoothed: Float | None = None
 ) -> list[dict[str, Any]]:
-    """Rows of the table `team` from those of the table `paths`; none where nothing was merged.
+    """Return the rows of the table `team`; none if nothing was merged.
 
-    `T_first_smoothed` (M, 3) is how a fuser of smoothed maps moved them, NaN for those left out:
-    where it merged the same robots, their smoothed paths are moved by it.
+    Args:
+        team: last maps, merged.
+        paths: rows of the table `paths`.
+        T_first_smoothed: motions of the maps by a fuser of smoothed maps, shape (M, 3), NaN for
+            maps that it left out. If it merged the same robots, it moves their smoothed paths.
     """
     own = dict(iter(paths.groupby("robot", sort=False)))
     rows = []
@@ -39,7 +47,11 @@ def team_rows(
         placed = np.isfinite(T_first_map[:, 0])
         members = [(k, robot) for k, robot in enumerate(team.robots) if placed[k]]
         row = {"component": number, "n_robots": len(members), "n_team": len(team.robots)}
-        for source in _sources_of([own[robot.name] for _, robot in members]):
+        member_paths = [own[robot.name] for _, robot in members]
+        for source in SOURCES:
+            column = f"{source}_{POSE_FIELDS[0]}"
+            if not all(column in path and path[column].notna().any() for path in member_paths):
+                continue
             T_moved = T_first_map
             if source == SMOOTHED and T_first_smoothed is not None:
                 same = np.array_equal(np.isfinite(T_first_smoothed[:, 0]), placed)
@@ -59,18 +71,8 @@ def team_rows(
     return rows
 
 
-def _sources_of(paths: list[pd.DataFrame]) -> list[str]:
-    """The kinds of paths that all of these robots have; not every log is smoothed."""
-    first = {source: f"{source}_{POSE_FIELDS[0]}" for source in SOURCES}
-    return [
-        source
-        for source, column in first.items()
-        if all(column in own and own[column].notna().any() for own in paths)
-    ]
-
-
 def _placements(team: FusedTeam) -> Iterator[Float]:
-    """T_first_map (M, 3) of each set of robots that were merged, or of a robot that was alone."""
+    """Yield T_first_map (M, 3) of each group of merged robots, or of a single robot."""
     if team.fusion is None:
         yield np.zeros((1, 3))
     else:
@@ -78,19 +80,19 @@ def _placements(team: FusedTeam) -> Iterator[Float]:
 
 
 def _poses(paths: pd.DataFrame, source: str) -> Float:
-    """(T, 3) of a robot, from one source or the truth."""
+    """Return the poses (T, 3) of a robot from a source or from the truth."""
     return paths[[f"{source}_{name}" for name in POSE_FIELDS]].to_numpy()
 
 
 @dataclass(frozen=True)
 class PlacedPath:
-    """One robot's path beside the truth.
+    """Path of one robot with the truth.
 
     Attributes:
-        poses: (T, 3) estimated, in the robot's map frame.
-        truth: (T, 3) true ones, in its own; NaN where unknown.
-        T_first_map: (3,) how the robot's map was moved when it was merged.
-        T_world_map: (3,) where its frame truly is.
+        poses: estimated poses in the frame of the robot's map, shape (T, 3).
+        truth: true poses in the same frame, shape (T, 3); NaN where unknown.
+        T_first_map: motion of the robot's map into the fused map, shape (3,).
+        T_world_map: true origin of the frame, shape (3,).
     """
 
     poses: Float
@@ -99,61 +101,54 @@ class PlacedPath:
     T_world_map: Float
 
     def in_one_frame(self) -> tuple[Float, Float]:
-        """Estimated poses (n, 3) in the fused frame and true ones in the world, where known."""
+        """Return estimated poses in the fused frame and true poses in the world, shape (n, 3)."""
         known = np.isfinite(self.truth).all(axis=1)
         poses, truth = self.poses[known], self.truth[known]
         return se2.compose(self.T_first_map, poses), se2.compose(self.T_world_map, truth)
 
 
 def team_ate_m(paths: Sequence[PlacedPath]) -> Float:
-    """Errors (N,) in m of the positions of all robots, after one rigid fit of all of them."""
-    together = zip(*(own.in_one_frame() for own in paths), strict=True)
-    path, truth = (np.concatenate(poses) for poses in together)
+    """Return position errors (N,) in m of all robots after one rigid fit of all paths."""
+    estimated_and_true = zip(*(own.in_one_frame() for own in paths), strict=True)
+    path, truth = (np.concatenate(poses) for poses in estimated_and_true)
     return ate_m(path, truth)
 
 
 def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.DataFrame:
-    """Rows of the table `team_pairs`: each two robots, aligned alone and placed with all others."""
+    """Return the rows of the table `team_pairs`: own alignment and relative pose in the team."""
     edges = team_edge_rows(team)
     if edges.empty:
         return edges
     used = (errors["aligner"] == aligner) & (errors["repetition"] == 0)
-    rows = edges.merge(criteria.at_the_end(errors[used])[[*_PAIR, *_ALONE]], "left", _PAIR)
-    place = {robot.name: k for k, robot in enumerate(team.robots)}
-    index = rows[_PAIR].map(place.get).to_numpy()
-    off = _placed_errors(team, index)
-    return rows.assign(team_translation_error_m=off[:, 0], team_rotation_error_rad=off[:, 1])
-
-
-def _placed_errors(team: FusedTeam, pairs: np.ndarray) -> Float:
-    """Errors (E, 2) in m and rad of T_a_b between robots (E, 2) as the team places them.
-
-    NaN where it does not place both in one map.
-    """
+    rows = edges.merge(criteria.at_the_end(errors[used])[[*_PAIR, *_OWN_ALIGNMENT]], "left", _PAIR)
+    index = {robot.name: k for k, robot in enumerate(team.robots)}
+    a, b = rows[_PAIR].map(index.get).to_numpy().T
+    # errors of T_a_b in the fused maps; NaN for robots in different maps
     T_world_map = np.array([robot.path.T_world_map for robot in team.robots])
-    a, b = pairs.T
-    off = np.full((len(pairs), 2), np.nan)
+    T_true, errors_of_team = (
+        se2.between(T_world_map[a], T_world_map[b]),
+        np.full((2, len(a)), np.nan),
+    )
     for T_first_map in _placements(team):
-        error = se2.between(T_first_map[a], T_first_map[b]) - se2.between(
-            T_world_map[a], T_world_map[b]
-        )
-        own = np.column_stack([np.hypot(error[:, 0], error[:, 1]), se2.wrap(error[:, 2])])
-        off = np.where(np.isfinite(own), own, off)
-    return off
+        error = se2.between(T_first_map[a], T_first_map[b]) - T_true
+        found = np.stack([np.hypot(error[:, 0], error[:, 1]), se2.wrap(error[:, 2])])
+        errors_of_team = np.where(np.isfinite(found), found, errors_of_team)
+    translation_m, rotation_rad = errors_of_team
+    return rows.assign(team_translation_error_m=translation_m, team_rotation_error_rad=rotation_rad)
 
 
-def believed(pairs: pd.DataFrame) -> pd.Series:
-    """Bool per row of `team_pairs`: whether the team's map was placed by this alignment."""
+def is_used_by_team(pairs: pd.DataFrame) -> pd.Series:
+    """Return True for rows of `team_pairs` whose alignment moved maps in the fusion."""
     return pairs["place"].isin([EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE])
 
 
 def edge_precision(pairs: pd.DataFrame) -> float:
-    """Share of right ones among the alignments that were believed; NaN where none were."""
-    used = pairs[believed(pairs)]
+    """Return the share of right alignments among those that the team uses; NaN if it uses none."""
+    used = pairs[is_used_by_team(pairs)]
     return float(1 - criteria.is_false_merge(used).mean())
 
 
 def edge_recall(pairs: pd.DataFrame) -> float:
-    """Share of the pairs with common ground whose alignment is right and was believed."""
-    met = pairs[criteria.has_common_ground(pairs)]
-    return float((criteria.right_refined(met) & believed(met)).mean())
+    """Return the share of pairs with common ground whose right alignment the team uses."""
+    overlapping = pairs[criteria.has_common_ground(pairs)]
+    return float((criteria.right_refined(overlapping) & is_used_by_team(overlapping)).mean())

@@ -1,4 +1,4 @@
-"""Truth joined to estimates; only the evaluation imports this module."""
+"""True poses and points for estimated paths and landmarks; only the evaluation uses this module."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,73 +12,75 @@ from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import TRUTH_TABLES, RobotTruth
+from mapfusion.robot_log import TRUTH_TABLES, RobotLog, RobotTruth, read_truth
 from mapfusion.tables import table_path
+
+
+def truth_or_unknown(folder: Path, log: RobotLog) -> RobotTruth:
+    """Return the truth in the folder of a log; NaN if the folder has none."""
+    if all(table_path(folder, name).is_file() for name in TRUTH_TABLES):
+        return read_truth(folder)
+    return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
 
 
 def landmark_truth(
     truth: RobotTruth, owners_at: Callable[[int, int], np.ndarray], maps: Mapping[int, LandmarkMap]
 ) -> dict[int, Float]:
-    """The true world point (N, 3) of each landmark of each evaluated map; NaN where unknown.
+    """Return the true points of the landmarks of each map, by iteration.
 
-    It is the median of the true points of all observations that went into the landmark.
+    The true point of a landmark is the median of the true points of its observations.
 
     Args:
-        truth: of the robot.
-        owners_at: by iteration and number of observations, (n,) the `source_observation` of the
-            landmark that each of the log's first observations went into then; -1 for none.
-        maps: by iteration.
+        truth: truth of the robot.
+        owners_at: takes an iteration and the number n of observations of the log. Returns, shape
+            (n,), the `source_observation` of the landmark that each observation was assigned to at
+            that iteration; -1 for none.
+        maps: maps by iteration.
+
+    Returns:
+        World points, shape (N, 3), by iteration; NaN where unknown.
     """
     point_m, has_point = truth.point_world_m, np.isfinite(truth.point_world_m).all(axis=1)
     n = len(point_m)
-    # Both by `source_observation`, their last row, which is that of -1, of none. From one map to
-    # the next few landmarks gain or lose an observation: the medians of all others stay.
+    # Arrays over `source_observation`; the last row belongs to -1. Few landmarks gain or lose an
+    # observation between two maps, so only the medians of these are computed again.
     median_m, points = np.full((n + 1, 3), np.nan), {}
     before = np.full(n, -1)
     for iteration, landmarks in maps.items():
         owner = owners_at(iteration, n)
-        changed, anew = np.flatnonzero(owner != before), np.zeros(n + 1, dtype=bool)
-        anew[before[changed]] = anew[owner[changed]] = True
-        anew[-1] = False
-        median_m[anew] = np.nan
-        counts = np.flatnonzero(anew[owner] & has_point)
-        found, found_m = _medians(owner[counts], point_m[counts])
-        median_m[found] = found_m
+        changed, outdated = np.flatnonzero(owner != before), np.zeros(n + 1, dtype=bool)
+        outdated[before[changed]] = outdated[owner[changed]] = True
+        outdated[-1] = False
+        median_m[outdated] = np.nan
+        used = np.flatnonzero(outdated[owner] & has_point)
+        # Medians by landmark: sort by landmark, then by value, and take the middle of each group.
+        found, group, counts = np.unique(owner[used], return_inverse=True, return_counts=True)
+        if len(found) <= 1 + np.iinfo(np.uint16).max:
+            group = group.astype(np.uint16)  # NumPy sorts these by radix sort, which is faster
+        first = np.cumsum(counts) - counts
+        lower, upper = first + (counts - 1) // 2, first + counts // 2
+        for k, column in enumerate(point_m[used].T):
+            by_value = np.argsort(column)
+            ranked = column[by_value[np.argsort(group[by_value], kind="stable")]]
+            median_m[found, k] = (ranked[lower] + ranked[upper]) / 2
         points[iteration] = median_m[landmarks.source_observation]
         before = owner
     return points
 
 
-def _medians(group: np.ndarray, values: Float) -> tuple[np.ndarray, Float]:
-    """The groups there are (G,), sorted, and by column the median (G, D) of each one's values.
-
-    Args:
-        group: (N,) of each row.
-        values: (N, D), finite.
-    """
-    found, place, counts = np.unique(group, return_inverse=True, return_counts=True)
-    if len(found) <= 1 + np.iinfo(np.uint16).max:
-        place = place.astype(np.uint16)  # such numbers NumPy sorts digit by digit, far sooner
-    first = np.cumsum(counts) - counts
-    lower, upper = first + (counts - 1) // 2, first + counts // 2
-    medians = np.empty((len(found), values.shape[1]))
-    for k, column in enumerate(values.T):
-        by_value = np.argsort(column)
-        ranked = column[by_value[np.argsort(place[by_value], kind="stable")]]
-        medians[:, k] = (ranked[lower] + ranked[upper]) / 2
-    return found, medians
-
-
 def true_pairs(
     points_a: Float, points_b: Float, index_a: np.ndarray, index_b: np.ndarray, radius_m: float
 ) -> np.ndarray:
-    """(N,) bool: index pairs whose true points lie within the radius; unknown points never do."""
+    """Return, shape (N,), True for pairs of landmarks whose true points lie within the radius.
+
+    Pairs with an unknown point are False.
+    """
     distance = np.linalg.norm(points_a[index_a] - points_b[index_b], axis=1)
     return distance <= radius_m  # False for NaN
 
 
 def common_landmarks(points_a: Float, points_b: Float, radius_m: float) -> int:
-    """How many landmarks of two maps truly correspond: mutual nearest true points within radius."""
+    """Return the number of common landmarks: mutual nearest true points within the radius."""
     known_a, known_b = (own[np.isfinite(own).all(axis=1)] for own in (points_a, points_b))
     if not len(known_a) or not len(known_b):
         return 0
@@ -90,21 +92,26 @@ def common_landmarks(points_a: Float, points_b: Float, radius_m: float) -> int:
 
 @dataclass(frozen=True)
 class PathTruth:
-    """True poses (T, 3) of a robot in its own map frame, which is its pose at the first frame."""
+    """True path of a robot.
+
+    Attributes:
+        T_map_robot: true poses, shape (T, 3), in the frame of the robot's map.
+        T_world_map: origin of this frame, shape (3,): the first known pose of the robot.
+    """
 
     T_map_robot: Float
     T_world_map: Float
 
     @classmethod
     def of(cls, truth: RobotTruth) -> "PathTruth":
-        """The start is the first known pose: robots stand still until their truth begins."""
+        """Return the path from the first known pose; robots stand still until then."""
         known = np.isfinite(truth.T_world_robot).all(axis=1)
         start = truth.T_world_robot[int(np.argmax(known))]
         return cls(se2.between(start, truth.T_world_robot), start)
 
 
 def fit_rmse_m(position_m: Float, point_world_m: Float) -> tuple[int, float]:
-    """How many landmarks have a known truth, and their RMSE after the best rigid fit to it."""
+    """Return the number of landmarks with a known true point, and their RMSE after a rigid fit."""
     known = np.isfinite(point_world_m).all(axis=1)
     points, target = position_m[known], point_world_m[known]
     if len(points) < 2:
@@ -115,19 +122,19 @@ def fit_rmse_m(position_m: Float, point_world_m: Float) -> tuple[int, float]:
 
 
 def degrees_of_freedom(landmarks: LandmarkMap) -> int:
-    """Coordinates that a landmark was estimated in."""
+    """Return the number of estimated coordinates of a landmark."""
     return 2 if landmarks.planar else 3
 
 
 def squared_mahalanobis(error: Float, covariance: Float) -> Float:
-    """Of errors (..., D) by their covariances (..., D, D)."""
+    """Return squared Mahalanobis lengths of errors (..., D) with covariances (..., D, D)."""
     return np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])
 
 
 def why_no_truth(scenario: AnyScenario) -> str:
-    """Which log of a scenario has no truth beside it; empty where all have.
+    """Return a text about the first log of a scenario without truth; empty if all have truth.
 
-    Errors are told of all robots or of none: a map is judged against another's, too.
+    Robots are evaluated together, because alignments concern the maps of two robots.
     """
     logs = map(Path, scenario.logs) if isinstance(scenario, Recording) else ()
     for log in logs:

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.checks import CheckedScenario
-from experiments.evaluation.single_steps import Merged, verdict_on
+from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.pipeline.tables import COVARIANCE, MOTION
 from experiments.reports.export import write_text
 from mapfusion.align.alignment import Status
@@ -69,7 +69,7 @@ def of_alignment(
 
 
 def _aligner(row: Mapping[str, Any]) -> dict[str, Any]:
-    status, reason = verdict_on(row)
+    status, reason = final_status(row)
     accepted, estimated = status is Status.ACCEPTED, row["status"] == Status.ACCEPTED
     refined = {name: row[f"refined_{name}"] for name in MOTION}
     refined |= _covariance([row[name] for name in COVARIANCE])
@@ -100,7 +100,7 @@ def of_map(
 
 
 def of_fusion(
-    paths: Sequence[Path], seed: int, merged: Merged, maps: Sequence[Path]
+    paths: Sequence[Path], seed: int, merged: MergeResult, maps: Sequence[Path]
 ) -> dict[str, Any]:
     """Return the document of `merge`: the fused map of most maps, and the others.
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.result import require_result
-from experiments.evaluation.team_errors import believed
+from experiments.evaluation.team_errors import is_used_by_team
 from experiments.pipeline.tables import alignment_of
 from experiments.reports.export import write_text
 from experiments.reports.figures.result_tables import ResultTables
@@ -159,7 +159,7 @@ def _believed_alignments(data: ResultTables) -> Iterator[tuple[str, str, dict[An
     edges, estimates = data.rows("team_edges"), data.rows("estimates")
     used = estimates["aligner"] == data.scenario.get("merge", {}).get("aligner")
     used &= estimates["repetition"] == 0
-    for a, b in edges.loc[believed(edges), ["robot_a", "robot_b"]].itertuples(index=False):
+    for a, b in edges.loc[is_used_by_team(edges), ["robot_a", "robot_b"]].itertuples(index=False):
         of_pair = used & (estimates["robot_a"] == a) & (estimates["robot_b"] == b)
         rows = estimates[of_pair].sort_values("iteration")
         yield a, b, rows.iloc[-1].to_dict()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pandas as pd
 
 from experiments.evaluation.criteria import has_common_ground, merged_robots, right_refined
-from experiments.evaluation.team_errors import believed
+from experiments.evaluation.team_errors import is_used_by_team
 from experiments.reports.formatting import listed, two_digits
 from mapfusion.fusion.team_graph import EdgeStatus
 
@@ -28,7 +28,7 @@ def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -
         if why:
             yield f"{robot} is left out of the fused map: {why}"
     if len(pairs):
-        met, used, right = has_common_ground(pairs), believed(pairs), right_refined(pairs)
+        met, used, right = has_common_ground(pairs), is_used_by_team(pairs), right_refined(pairs)
         found = (used & met & right).sum()
         yield (
             f"alignments believed: {used.sum()}, right: {found}; "

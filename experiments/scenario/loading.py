@@ -100,11 +100,18 @@ def load_scenario(
         data["seed"] = seed
     scenario = scenario_of(data, str(path), functools.partial(_place, path, overrides))
     _warn_of_name_clashes(scenario.align)
-    if isinstance(scenario, Recording):
-        folder = OWN if path.parent == SHIPPED else path.parent
-        logs = [_resolved(path, folder, log) for log in scenario.logs]
-        return scenario.model_copy(update={"logs": logs})
-    return scenario
+    if not isinstance(scenario, Recording):
+        return scenario
+    folder, logs = OWN if path.parent == SHIPPED else path.parent, []
+    for log in scenario.logs:
+        try:
+            resolved = (folder / log).resolve()
+            (resolved / _LONG_NAME).exists()  # raises if the path is too long for the system
+        except (OSError, RuntimeError, ValueError) as error:  # circular links, a long name
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise InputError(f"{path}: logs: {log}: no folder has this path ({reason})") from error
+        logs.append(str(resolved))
+    return scenario.model_copy(update={"logs": logs})
 
 
 # Each wrong key of a file needs the lines.
@@ -121,16 +128,6 @@ def _place(path: Path, overrides: Sequence[str], location: Location) -> str:
     above = (location[:n] for n in range(len(location), 0, -1))
     line = next((_lines(path)[each] for each in above if each in _lines(path)), None)
     return "" if line is None else f", line {line}"
-
-
-def _resolved(path: Path, folder: Path, log: str) -> str:
-    try:
-        resolved = (folder / log).resolve()
-        (resolved / _LONG_NAME).exists()  # raises if the path is too long for the system
-    except (OSError, RuntimeError, ValueError) as error:  # circular links, a long name
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: logs: {log}: no folder has this path ({reason})") from error
-    return str(resolved)
 
 
 def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> AnyScenario:
@@ -259,10 +256,12 @@ def _validated(where: str, kind: type[S], data: dict[str, Any], place: Place = _
         if not problems:
             return made
     except ValidationError as error:
-        problems = [
-            *(each for each in _refused(kind, error) if not _reaches(each.location, unfit)),
-            *problems,
-        ]
+        refused = []
+        for problem in _refused(kind, error):
+            at, last = problem.location, len(problem.location)
+            if not any(at[:n] in unfit for n in range(last + 1)):  # not at or below an unfit value
+                refused.append(problem)
+        problems = refused + problems
     if isinstance(kind, type) and issubclass(kind, Scenario):
         problems += _contradictions(kind, data, {problem.location[:1] for problem in problems})
     lines = []
@@ -272,11 +271,6 @@ def _validated(where: str, kind: type[S], data: dict[str, Any], place: Place = _
     if len(lines) > _MOST_LINES:
         lines[_MOST_LINES:] = [f"{where}: {len(lines) - _MOST_LINES} more things are wrong"]
     raise InputErrors(lines)
-
-
-def _reaches(location: Location, others: Collection[Location]) -> bool:
-    """Return True if a location is one of the others or lies below one."""
-    return any(location[:n] in others for n in range(len(location) + 1))
 
 
 def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:

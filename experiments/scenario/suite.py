@@ -139,9 +139,8 @@ def _entry(path: Path) -> dict[str, Any]:
     from sim.plan_generator import RouteParameters
 
     data = read_mapping(path)
-    generate, generated, drive = (
-        _section(data, name) for name in ("generate", "generated", "drive")
-    )
+    sections = (data.get(name) for name in ("generate", "generated", "drive"))
+    generate, generated, drive = (each if isinstance(each, dict) else {} for each in sections)
     robots, overlap = data.get("logs", data.get("robots")), generated.get("overlap_asked")
     n_robots = len(robots) if isinstance(robots, list) else None
     if "generate" in data:
@@ -156,11 +155,6 @@ def _entry(path: Path) -> dict[str, Any]:
         "iterations": _number(drive.get("frames")),
         "overlap": _number(overlap),
     }
-
-
-def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
-    found = data.get(name)
-    return found if isinstance(found, dict) else {}
 
 
 def _number(value: Any) -> float | None:

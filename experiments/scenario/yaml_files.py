@@ -236,19 +236,16 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> dict[str,
         dotted, separator, value = override.partition("=")
         if not separator or not dotted:
             raise InputError(f"--set {override}: expected key=value, for example evaluate.every=1")
-        _assign(result, dotted, parse_value(value, f"--set {override}"))
+        parsed = parse_value(value, f"--set {override}")
+        node: Any = result
+        *parents, last = dotted.split(".")
+        for name in parents:
+            key = _key(node, name, dotted)
+            if isinstance(node, dict) and node.get(key) is None:
+                node[key] = {}
+            node = node[key]
+        node[_key(node, last, dotted)] = parsed
     return result
-
-
-def _assign(data: dict[str, Any], dotted: str, value: Any) -> None:
-    node: Any = data
-    *parents, last = dotted.split(".")
-    for name in parents:
-        key = _key(node, name, dotted)
-        if isinstance(node, dict) and node.get(key) is None:
-            node[key] = {}
-        node = node[key]
-    node[_key(node, last, dotted)] = value
 
 
 def _key(node: Any, name: str, dotted: str) -> str | int:

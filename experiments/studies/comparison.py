@@ -14,20 +14,22 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import alignment_summary
-from experiments.evaluation.alignment_summary import MAP_KEYS, MAP_PAIR, setting_columns
+from experiments.evaluation import criteria
 from experiments.evaluation.criteria import (
     ANSWERABLE_PAIRS,
     COMMON_LANDMARKS,
+    MAP_KEYS,
+    MAP_PAIR,
     ORACLE,
     RICH_PAIRS,
     is_false_merge,
     right_refined,
+    setting_columns,
 )
 from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.path_errors import path_rms
 from experiments.evaluation.result_files import read_scenario
-from experiments.evaluation.team_errors import believed
+from experiments.evaluation.team_errors import is_used_by_team
 from experiments.studies import intervals
 from experiments.studies.error_bands import ROBOT_PAIR
 from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN
@@ -66,7 +68,7 @@ class Quantity(NamedTuple):
 
 def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
     """Return rows of `maps_of` with each map's refined error over that of the oracle."""
-    maps = alignment_summary.maps_of(errors)
+    maps = criteria.summarise_alignments(errors)
     of_oracle = maps.assign(oracle=maps[_REFINED].where(maps["aligner"] == ORACLE))
     reference = of_oracle.groupby(MAP_PAIR)["oracle"].transform("first")
     return maps.assign(over_oracle=maps[_REFINED] / reference)
@@ -86,7 +88,7 @@ def _fused_last(fusers: pd.DataFrame) -> pd.DataFrame:
 
 def _team_alignments(pairs: pd.DataFrame) -> pd.DataFrame:
     """Add found (right and used), false (wrong and used) and off_m (error in the team's map)."""
-    used, right = believed(pairs), right_refined(pairs)
+    used, right = is_used_by_team(pairs), right_refined(pairs)
     false = is_false_merge(pairs) & used
     off_m = pairs["team_translation_error_m"]
     return pairs.assign(found=(right & used).astype(float), false=false.astype(float), off_m=off_m)
@@ -96,7 +98,7 @@ _SMOOTHER = ("path_rmse_m", "landmark_rmse_m", "nees_per_dof")
 _FUSERS = ("landmark_rmse_m", "over_better_filter", "nees_per_dof", "coverage_95")
 # Columns to read of each table, columns that older runs may lack, and the reduction of the rows.
 READ: dict[str, tuple[Sequence[str] | None, Sequence[str], Callable[..., pd.DataFrame]]] = {
-    "errors": (alignment_summary.NEEDED, alignment_summary.OPTIONAL, _maps_over_oracle),
+    "errors": (criteria.NEEDED, criteria.OPTIONAL, _maps_over_oracle),
     "robots": (["robot", "path_error_m", "odometry_error_m"], (), partial(path_rms, by=_ROBOT)),
     "map_fits": (["map", "rmse_m"], (), pd.DataFrame),
     "smoother": (["robot", *_SMOOTHER], (), pd.DataFrame),
@@ -315,7 +317,7 @@ def _all_values(
         if not (a.has(table) and b.has(table)):
             continue
         rows = _joined(a, b, table, apart_from)
-        methods = alignment_summary.methods_in(rows, oracle=True) if "aligner" in rows else []
+        methods = criteria.methods_in(rows, oracle=True) if "aligner" in rows else []
         for method in [*methods, ""]:
             own = rows[rows["aligner"] == method] if method else rows
             of = method if method in ("", ORACLE) else EACH_METHOD
@@ -336,9 +338,7 @@ def _joined(a: Runs, b: Runs, table: str, apart_from: Sequence[str]) -> pd.DataF
     for runs in (a, b):
         parts = []
         for rows in runs.batches(table, columns, optional):
-            named = rows.drop(
-                columns=[*alignment_summary.RUN_KEYS, *alignment_summary.setting_columns(rows)]
-            )
+            named = rows.drop(columns=[*criteria.RUN_KEYS, *criteria.setting_columns(rows)])
             parts.append(reduce(named.assign(run_id=match_names(rows, apart_from))))
         # a run of one robot has no rows; its columns have no useful types
         parts = [part for part in parts if len(part)] or parts[:1]
@@ -346,9 +346,7 @@ def _joined(a: Runs, b: Runs, table: str, apart_from: Sequence[str]) -> pd.DataF
     keys = [name for name in _KEYS if name in frames[0]]
     joined = frames[0].merge(frames[1], on=keys, suffixes=("_a", "_b"))
     lesser = {
-        name: joined.filter(like=name).min(axis=1)
-        for name in alignment_summary.COUNTS
-        if name in frames[0]
+        name: joined.filter(like=name).min(axis=1) for name in criteria.COUNTS if name in frames[0]
     }
     return joined.assign(**lesser)
 

@@ -6,14 +6,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import alignment_summary
-from experiments.evaluation.alignment_summary import (
+from experiments.evaluation import criteria
+from experiments.evaluation.criteria import (
+    ANSWERABLE_PAIRS,
     ERROR_COLUMNS,
     MAP_KEYS,
     RUN_KEYS,
+    absolute_errors,
     setting_columns,
 )
-from experiments.evaluation.criteria import ANSWERABLE_PAIRS, how_far_off
 
 BAND = (0.1, 0.9)
 _SIGNED = tuple(name for name in ERROR_COLUMNS if name.endswith("_rad"))
@@ -64,14 +65,14 @@ def medians_of_run(errors: pd.DataFrame) -> pd.DataFrame:
     groups = errors.groupby([*keys, *MAP_KEYS, "aligner"], sort=False, dropna=False)
     medians = groups[list(ERROR_COLUMNS)].median()
     known = {name: medians[name].where(_mostly_known(groups, name)) for name in _SIGNED}
-    parts = [medians.assign(**known), groups[list(alignment_summary.COUNTS)].first()]
+    parts = [medians.assign(**known), groups[list(criteria.COUNTS)].first()]
     return pd.concat(parts, axis=1).reset_index()
 
 
 def _infinite_where_missing(rows: pd.DataFrame, signed: Sequence[str]) -> pd.DataFrame:
     """Return rows with infinite errors where there is no estimate, except in signed columns."""
     unsigned = [name for name in ERROR_COLUMNS if name not in signed]
-    return rows.assign(**how_far_off(rows, unsigned))
+    return rows.assign(**absolute_errors(rows, unsigned))
 
 
 def _mostly_known(groups: Any, column: str) -> pd.Series:
@@ -118,8 +119,4 @@ def time_bands(
     found |= {"n_maps": grouped.size(), "elapsed_low_s": elapsed.quantile(BAND[0])}
     found |= {"elapsed_s": elapsed.median(), "elapsed_high_s": elapsed.quantile(BAND[1])}
     bands = pd.DataFrame(found).reset_index().drop(columns="group")
-    return (
-        bands.set_index("aligner")
-        .loc[alignment_summary.methods_in(timed, oracle=True)]
-        .reset_index()
-    )
+    return bands.set_index("aligner").loc[criteria.methods_in(timed, oracle=True)].reset_index()

@@ -24,7 +24,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from experiments.evaluation.alignment_summary import MAP_KEYS
+from experiments.evaluation.criteria import MAP_KEYS
 from mapfusion.geometry.numerics import Float
 
 CONFIDENCE = 0.95

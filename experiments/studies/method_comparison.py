@@ -14,14 +14,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.alignment_summary import (
+from experiments.evaluation.criteria import (
     ERROR_COLUMNS,
     MAP_PAIR,
+    ORACLE,
+    answerable,
+    at_the_end,
     error_over_oracle,
-    maps_of,
+    has_common_ground,
     methods_in,
+    rich,
+    summarise_alignments,
 )
-from experiments.evaluation.criteria import ORACLE, answerable, at_the_end, has_common_ground, rich
 from experiments.evaluation.metrics import repetition_spread_m
 from experiments.evaluation.tables import SHOWN
 from experiments.studies import intervals
@@ -287,7 +291,7 @@ def aligner_summary(
     """
     errors = errors[errors["status"] != Status.ABSENT]
     own = {name: answerable(errors[errors["aligner"] == name]) for name in aligners}
-    shown = _shown_columns(maps_of(errors)).reindex(pd.Index(aligners, name="aligner"))
+    shown = _shown_columns(summarise_alignments(errors)).reindex(pd.Index(aligners, name="aligner"))
     spread_m = [repetition_spread_m(rows) for rows in own.values()]
     return shown.assign(spread_m=spread_m, time_ms=_median_times_ms(timings)).reset_index()
 

@@ -15,7 +15,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.evaluation import tables
-from experiments.evaluation.alignment_summary import RUN_KEYS, setting_columns
+from experiments.evaluation.criteria import RUN_KEYS, setting_columns
 from experiments.evaluation.result_files import read_scenario, require_tables
 from experiments.studies.sweep_tables import SCHEMA_VERSION
 from mapfusion.errors import InputError

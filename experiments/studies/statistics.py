@@ -7,23 +7,21 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.alignment_summary import (
+from experiments.evaluation.criteria import (
     MAP_KEYS,
     NEEDED,
     OPTIONAL,
-    maps_of,
-    setting_columns,
-)
-from experiments.evaluation.criteria import (
     has_common_ground,
     is_false_merge,
     right_refined,
-    that_ever_meet,
+    setting_columns,
+    summarise_alignments,
+    with_common_ground_at_any_time,
 )
 from experiments.evaluation.fused_landmarks import mean_nees_band
 from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.path_errors import STATISTICS
-from experiments.evaluation.team_errors import believed
+from experiments.evaluation.team_errors import is_used_by_team
 from experiments.scenario.seeds import generator
 from experiments.studies import intervals
 from experiments.studies.error_bands import ROBOT_PAIR, error_bands, medians_of_run, time_bands
@@ -169,7 +167,7 @@ def team_alignments(pairs: pd.DataFrame, rng: np.random.Generator) -> pd.DataFra
         alone_rad) and by the whole team (team_m, team_rad), with intervals (whole runs are
         resampled).
     """
-    used, met = believed(pairs), has_common_ground(pairs)
+    used, met = is_used_by_team(pairs), has_common_ground(pairs)
     right = pd.Series(right_refined(pairs) & used)
     row: dict[str, Any] = {"n_runs": pairs["run_id"].nunique(), "n_pairs": len(pairs)}
     row |= {"n_met": int(met.sum()), "n_believed": int(used.sum())}
@@ -297,7 +295,7 @@ def reduced_errors(runs: Runs) -> ReducedErrors:
         every += whole["aligner"].unique().tolist()
         errors = whole[whole["status"] != Status.ABSENT]
         if len(errors):
-            maps.append(maps_of(errors))
+            maps.append(summarise_alignments(errors))
             medians.append(medians_of_run(errors))
     if not maps:  # single robots
         nothing = pd.DataFrame(columns=["run_id", "scenario", "aligner"])
@@ -330,7 +328,7 @@ def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
 
 def _error_bands(rows: pd.DataFrame) -> pd.DataFrame:
     is_pooled = (rows["scenario"] == ALL_SCENARIOS).all()
-    return error_bands(that_ever_meet(rows) if is_pooled else rows)
+    return error_bands(with_common_ground_at_any_time(rows) if is_pooled else rows)
 
 
 def _each(

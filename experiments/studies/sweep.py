@@ -18,7 +18,7 @@ import pyarrow as pa
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import measure_aligners
 from experiments.pipeline import cluster
 from experiments.pipeline.cluster import connected
@@ -308,7 +308,7 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
 
 
 def _measured(sweep: Sweep, run: SweepRun) -> pd.DataFrame:
-    judged = JudgedRun.of(run.load(), sweep.store)
+    judged = EvaluatedRun.of(run.load(), sweep.store)
     judged.execute(1, lambda *_: None)  # makes damaged stages again; all others exist
     measure_aligners(judged)
     return judged.pair_table(ALIGNER_TIMINGS)

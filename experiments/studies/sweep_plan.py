@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import all_tables, renderer
 from experiments.pipeline.memory import require_memory
 from experiments.pipeline.store import Store
@@ -89,12 +89,12 @@ def planned(
     Raises:
         InputError: the run is impossible.
     """
-    judged = JudgedRun.of(run.load(), store)
+    judged = EvaluatedRun.of(run.load(), store)
     if jobs is not None:
         require_memory(judged.pipeline, jobs)
     pipeline, stages = judged.pipeline, [f"{each.name}/{each.key}" for each in judged.stages()]
     read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam, robot.smooth)]
-    read += [*(pair.estimates for pair in pipeline.pairs), *judged.judgements]
+    read += [*(pair.estimates for pair in pipeline.pairs), *judged.evaluations]
     read += pipeline.fusers.values()
     needs = tuple(name for stage in read for name in task_names(stage))
     name, arguments = f"run/{run.run_id}", (run, judged, stages, tables.dataset)
@@ -105,10 +105,10 @@ def planned(
 
 
 def rows_of(
-    run: SweepRun, judged: JudgedRun, stages: Sequence[str], dataset: SweepDataset
+    run: SweepRun, judged: EvaluatedRun, stages: Sequence[str], dataset: SweepDataset
 ) -> dict[str, pa.Table]:
     """Return a run's rows of all tables (work of the last task)."""
-    made = all_tables(judged, judged.load_team(), _TABLES)
+    made = all_tables(judged, judged.team, _TABLES)
     times = [
         {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
         for folder in judged.folders()

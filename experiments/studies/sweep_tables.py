@@ -29,7 +29,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ValidationError
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import answerable, how_far_off
+from experiments.evaluation.criteria import absolute_errors, answerable
 from experiments.pipeline.code_version import library_versions, source_hash
 from experiments.pipeline.tables import FLOAT, TEXT, fields
 from experiments.studies.sweep_combinations import SweepRun
@@ -330,7 +330,7 @@ def medians_over_runs(dataset: SweepDataset, runs: Sequence[SweepRun]) -> pd.Dat
         errors = read_parquet(file, "table errors", columns).to_pandas()
         errors = answerable(errors[errors["run_id"].isin(wanted)])
         given = {name: errors[of].notna() for name, of in zip(GIVEN, ERRORS, strict=True)}
-        judged = errors.assign(**given, **how_far_off(errors, ERRORS))
+        judged = errors.assign(**given, **absolute_errors(errors, ERRORS))
         groups = judged.groupby(["run_id", *leading, "aligner"], sort=False)
         parts.append(groups[ERRORS].median().join(groups[GIVEN].mean()).reset_index())
     every = pd.concat(parts)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.evaluation.map_consistency import COVERED, fitted, relative_consistency
+from experiments.evaluation.map_consistency import COVERED, fit_to_truth, relative_consistency
 from experiments.scenario.loading import load_scenario
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.fastslam.mapping import build_map
@@ -102,7 +102,7 @@ def measure(dataset: int, folder: Path, jobs: int) -> None:
     smoothed = [read_map(maps / f"robot{k + 1}.smoothed.parquet") for k in range(N_ROBOTS)]
     say_ratios("smoothed", np.array([rmse_m(each, places) for each in smoothed]), dataset)
     joint = read_map(maps / "fused.parquet")
-    fit = fitted(joint, truth_of(joint, places))
+    fit = fit_to_truth(joint, truth_of(joint, places))
     found = relative_consistency(joint, fit)
     say(
         f"{dataset} joint     {rmse_m(joint, places):.3f} m, {len(joint)} landmarks, NEES/dof"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.evaluation.map_consistency import fitted, relative_consistency
+from experiments.evaluation.map_consistency import fit_to_truth, relative_consistency
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import one_scenario
@@ -23,7 +23,7 @@ from tests.helpers.by_pictures import Mapped, mapped_by_pictures
 
 def line_of(name: str, each: Mapped) -> float:
     """Prints a map's line; returns its NEES per degree of freedom."""
-    fit = fitted(each.landmarks, each.point_m)
+    fit = fit_to_truth(each.landmarks, each.point_m)
     found = relative_consistency(each.landmarks, fit)
     sys.stdout.write(
         f"{name:16s} {len(each.landmarks):5d} landmarks, {1e3 * fit.rmse_m:5.1f} mm, gross"

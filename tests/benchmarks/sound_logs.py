@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from experiments.evaluation.evaluated_run import finding_of_truth
-from experiments.evaluation.pair_evaluation import truth_of
+from experiments.evaluation.truth import truth_or_unknown
 from mapfusion.datasets.log_consistency import Finding, check_log
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.robot_log import read_log
@@ -24,7 +24,7 @@ def findings_of(folder: Path) -> list[Finding]:
     """What a log says against itself, and what its truth contradicts."""
     log, noise = read_log(folder), MotionNoise()
     findings = list(check_log(log, noise).findings)
-    truth = finding_of_truth(log, truth_of(folder, log).T_world_robot, noise, not findings)
+    truth = finding_of_truth(log, truth_or_unknown(folder, log).T_world_robot, noise, not findings)
     return findings if truth is None else [*findings, truth]
 
 

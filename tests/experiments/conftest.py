@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import run_scenario
 from experiments.pipeline.store import Store
 from experiments.pipeline.workers import single_threaded
@@ -61,7 +61,7 @@ def tiny_results_copy(tiny_results: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def tiny_log(tiny: Simulation, tiny_results: Path) -> Path:
     """The log of R1 in the store of that run."""
-    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    run = EvaluatedRun.of(tiny, Store.of(tiny_results))
     return run.store.path(run.pipeline.robots[0].log)
 
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.evaluation.dataset_export import write_drives
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
+from experiments.evaluation.single_steps import write_drives
 from experiments.pipeline.store import Store
 from experiments.scenario.settings import Simulation
 from experiments.scenario.yaml_files import read_calibration
@@ -30,7 +30,7 @@ class Mapped(NamedTuple):
 
 def mapped_by_pictures(scenario: Simulation, root: Path, jobs: int = 1) -> list[Mapped]:
     """Each robot's drive is written below `root` as a recording, imported again and mapped."""
-    run = JudgedRun.of(scenario, Store.of(root))
+    run = EvaluatedRun.of(scenario, Store.of(root))
     robots = run.pipeline.simulated
     run.execute(jobs, lambda *_: None, [robot.log for robot in robots])
     paths = write_drives(scenario, "euroc", root / "drives", root, jobs, lambda *_: None)

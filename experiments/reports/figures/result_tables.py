@@ -13,7 +13,7 @@ import pandas as pd
 import pyarrow as pa
 from PIL import Image
 
-from experiments.evaluation.alignment_summary import methods_in
+from experiments.evaluation.criteria import methods_in
 from experiments.evaluation.result_files import read_scenario, read_world
 from experiments.evaluation.tables import ALL, read, table_path
 from experiments.reports.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles

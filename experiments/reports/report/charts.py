@@ -11,7 +11,7 @@ import pandas as pd
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from experiments.evaluation.alignment_summary import MAP_PAIR
+from experiments.evaluation.criteria import MAP_PAIR
 from experiments.reports.report.theme import NEUTRAL, faint
 from experiments.studies.error_bands import error_bands, scarce_spans, time_bands
 from experiments.studies.method_comparison import success_rates

@@ -12,10 +12,13 @@ from PIL import Image
 from ruamel.yaml import YAML
 
 from experiments.evaluation import metrics
-from experiments.evaluation.alignment_summary import methods_in, setting_columns
 from experiments.evaluation.checks import Outcome
-from experiments.evaluation.criteria import that_ever_meet
-from experiments.evaluation.evaluated_run import lines_of
+from experiments.evaluation.criteria import (
+    methods_in,
+    setting_columns,
+    with_common_ground_at_any_time,
+)
+from experiments.evaluation.evaluated_run import finding_row_lines
 from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.path_errors import path_rms
 from experiments.evaluation.result import require_result
@@ -172,7 +175,7 @@ def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]
     for labels, rows in ordered:
         scenario = labels.pop("scenario")
         if scenario == ALL_SCENARIOS:
-            n_before, rows = len(rows), that_ever_meet(rows)
+            n_before, rows = len(rows), with_common_ground_at_any_time(rows)
             scenario = "(all)" if len(rows) == n_before else "(all with common ground)"
         settings = [f"{name.rpartition('.')[2]} {value}" for name, value in labels.items()]
         yield ", ".join([scenario, *settings]), rows
@@ -186,7 +189,7 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
         "spread_text": "repetitions on the same maps",
         "charts": {"map": map_figure(data, {n: chart_style(s) for n, s in data.styles.items()})},
         "outcomes": list(_outcomes(data)),
-        "findings": list(lines_of(data.rows("findings"))),
+        "findings": list(finding_row_lines(data.rows("findings"))),
         "robots": path_rms(data.table("robots")).to_dict("records"),
         "fits": data.rows("map_fits").to_dict("records"),
         "smoother": data.rows("smoother").to_dict("records"),

@@ -10,13 +10,18 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.evaluation import tables
-from experiments.evaluation.alignment_summary import methods_in
 from experiments.evaluation.checks import CheckedScenario
-from experiments.evaluation.criteria import ANSWERABLE_PAIRS, ORACLE, answerable, at_the_end
+from experiments.evaluation.criteria import (
+    ANSWERABLE_PAIRS,
+    ORACLE,
+    answerable,
+    at_the_end,
+    methods_in,
+)
 from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.map_consistency import GROSS_M
 from experiments.evaluation.path_errors import path_rms
-from experiments.evaluation.single_steps import Merged, verdict_on
+from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.evaluation.tables import SHOWN
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
@@ -232,7 +237,7 @@ _VERDICTS |= columns(".2f", probability="prob.\nright") | columns(">", time="tim
 
 def print_verdict(row: dict[str, Any]) -> None:
     """Print the verdict on one aligner's estimate, as soon as there is one."""
-    status, why = verdict_on(row)
+    status, why = final_status(row)
     reason = why or row["reason"]
     print_lines([f"  {row['aligner']}: {status}" + (f": {reason}" if reason else "")])
 
@@ -245,7 +250,7 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     note = "sigma: as stated for the refined one, of the distance and of the angle"
     print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
     inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
-    verdicts = [str(verdict_on(row)[0]) for row in rows]
+    verdicts = [str(final_status(row)[0]) for row in rows]
     times = (1e3 * found["elapsed_s"]).map(two_digits)
     print_frame(
         found.assign(inliers=inliers, time=times, verdict=verdicts),
@@ -275,7 +280,7 @@ def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
     print_lines(lines)
 
 
-def print_unmerged(merged: Merged, maps: Sequence[Path]) -> None:
+def print_unmerged(merged: MergeResult, maps: Sequence[Path]) -> None:
     """Why each two maps were not merged."""
     print_lines(
         f"  {maps[a]} and {maps[b]}: not merged: {reason}"

@@ -10,8 +10,13 @@ import numpy as np
 import pandas as pd
 from rich.text import Text
 
-from experiments.evaluation.alignment_summary import setting_columns
-from experiments.evaluation.criteria import ORACLE, RICH_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
+from experiments.evaluation.criteria import (
+    ORACLE,
+    RICH_PAIRS,
+    RIGHT_WITHIN_M,
+    RIGHT_WITHIN_RAD,
+    setting_columns,
+)
 from experiments.reports.formatting import interval, number
 from experiments.reports.terminal import layout
 from experiments.reports.terminal.layout import columns

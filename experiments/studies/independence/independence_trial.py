@@ -16,8 +16,8 @@ from typing import Any
 import pandas as pd
 
 from experiments.evaluation.alignment_errors import EvaluatedRobot, first_shared_iteration
-from experiments.evaluation.evaluated_run import JudgedRun
-from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
+from experiments.evaluation.evaluated_run import EvaluatedRun
+from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.map_consistency import rmse
 from experiments.evaluation.path_errors import STATISTICS
 from experiments.evaluation.smoothed_robots import SmoothedRobot
@@ -159,7 +159,7 @@ def team_sizes(text: str | None, scenario: AnyScenario) -> list[int]:
 class RecordedTeam:
     """A team's stages: those that make its maps, and those that measure their cost."""
 
-    run: JudgedRun
+    run: EvaluatedRun
 
     @property
     def n_robots(self) -> int:
@@ -257,7 +257,7 @@ class RecordedTeam:
         return self.run.store.path(stage)
 
 
-def team_of(run: JudgedRun, n_robots: int) -> RecordedTeam:
+def team_of(run: EvaluatedRun, n_robots: int) -> RecordedTeam:
     """Return the first robots of a run as a team; their logs must exist.
 
     Raises:
@@ -277,7 +277,7 @@ def team_of(run: JudgedRun, n_robots: int) -> RecordedTeam:
     recorded = Recording(**kept | changed, logs=logs)
     if reason := why_no_truth(recorded):
         raise InputError(f"scenario {scenario.name}: {reason}; errors cannot be told")
-    return RecordedTeam(JudgedRun.of(recorded, run.store))
+    return RecordedTeam(EvaluatedRun.of(recorded, run.store))
 
 
 def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
@@ -375,14 +375,14 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
         for k, fusion in read_fusions(folder, names).items():
             beside = known.smoothed if make_fuser(fuser).smoothed else [None] * len(robots)
             given = [GivenMap.at(*both, k) for both in zip(robots, beside, strict=True)]
-            judged[fuser, k] = _errors(JudgedFusion(fuser, k, fusion, given), known, anew)
+            judged[fuser, k] = _errors(EvaluatedFusion(fuser, k, fusion, given), known, anew)
     for strategy in STRATEGIES:
         for k in team.iterations:
             row = {"strategy": strategy.name, "iteration": k} | about
             yield row | judged[strategy.fuser, k]
 
 
-def _errors(fusion: JudgedFusion, known: _Known, anew: _Paths) -> dict[str, Any]:
+def _errors(fusion: EvaluatedFusion, known: _Known, anew: _Paths) -> dict[str, Any]:
     """Return the errors of one fused map; paths that its fuser estimated anew take precedence."""
     fused = fusion.fusion
     row = {"n_merged": len(fused.members), "fallback": fusion.fallback}
@@ -408,7 +408,7 @@ def _errors(fusion: JudgedFusion, known: _Known, anew: _Paths) -> dict[str, Any]
     }
 
 
-def _own_path(known: _Known, fusion: JudgedFusion, place: int) -> Float:
+def _own_path(known: _Known, fusion: EvaluatedFusion, place: int) -> Float:
     """Return the path (T, 3) of the map that a robot gave: of the smoother or of the filter."""
     given, smoothed = fusion.given[place], known.smoothed[place]
     for k, landmarks in smoothed.maps.items():
@@ -447,7 +447,7 @@ def run_independence(
     """
     teams, costs = [], []
     for scenario in scenarios:
-        run = JudgedRun.of(scenario, store)
+        run = EvaluatedRun.of(scenario, store)
         make = partial(_tables, run, sizes, jobs, on_progress)
         own_teams, own_costs = mending(store, make)
         teams.append(own_teams.assign(scenario=scenario.name, seed=scenario.seed))
@@ -457,7 +457,7 @@ def run_independence(
 
 
 def _tables(
-    run: JudgedRun, sizes: Sequence[int], jobs: int, on_progress: OnProgress
+    run: EvaluatedRun, sizes: Sequence[int], jobs: int, on_progress: OnProgress
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the two tables of one seed."""
     if logs := [robot.log for robot in run.pipeline.simulated]:

@@ -18,7 +18,7 @@ import numpy as np
 from experiments.evaluation.alignment_errors import EvaluatedRobot
 from experiments.evaluation.checks import load_checked
 from experiments.evaluation.criteria import MERGEABLE_PAIRS
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.pair_evaluation import load_robot
 from experiments.evaluation.result import require_result
 from experiments.evaluation.truth import common_landmarks, true_pairs
@@ -210,7 +210,7 @@ def _worlds(word: str, seeds: Sequence[int], results: Path) -> Iterator[MappedWo
 def _world(label: str, name: str, scenario: AnyScenario, store: Store) -> MappedWorld:
     if not isinstance(scenario, Simulation):
         raise InputError(f"{label}: made from recorded logs; only simulated worlds surely differ")
-    judged = JudgedRun.of(scenario, store)
+    judged = EvaluatedRun.of(scenario, store)
     for robot in judged.pipeline.simulated:
         if not all(store.folder(stage).finished for stage in (robot.log, robot.slam)):
             what = f"the maps of {robot.name} are not in {store.root} (made by another version?)"

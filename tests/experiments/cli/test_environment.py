@@ -33,7 +33,7 @@ def test_a_number_of_threads_is_one(
     taken: str,
 ) -> None:
     monkeypatch.setenv(name, value)
-    main._mend_thread_counts()
+    main._repair_thread_counts()
     assert os.environ[name] == taken
     warned = capsys.readouterr().err
     is_wrong = taken == "1" and value != ""
@@ -43,7 +43,7 @@ def test_a_number_of_threads_is_one(
 
 def test_no_variable_is_set_that_was_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    main._mend_thread_counts()
+    main._repair_thread_counts()
     assert "OMP_NUM_THREADS" not in os.environ
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation import tables
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import run_scenario
 from experiments.pipeline.pipeline import lay_out
 from experiments.pipeline.stage import Job
@@ -82,7 +82,7 @@ def test_finished_stages_are_reused_and_fresh_computes_again(
     def tell(stage: str, done: int, total: int) -> None:
         told.append(stage)
 
-    finished = JudgedRun.of(tiny, Store.of(tiny_results))
+    finished = EvaluatedRun.of(tiny, Store.of(tiny_results))
     finished.execute(1, tell)
     assert told == []
 
@@ -151,7 +151,7 @@ def test_truth_is_for_the_evaluation_alone(
 ) -> None:
     rng = np.random.default_rng(1)
     folders = []
-    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    run = EvaluatedRun.of(tiny, Store.of(tiny_results))
     for robot in run.pipeline.robots:
         folder, log = tmp_path / robot.name, run.store.path(robot.log)
         folder.mkdir()
@@ -184,7 +184,7 @@ def test_truth_is_for_the_evaluation_alone(
 
 def test_estimating_opens_no_truth(tiny: Simulation, tiny_results: Path, tmp_path: Path) -> None:
     """The filter and the aligners run where the truth is not even on disk."""
-    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    run = EvaluatedRun.of(tiny, Store.of(tiny_results))
     folders = {}
     for robot in run.pipeline.robots:
         folders[robot.log.key] = log = tmp_path / robot.name

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.tables import UNKNOWN
 from experiments.pipeline.store import Store
 from experiments.reports.figures.result_tables import ResultTables
@@ -38,7 +38,7 @@ def scenario(
     tiny: Simulation, tiny_results: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
-    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    run = EvaluatedRun.of(tiny, Store.of(tiny_results))
     for robot in run.pipeline.robots:
         (folder / robot.name).mkdir()
         for name in ("frames.parquet", "observations.parquet"):

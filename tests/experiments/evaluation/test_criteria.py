@@ -7,9 +7,8 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation import criteria, tables
-from experiments.evaluation.alignment_summary import maps_of
 from experiments.evaluation.checks import CheckedScenario, check_all, load_checked
-from experiments.evaluation.criteria import nothing_merged
+from experiments.evaluation.criteria import nothing_merged, summarise_alignments
 from experiments.evaluation.metrics import USED_TABLES
 from mapfusion.errors import InputError
 from tests.helpers.made_up_runs import complete, many_errors
@@ -46,11 +45,11 @@ def test_an_estimate_and_its_refinement_are_judged_apart(wrong: dict[str, float]
     right = {"translation_error_m": 0.4, "rotation_error_rad": -0.09}
     right |= {f"refined_{name}": value for name, value in right.items()}
     errors = many_errors(1, repetitions=1).assign(n_common=3)
-    mended = maps_of(errors.assign(**(right | wrong)))
+    mended = summarise_alignments(errors.assign(**(right | wrong)))
     assert (mended["estimated_success"] == 0).all()
     assert (mended["refined_success"] == 1).all()
     spoilt = {f"refined_{name}": value for name, value in wrong.items()}
-    spoilt_maps = maps_of(errors.assign(**(right | spoilt), accepted=True))
+    spoilt_maps = summarise_alignments(errors.assign(**(right | spoilt), accepted=True))
     assert (spoilt_maps["estimated_success"] == 1).all()
     assert (spoilt_maps["refined_success"] == 0).all()
     assert (spoilt_maps["false_accepted"] == 1).all()
@@ -74,7 +73,7 @@ def write_run(folder: Path, n_robots: int, n_placed: int, n_common: tuple[int, .
     pair = {"robot_a": "R0", "robot_b": "R1", "aligner": "ransac"}
     errors = [pair | {"iteration": 10 * k, "n_common": n} for k, n in enumerate(n_common, 1)]
     for name, rows in (("fused_motions", motions), ("errors", errors)):
-        frame = complete(name, pd.DataFrame(rows)) if rows else tables.framed(name, [])
+        frame = complete(name, pd.DataFrame(rows)) if rows else tables.as_table(name, [])
         tables.write(tables.table_path(folder, name), name, frame)
     for name in {*USED_TABLES} - {"fused_motions", "errors"}:
         tables.write(tables.table_path(folder, name), name, [])

@@ -13,10 +13,10 @@ from experiments.evaluation.alignment_errors import EvaluatedRobot
 from experiments.evaluation.fused_map_errors import (
     FILTERED,
     FUSED,
-    NOMINAL,
+    NOMINAL_COVERAGES,
     SMOOTHED,
+    EvaluatedFusion,
     GivenMap,
-    JudgedFusion,
     coverage_rows,
 )
 from experiments.evaluation.smoothed_robots import SmoothedRobot
@@ -24,18 +24,18 @@ from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from tests.experiments.evaluation.judged_teams import (
+from tests.experiments.evaluation.evaluated_teams import (
     BENT_M,
     PARTS,
     K,
     evaluated_robots,
-    judged_team,
+    evaluated_team,
 )
 from tests.mapfusion.fusion.drawn_maps import DrawnTeam
 
 
-def coverage(fusions: Sequence[JudgedFusion]) -> pd.DataFrame:
-    return tables.framed("fuser_coverage", coverage_rows(fusions))
+def coverage(fusions: Sequence[EvaluatedFusion]) -> pd.DataFrame:
+    return tables.as_table("fuser_coverage", coverage_rows(fusions))
 
 
 def counted(landmarks: LandmarkMap, truth: np.ndarray, d: int = 3) -> np.ndarray:
@@ -49,12 +49,14 @@ def counted(landmarks: LandmarkMap, truth: np.ndarray, d: int = 3) -> np.ndarray
 def test_shares_are_those_of_landmarks_counted_one_by_one(planar: bool) -> None:
     """Before fusing those of all robots together, not the mean of their shares."""
     team = DrawnTeam(PARTS, 1, planar, BENT_M)
-    judged = judged_team(team)
+    judged = evaluated_team(team)
     rows, d = coverage([judged]), 2 if planar else 3
     needed = np.concatenate([counted(own, team.truth(k), d) for k, own in enumerate(team.maps)])
     before = rows[rows["map"] == FILTERED].set_index("nominal")
     assert (before["n_landmarks"] == len(needed)).all()
-    assert before["frame_coverage"].to_dict() == {p: np.mean(needed <= p) for p in NOMINAL}
+    assert before["frame_coverage"].to_dict() == {
+        p: np.mean(needed <= p) for p in NOMINAL_COVERAGES
+    }
     after, row = rows[rows["map"] == FUSED].set_index("nominal"), judged.row()
     assert after.loc[0.95, "coverage"] == row["coverage_95"]
     assert after.loc[0.95, "frame_coverage"] == row["frame_coverage_95"]
@@ -63,7 +65,7 @@ def test_shares_are_those_of_landmarks_counted_one_by_one(planar: bool) -> None:
 
 
 def test_maps_that_are_as_sure_as_they_may_be_keep_to_the_diagonal() -> None:
-    fusions = [judged_team(DrawnTeam(PARTS, seed, bent_m=BENT_M)) for seed in range(30)]
+    fusions = [evaluated_team(DrawnTeam(PARTS, seed, bent_m=BENT_M)) for seed in range(30)]
     rows = pd.concat([coverage([each]) for each in fusions])
     for of, own in rows.groupby("map"):
         mean = own.groupby("nominal")[["coverage", "frame_coverage"]].mean()
@@ -73,11 +75,11 @@ def test_maps_that_are_as_sure_as_they_may_be_keep_to_the_diagonal() -> None:
 def test_gross_landmarks_are_left_out() -> None:
     team = DrawnTeam(PARTS, 2, bent_m=BENT_M)
     team.pairs = []
-    whole = coverage([judged_team(team)]).set_index(["map", "nominal"])
+    whole = coverage([evaluated_team(team)]).set_index(["map", "nominal"])
     position = team.maps[0].position_m.copy()
     position[:4] += 0.4
     team.maps[0] = replace(team.maps[0], position_m=position)
-    rows = coverage([judged_team(team)]).set_index(["map", "nominal"])
+    rows = coverage([evaluated_team(team)]).set_index(["map", "nominal"])
     lost = whole["n_landmarks"] - rows["n_landmarks"]
     assert (lost == 4).all()
     assert rows.loc[(FUSED, 0.99), "coverage"] > 0.9
@@ -85,7 +87,7 @@ def test_gross_landmarks_are_left_out() -> None:
 
 def test_smoothed_maps_stand_beside_the_filters_and_only_the_end_counts() -> None:
     team = DrawnTeam(PARTS, 3, bent_m=BENT_M)
-    judged = judged_team(team)
+    judged = evaluated_team(team)
     rough = [replace(own, covariance_m2=own.covariance_m2 / 100, joint=None) for own in team.maps]
     given = [
         GivenMap(robot, own.landmarks, own.points_world_m, worse, own.of_filter_world_m)
@@ -108,7 +110,7 @@ def test_smoothed_maps_stand_beside_the_filters_and_only_the_end_counts() -> Non
 def test_where_nothing_was_fused_or_no_truth_is_known_there_are_no_rows() -> None:
     team = DrawnTeam(PARTS, 4, bent_m=BENT_M)
     team.world_m[:] = np.nan
-    assert coverage([judged_team(team)]).empty
+    assert coverage([evaluated_team(team)]).empty
     assert coverage([]).empty
 
 
@@ -123,7 +125,7 @@ def _fitted_errors(position: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def test_figures_are_those_of_the_landmarks_one_by_one() -> None:
     team = DrawnTeam(PARTS, 1, bent_m=BENT_M)
-    judged = judged_team(team)
+    judged = evaluated_team(team)
     row, fused = judged.row(), judged.fusion
     truth = np.full((len(fused.landmarks), 3), np.nan)
     for k, part in enumerate(team.parts):
@@ -180,14 +182,14 @@ def test_over_the_filter_is_of_the_same_landmarks_in_the_filter_s_maps() -> None
             robot, np.zeros((1, 3)), good.maps, good.points_world_m, {}, {"not_smoothed": ""}
         )
         given.append(GivenMap.at(robot, smoothed, K))
-    row = JudgedFusion("joint", K, fused, given).row()
+    row = EvaluatedFusion("joint", K, fused, given).row()
     assert row["over_better_filter"] == pytest.approx(row["over_better_parent"] / 2, rel=0.1)
 
 
 def test_a_map_of_one_robot_has_no_parents_to_be_better_than() -> None:
     team = DrawnTeam(PARTS, 3, bent_m=BENT_M)
     team.pairs = []
-    row = judged_team(team).row()
+    row = evaluated_team(team).row()
     assert np.isnan([row["over_better_parent"], row["alignment_nees_per_dof"]]).all()
     assert row["n_robots"] == 1
 
@@ -196,14 +198,14 @@ def test_motions_are_judged_by_the_median_robot_and_across_the_half_turn() -> No
     """Three maps are off by 0.1, 0.2 and 0.9 m, and by 0.01, 0.02 and 0.3 rad."""
     team = DrawnTeam([slice(0, 20)] * 4, 5, bent_m=BENT_M)
     team.T_world_map[:, 2] = [3.1, -3.1, 0.5, -0.4]
-    fused = judged_team(team).fusion
+    fused = evaluated_team(team).fusion
     sigma = np.diag([0.1, 0.1, 0.01]) ** 2
     T = np.array([se2.between(team.T_world_map[0], own) for own in team.T_world_map])
     T[1:, 0] += [0.1, -0.2, 0.9]
     T[1:, 2] += [0.01 + 2 * np.pi, -0.02, 0.3]
     fused = replace(fused, T_first_map=T, motion_covariance=np.tile(sigma, (4, 1, 1)))
     given = [GivenMap.at(robot, None, K) for robot in evaluated_robots(team)]
-    row = JudgedFusion("joint", K, fused, given).row()
+    row = EvaluatedFusion("joint", K, fused, given).row()
     assert row["alignment_error_m"] == pytest.approx(0.2)
     assert row["alignment_error_rad"] == pytest.approx(0.02)
     assert row["alignment_nees_per_dof"] == pytest.approx((4 + 4) / 3)  # 2, 8 and 981 over 3
@@ -213,6 +215,6 @@ def test_a_fused_map_is_held_against_the_truth_in_its_own_frame() -> None:
     """The first robot met nobody, so the map is in the frame of the second."""
     team = DrawnTeam(PARTS, 6, bent_m=BENT_M)
     team.pairs = [pair for pair in team.pairs if 0 not in (pair.a, pair.b)]
-    judged = judged_team(team)
+    judged = evaluated_team(team)
     assert judged.fusion.members.tolist() == [1, 2]
     assert judged.row()["landmark_rmse_m"] < 0.1

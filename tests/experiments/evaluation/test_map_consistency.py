@@ -8,8 +8,8 @@ import scipy.linalg
 
 from experiments.evaluation.map_consistency import (
     GROSS_M,
-    both_consistencies,
-    fitted,
+    consistencies,
+    fit_to_truth,
     relative_consistency,
 )
 from mapfusion.geometry import se2
@@ -68,7 +68,7 @@ def dense_without_gauge(landmarks: LandmarkMap, error: Float, at: Float) -> tupl
 @pytest.mark.parametrize("planar", [False, True])
 def test_equals_the_dense_twin(planar: bool) -> None:
     landmarks, truth = drawn_map(np.random.default_rng(0), planar=planar)
-    fit, d = fitted(landmarks, truth), 2 if planar else 3
+    fit, d = fit_to_truth(landmarks, truth), 2 if planar else 3
     found = relative_consistency(landmarks, fit)
     error, S = dense_without_gauge(landmarks, fit.error_m, fit.truth_m)
     dof = len(error) - 3
@@ -83,7 +83,7 @@ def test_equals_the_dense_twin(planar: bool) -> None:
 def test_in_its_own_frame_nothing_is_projected() -> None:
     landmarks, truth = drawn_map(np.random.default_rng(1))
     error = landmarks.position_m - truth
-    _, found = both_consistencies(landmarks, fitted(landmarks, truth))
+    _, found = consistencies(landmarks, fit_to_truth(landmarks, truth))
     assert landmarks.joint is not None
     nees = error.ravel() @ scipy.linalg.solve(landmarks.joint.dense_m2(), error.ravel())
     assert found.nees_per_dof == pytest.approx(nees / error.size, rel=1e-9)
@@ -93,7 +93,7 @@ def test_in_its_own_frame_nothing_is_projected() -> None:
 def test_drawn_errors_of_the_stated_covariance_are_consistent(planar: bool) -> None:
     rng = np.random.default_rng(2)
     drawn = [drawn_map(rng, planar=planar) for _ in range(200)]
-    found = [relative_consistency(own, fitted(own, truth)) for own, truth in drawn]
+    found = [relative_consistency(own, fit_to_truth(own, truth)) for own, truth in drawn]
     assert np.mean([each.nees_per_dof for each in found]) == pytest.approx(1, abs=0.035)
     assert np.mean([each.marginal_nees_per_dof for each in found]) == pytest.approx(1, abs=0.2)
     assert np.mean([each.coverage_95 for each in found]) == pytest.approx(0.95, abs=0.03)
@@ -103,20 +103,20 @@ def test_a_map_that_leaves_out_what_is_shared_is_found_too_sure() -> None:
     """Too sure of all at once where correlations are left out, of each where the sigma is small."""
     landmarks, truth = drawn_map(np.random.default_rng(3), n=100)
     assert landmarks.joint is not None
-    right = relative_consistency(landmarks, fitted(landmarks, truth))
+    right = relative_consistency(landmarks, fit_to_truth(landmarks, truth))
     half = JointCovariance(landmarks.joint.own_m2 / 4, landmarks.joint.common_m / 2)
     sure = replace(landmarks, covariance_m2=half.marginal_m2, joint=half)
-    found = relative_consistency(sure, fitted(sure, truth))
+    found = relative_consistency(sure, fit_to_truth(sure, truth))
     assert found.nees_per_dof == pytest.approx(4 * right.nees_per_dof)
     assert found.coverage_95 < right.coverage_95 - 0.1
     alone = replace(landmarks, covariance_m2=landmarks.joint.own_m2, joint=None)
-    assert relative_consistency(alone, fitted(alone, truth)).nees_per_dof > 5
+    assert relative_consistency(alone, fit_to_truth(alone, truth)).nees_per_dof > 5
 
 
 def test_the_frame_that_a_map_is_in_changes_nothing() -> None:
     landmarks, truth = drawn_map(np.random.default_rng(4))
     other = moved(landmarks, np.array([3.0, -2.0, 2.5]))
-    fits = [fitted(each, truth) for each in (landmarks, other)]
+    fits = [fit_to_truth(each, truth) for each in (landmarks, other)]
     assert fits[1].rmse_m == pytest.approx(fits[0].rmse_m)
     found = [relative_consistency(*each) for each in zip((landmarks, other), fits, strict=True)]
     for name, value in vars(found[0]).items():
@@ -128,13 +128,13 @@ def test_gross_landmarks_are_left_out_of_all_figures() -> None:
     position = landmarks.position_m.copy()
     position[[3, 8]] += [[2.0, 1.0, 0.0], [0.0, 0.0, GROSS_M * 2]]
     truth[11] = np.nan
-    fit = fitted(replace(landmarks, position_m=position), truth)
+    fit = fit_to_truth(replace(landmarks, position_m=position), truth)
     np.testing.assert_array_equal(fit.rows[fit.gross], [3, 8])
     assert 11 not in fit.rows
     assert fit.gross_share == 2 / 39
     others = truth.copy()
     others[[3, 8]] = np.nan
-    alone = fitted(landmarks, others)
+    alone = fit_to_truth(landmarks, others)
     assert fit.rmse_m == pytest.approx(alone.rmse_m, rel=1e-9)
     spoilt = relative_consistency(replace(landmarks, position_m=position), fit)
     assert spoilt == relative_consistency(landmarks, alone)
@@ -151,14 +151,14 @@ def test_a_few_that_are_metres_off_do_not_make_all_others_gross() -> None:
         [4.0, 0.0, 0.0],
         [2.0, 0, 0],
     ]
-    fit = fitted(replace(landmarks, position_m=position), truth)
+    fit = fit_to_truth(replace(landmarks, position_m=position), truth)
     np.testing.assert_array_equal(fit.rows[fit.gross], wrong)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
 def test_of_fewer_landmarks_than_a_fit_needs_nothing_is_known(n: int) -> None:
     landmarks, truth = drawn_map(np.random.default_rng(6), n=n)
-    fit = fitted(landmarks, truth)
+    fit = fit_to_truth(landmarks, truth)
     assert len(fit.rows) == n
     assert np.isnan(relative_consistency(landmarks, fit).nees_per_dof)
     assert np.isnan(fit.rmse_m) == (n == 0)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.evaluation import tables
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import run_scenario
 from experiments.pipeline.stages.snapshots import stored_maps
 from experiments.pipeline.store import Store
@@ -41,7 +41,7 @@ def test_each_part_is_there_when_it_is_told(
 def test_maps_of_a_result_tell_from_where_their_landmarks_were_seen(
     tiny: Simulation, tiny_results: Path
 ) -> None:
-    run = JudgedRun.of(tiny, Store.of(tiny_results))
+    run = EvaluatedRun.of(tiny, Store.of(tiny_results))
     for robot in run.pipeline.robots:
         stored = stored_maps(run.robot_folders(robot))[robot.n_frames - 1].viewing
         told = read_map(tiny_results / "tiny-3" / "maps" / f"{robot.name}.parquet").viewing

@@ -10,7 +10,7 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 from scipy.optimize import least_squares
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot, MetMaps
+from experiments.evaluation.alignment_errors import EvaluatedRobot, MapPair
 from experiments.evaluation.fused_landmarks import FusedTeam
 from experiments.evaluation.path_errors import STATISTICS, path_statistics_rows
 from experiments.evaluation.team_errors import (
@@ -51,7 +51,7 @@ def team_of(
         return FusedTeam(robots, [], ITERATION, None)
     none = Correspondences(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
     met = [
-        MetMaps(a, b, ITERATION, (a.at(0)[0], b.at(0)[0]), (), none, pd.DataFrame(), NO_RIVALS)  # type: ignore[arg-type]
+        MapPair(a, b, ITERATION, (a.at(0)[0], b.at(0)[0]), (), none, pd.DataFrame(), NO_RIVALS)  # type: ignore[arg-type]
         for a, b in itertools.combinations(robots, 2)
     ]
     none_m, none_m2 = np.zeros(len(robots)), np.zeros((len(robots), 3, 3))

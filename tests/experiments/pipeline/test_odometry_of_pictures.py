@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
-from experiments.evaluation.map_consistency import Consistency, fitted, relative_consistency
+from experiments.evaluation.map_consistency import Consistency, fit_to_truth, relative_consistency
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from mapfusion.align.alignment import Alignment, Status
@@ -39,7 +39,7 @@ def assert_as_sure_as_stated(nees_per_dof: float, coverage_95: float) -> None:
 
 def consistency_of(each: Mapped) -> Consistency:
     assert len(each.landmarks) > 50
-    return relative_consistency(each.landmarks, fitted(each.landmarks, each.point_m))
+    return relative_consistency(each.landmarks, fit_to_truth(each.landmarks, each.point_m))
 
 
 def test_smoothed_maps_are_as_sure_as_they_say(mapped: list[Mapped]) -> None:
@@ -62,7 +62,7 @@ def test_maps_fused_jointly_are_as_sure_as_they_say(mapped: list[Mapped]) -> Non
     assert fused.fallback == ""
     known = fused.parents != ABSENT
     world = np.where(known[:, :1], a.point_m[fused.parents[:, 0]], b.point_m[fused.parents[:, 1]])
-    fit = fitted(fused.landmarks, se2.transform_points(se2.inverse(a.start), world))
+    fit = fit_to_truth(fused.landmarks, se2.transform_points(se2.inverse(a.start), world))
     found = relative_consistency(fused.landmarks, fit)
     assert_as_sure_as_stated(found.nees_per_dof, found.coverage_95)
     off = fused.T_first_map[1] - T

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import provenance
 from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
@@ -25,7 +25,7 @@ def test_the_renderer_s_driver_is_in_the_record_and_in_the_key(
     keys = []
     for driver in ("llvmpipe 22", "llvmpipe 23"):
         monkeypatch.setattr(renderer, "egl_driver", lambda driver=driver: driver)
-        laid_out = JudgedRun.of(scenario, Store(tmp_path))
+        laid_out = EvaluatedRun.of(scenario, Store(tmp_path))
         assert provenance(laid_out)["renderer"] == f"OpenGL by EGL ({driver})"
         keys.append(laid_out.pipeline.simulated[0].features.key)
     assert keys[0] != keys[1]
@@ -56,7 +56,7 @@ def test_an_unknown_renderer_lists_the_known(
 
 def test_the_ray_caster_is_in_the_record_and_in_the_key(tiny_path: Path, tmp_path: Path) -> None:
     runs = [
-        JudgedRun.of(load_scenario(tiny_path, [f"render.renderer={name}"]), Store(tmp_path))
+        EvaluatedRun.of(load_scenario(tiny_path, [f"render.renderer={name}"]), Store(tmp_path))
         for name in ("tiny", "raycast")
     ]
     assert [provenance(run)["renderer"] for run in runs] == ["TinyRenderer", "our ray caster"]

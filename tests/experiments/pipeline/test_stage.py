@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pydantic_core import to_jsonable_python
 
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.pipeline import stage as stage_module
 from experiments.pipeline.code_version import imported_sources
 from experiments.pipeline.pipeline import lay_out
@@ -101,7 +101,7 @@ WORDS += ("other", "raycast", "pixels", "drop")
 
 def stages_of(scenario: Simulation) -> list[Stage]:
     """In the scenario's order: done they are in another, the aligner that merges first."""
-    found = JudgedRun.of(scenario, Store(Path("nowhere"))).stages()
+    found = EvaluatedRun.of(scenario, Store(Path("nowhere"))).stages()
     return with_those_before([*(s for s in found if s.name not in ("aligner", "fuse")), *found])
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.pair_evaluation import load_robot
 from experiments.evaluation.truth import fit_rmse_m
 from experiments.pipeline.store import Store
@@ -38,7 +38,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Mapped]:
     shared = ["render.renderer=raycast", "slam.filter.proposal=informed", "evaluate.every=40"]
     kinds = {"level": [], "sways": [SWAY], "blind": [SWAY, "attitude.measured=false"]}
     for kind, own in kinds.items():
-        run = JudgedRun.of(load_scenario(path, [*shared, *own]), Store.of(root))
+        run = EvaluatedRun.of(load_scenario(path, [*shared, *own]), Store.of(root))
         robot = run.pipeline.simulated[0]
         run.execute(1, lambda *_: None, [robot.slam])
         log = run.store.path(robot.log)

@@ -26,7 +26,7 @@ def pairs(*rows: tuple[str, str, str, int, float]) -> pd.DataFrame:
     return complete("team_pairs", frame.assign(refined_rotation_error_rad=0.0))
 
 
-NONE = {name: tables.framed(name, []) for name in ("team", "team_pairs")}
+NONE = {name: tables.as_table(name, []) for name in ("team", "team_pairs")}
 
 
 def test_a_team_of_which_one_is_left_out() -> None:

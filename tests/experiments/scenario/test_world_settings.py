@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import AnyScenario, Simulation
@@ -28,7 +28,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def keys(scenario: AnyScenario, folder: Path) -> list[str]:
-    return [stage.key for stage in JudgedRun.of(scenario, Store(folder)).stages()]
+    return [stage.key for stage in EvaluatedRun.of(scenario, Store(folder)).stages()]
 
 
 def test_the_loaded_scenario_holds_world_and_robots(path: Path) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.evaluation.alignment_summary import ERROR_COLUMNS
+from experiments.evaluation.criteria import ERROR_COLUMNS
 from experiments.studies.comparison import BETTER, NOISE, SAME, WORSE, compare
 from experiments.studies.intervals import holm
 from mapfusion.errors import InputError

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.evaluation.alignment_summary import maps_of
+from experiments.evaluation.criteria import summarise_alignments
 from experiments.evaluation.tables import SHOWN, Shown
 from experiments.studies.method_comparison import aligner_summary, recommend
 from tests.helpers.made_up_runs import many_errors
@@ -48,7 +48,7 @@ def timings(**ms: float) -> pd.DataFrame:
 
 def verdict_of(errors: pd.DataFrame, times: pd.DataFrame | None = None):
     order = list(dict.fromkeys(errors["aligner"]))
-    maps = maps_of(errors)
+    maps = summarise_alignments(errors)
     return recommend(maps, pd.DataFrame() if times is None else times, order)
 
 

@@ -5,8 +5,7 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from experiments.evaluation.alignment_summary import maps_of
-from experiments.evaluation.criteria import RICH_PAIRS
+from experiments.evaluation.criteria import RICH_PAIRS, summarise_alignments
 from experiments.evaluation.metrics import compute
 from experiments.studies.error_bands import (
     BAND,
@@ -37,7 +36,7 @@ def rich(errors: pd.DataFrame) -> pd.DataFrame:
 def test_ratio_over_the_oracle_agrees_with_the_checks_metric() -> None:
     errors = rich(many_errors(10))
     errors.loc[errors.index[::7], "translation_error_m"] = np.nan
-    table = oracle_ratios(maps_of(errors), rng()).set_index("aligner")
+    table = oracle_ratios(summarise_alignments(errors), rng()).set_index("aligner")
     for aligner in ("ransac", "icp"):
         row = table.loc[aligner]
         for stage in ("refined", "estimated"):
@@ -51,14 +50,14 @@ def test_ratio_over_the_oracle_agrees_with_the_checks_metric() -> None:
 def test_ratio_resamples_method_and_oracle_together() -> None:
     """A drift that differs from run to run, and is common to both, cancels in the ratio."""
     errors = rich(many_errors(10, methods={"exact": (1.3, 0.0, 0.0)}))
-    row = oracle_ratios(maps_of(errors), rng()).set_index("aligner").loc["exact"]
+    row = oracle_ratios(summarise_alignments(errors), rng()).set_index("aligner").loc["exact"]
     assert row["estimated_ratio"] == pytest.approx(1.3)
     assert row["estimated_ratio_high"] - row["estimated_ratio_low"] == pytest.approx(0, abs=1e-9)
 
 
 def test_scarce_maps_are_left_out() -> None:
     errors = many_errors(3)
-    table = oracle_ratios(maps_of(errors), rng())
+    table = oracle_ratios(summarise_alignments(errors), rng())
     maps = errors[errors["n_true"] >= RICH_PAIRS]
     keys = ["run_id", "robot_a", "robot_b", "iteration"]
     assert (table["n_maps"] == maps.groupby(keys).ngroups).all()
@@ -66,7 +65,7 @@ def test_scarce_maps_are_left_out() -> None:
 
 def test_methods_on_the_same_maps() -> None:
     errors = rich(many_errors(12))
-    table = compare_methods(maps_of(errors), rng())
+    table = compare_methods(summarise_alignments(errors), rng())
     assert table[["first", "second"]].to_numpy().tolist() == [["ransac", "icp"]]
     row = table.iloc[0]
     wide = errors.pivot_table(
@@ -88,24 +87,24 @@ def test_methods_on_the_same_maps() -> None:
 def test_a_method_without_answer_loses_and_two_draw() -> None:
     errors = rich(many_errors(4))
     errors.loc[errors["aligner"] == "ransac", "translation_error_m"] = np.nan
-    row = compare_methods(maps_of(errors), rng()).iloc[0]
+    row = compare_methods(summarise_alignments(errors), rng()).iloc[0]
     assert (row["ratio"], row["first_wins"]) == (np.inf, 0)
     errors["translation_error_m"] = np.nan
-    row = compare_methods(maps_of(errors), rng()).iloc[0]
+    row = compare_methods(summarise_alignments(errors), rng()).iloc[0]
     assert (row["ratio"], row["first_wins"]) == (1, 0.5)
     assert np.isnan(row["p"])
 
 
 def test_one_run_has_no_test_and_one_method_no_other() -> None:
-    row = compare_methods(maps_of(rich(many_errors(1))), rng()).iloc[0]
+    row = compare_methods(summarise_alignments(rich(many_errors(1))), rng()).iloc[0]
     assert np.isnan(row["p"])
     assert np.isnan(row["p_holm"])
     alone = rich(many_errors(2, methods={"svd": (1.0, 0.1, 0.0)}))
-    assert compare_methods(maps_of(alone), rng()).empty
+    assert compare_methods(summarise_alignments(alone), rng()).empty
 
 
 def test_same_rows_same_table_whatever_their_order() -> None:
-    maps = maps_of(rich(many_errors(5)))
+    maps = summarise_alignments(rich(many_errors(5)))
     again = compare_methods(maps, rng())
     pd.testing.assert_frame_equal(compare_methods(maps, rng()), again)
 
@@ -222,7 +221,7 @@ def test_maps_that_one_method_did_not_see_leave_the_others_in_their_runs() -> No
     both = np.log(one["translation_error_m"] / other["translation_error_m"]).dropna().sort_index()
     runs = clusters_of(both.reset_index())
     expected = np.exp(median_interval(both.to_numpy(), runs, rng()))
-    (row,) = compare_methods(maps_of(errors), rng()).to_dict("records")
+    (row,) = compare_methods(summarise_alignments(errors), rng()).to_dict("records")
     assert (row["n_maps"], row["n_runs"]) == (len(both), 5)
     assert [row[f"ratio{end}"] for end in ("", "_low", "_high")] == pytest.approx(expected)
 
@@ -233,6 +232,6 @@ def test_what_is_told_beside_the_ratio_is_a_median_too() -> None:
     place = errors.groupby(["robot_a", "robot_b", "iteration"]).ngroup()
     errors["translation_error_m"] = off[place]
     errors["refined_translation_error_m"] = off[place] / 3
-    row = oracle_ratios(maps_of(errors), rng()).set_index("aligner").loc["one"]
+    row = oracle_ratios(summarise_alignments(errors), rng()).set_index("aligner").loc["one"]
     assert row["estimated_m"] == pytest.approx(np.median(off))
     assert row["refined_m"] == pytest.approx(np.median(off) / 3)

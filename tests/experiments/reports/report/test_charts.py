@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.evaluation.alignment_summary import maps_of
+from experiments.evaluation.criteria import summarise_alignments
 from experiments.reports.figures.style import aligner_styles
 from experiments.reports.report.charts import (
     error_curves,
@@ -59,7 +59,7 @@ def test_success_is_by_bin_and_of_maps_with_common_ground() -> None:
     rows = rows.assign(n_true=np.where(rows["iteration"] <= 50, 5, 40), n_correspondences=100)
     lost = (rows["iteration"] == 75) & (rows["aligner"] == "ransac")
     rows.loc[lost, "refined_translation_error_m"] = 9.0
-    maps = maps_of(rows.assign(n_common=9)).assign(overlap_share=np.nan)
+    maps = summarise_alignments(rows.assign(n_common=9)).assign(overlap_share=np.nan)
     by_name = {curve["label"]: curve for curve in success_curves(maps, ["ransac"])}
     pairs = by_name["true pairs among the correspondences"]
     assert pairs["bins"] == ["3–9", "30–99"]
@@ -70,7 +70,7 @@ def test_success_is_by_bin_and_of_maps_with_common_ground() -> None:
     assert by_name["share of false correspondences"]["bins"] == ["50–70 %", "95–99 %"]
     assert "common landmarks, share of the smaller map" not in by_name
     apart = rows.assign(n_common=np.where(rows["n_true"] == 5, 2, 9))
-    curves = success_curves(maps_of(apart).assign(overlap_share=0.5), ["ransac"])
+    curves = success_curves(summarise_alignments(apart).assign(overlap_share=0.5), ["ransac"])
     assert curves[0]["bins"] == ["30–99"]  # elsewhere there is nothing to be right about
 
 
@@ -101,7 +101,7 @@ def test_what_was_offered_is_a_median_over_maps() -> None:
 def test_a_rate_counts_the_maps_with_common_ground() -> None:
     rows = many_errors(2, methods={"ransac": (1.0, 0.0, 0.0)}, repetitions=1).assign(n_true=5)
     rows["n_common"] = np.where(rows["iteration"] <= 25, 2, 9)  # one iteration of four
-    curves = success_curves(maps_of(rows).assign(overlap_share=np.nan), ["ransac"])
+    curves = success_curves(summarise_alignments(rows).assign(overlap_share=np.nan), ["ransac"])
     assert curves[0]["aligners"]["ransac"]["n"] == [2 * 2 * 3]
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation import tables
-from experiments.evaluation.evaluated_run import JudgedRun
+from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.pipeline.stages.fuse import read_fusions
 from experiments.pipeline.store import Store
 from experiments.pipeline.tables import read_rows
@@ -86,7 +86,7 @@ def test_paths_are_those_of_the_run(
 ) -> None:
     team = tables.read(tables.table_path(trio_result, "team"), "team").set_index("source")
     assert last(found.teams, "filters")["path_rmse_m"] == pytest.approx(team.loc["final", "rmse"])
-    run = JudgedRun.of(scenario, Store.of(trio_result.parent))
+    run = EvaluatedRun.of(scenario, Store.of(trio_result.parent))
     robots = run.load_robots()
     smoothed = run.load_smoothed(robots)
     folder = run.store.path(run.pipeline.fusers["joint"])
@@ -115,7 +115,7 @@ def test_bytes_are_those_of_the_files_that_hold_it(
     found: Independence, scenario: Simulation, trio_result: Path
 ) -> None:
     maps = trio_result / "maps"
-    run = JudgedRun.of(scenario, Store.of(trio_result.parent))
+    run = EvaluatedRun.of(scenario, Store.of(trio_result.parent))
     logs = [run.store.path(robot.log) for robot in run.pipeline.robots]
     files = {
         "filters": [
@@ -212,7 +212,7 @@ def test_command_writes_tables_page_and_figure(
 
 def test_a_smaller_team_is_some_of_the_larger_one(scenario: Simulation, results: Path) -> None:
     """What two robots do by themselves, and their alignment, is measured for both teams at once."""
-    run = JudgedRun.of(scenario, Store.of(results))
+    run = EvaluatedRun.of(scenario, Store.of(results))
     two, three = (team_of(run, n) for n in (2, 3))
     keys = {name: stage.key for name, stage in three.by_robot.items()}
     assert {name: stage.key for name, stage in two.by_robot.items()} == {

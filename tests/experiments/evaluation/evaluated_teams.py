@@ -1,7 +1,7 @@
 """Drawn maps of several robots with their truth, fused and ready to be judged."""
 
 from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
+from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.truth import PathTruth
 from mapfusion.fusion.fused_map import MergeParameters
 from mapfusion.fusion.fusers import make_fuser
@@ -23,8 +23,8 @@ def evaluated_robots(team: DrawnTeam) -> list[EvaluatedRobot]:
     return robots
 
 
-def judged_team(team: DrawnTeam, fuser: str = "joint") -> JudgedFusion:
+def evaluated_team(team: DrawnTeam, fuser: str = "joint") -> EvaluatedFusion:
     """All maps fused, by a fuser that is given these very maps."""
     fused = merge(team.maps, team.pairs, MergeParameters(), make_fuser(fuser)).fused[0]
     given = [GivenMap.at(robot, None, K) for robot in evaluated_robots(team)]
-    return JudgedFusion(fuser, K, fused, given)
+    return EvaluatedFusion(fuser, K, fused, given)
