@@ -8,11 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
 from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.evaluation.tables import table_path
@@ -20,7 +16,7 @@ from experiments.pipeline.code_version import library_versions
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, write_rows
 from experiments.plugins.discovery import find_method
 from experiments.reports.export import to_markdown, write_tables, write_text
-from experiments.reports.figures import independence_figure, refusal_figures, style, verdict_figures
+from experiments.reports.figures import study_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
 from experiments.reports.json_document import publish
@@ -99,13 +95,6 @@ def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
 
 
 SCHEMA_VERSION = 1
-_BAND_ALPHA = 0.14
-_DODGE = 0.45  # of the distance between two shares, over which the methods are spread
-_MIN_SUCCESSES = 10  # the median error of fewer says little
-_RATIO_TICKS = (1, 2, 5, 10, 20, 50, 100)
-_RATIO_RANGE = (0.9, 11.0)  # shown at least
-_MARGIN = 1.15  # about what is drawn
-_ROWS = ("success (%)", "error over the oracle's", "time of one call (ms)")
 
 
 def write_benchmark(
@@ -131,7 +120,7 @@ def write_benchmark(
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     write_json(folder / "provenance.json", provenance)
-    save_figure(folder, "benchmark", draw, summary)
+    save_figure(folder, "benchmark", study_figures.draw_benchmark, summary)
 
 
 def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
@@ -177,64 +166,6 @@ def cell_text(cell: pd.Series) -> str:
     return ", ".join(parts)
 
 
-def draw(summary: pd.DataFrame) -> Figure:
-    """Draw one column of panels for each number of pairs, with the rows of `_ROWS`.
-
-    Bands: Wilson's 95 % interval of the success, 10-90 % of the trials' times. The shares are
-    spaced evenly and the methods set a little apart, as most lie on one another.
-    """
-    counts = summary["n_pairs"].unique()
-    methods = summary["method"].unique().tolist()
-    styles = style.aligner_styles(methods)
-    shares = sorted(summary["outlier_share"].unique())
-    figure = Figure(figsize=(style.PAGE_WIDTH_IN, 6.6))
-    panels = figure.subplots(len(_ROWS), len(counts), sharex=True, sharey="row", squeeze=False)
-    ran = summary[summary["status"] != Status.ABSENT].sort_values("outlier_share")
-    for column, count in zip(panels.T, counts, strict=True):
-        for place, method in enumerate(methods):
-            own = ran[(ran["n_pairs"] == count) & (ran["method"] == method)]
-            offset = _DODGE * ((place + 0.5) / len(methods) - 0.5)
-            x = np.searchsorted(shares, own["outlier_share"]) + offset
-            _add_method(column, x, own, styles[method])
-        column[0].set_title(f"{count} pairs")
-        column[-1].set_xlabel("outliers (%)")
-    _lay_out(panels, shares)
-    absent = set(summary["method"][summary["status"] == Status.ABSENT])
-    looks = {f"{m} (absent)" if m in absent else m: styles[m] for m in methods}
-    style.aligner_legend(figure, looks, columns=5)
-    return figure
-
-
-def _add_method(axes: np.ndarray, x: np.ndarray, own: pd.DataFrame, line: dict) -> None:
-    success, ratio, elapsed = axes
-    line = line | {"linewidth": 0.8, "markersize": 2.8}
-    ends = (100 * own["success_low"], 100 * own["success_high"])
-    success.vlines(x, *ends, color=line["color"], linewidth=2.2, alpha=0.35)
-    success.plot(x, 100 * own["success"], **line)
-    ratio.plot(x, own["ratio_m"].where(own["n_success"] >= _MIN_SUCCESSES), **line)
-    ends = (1e3 * own["elapsed_low_s"], 1e3 * own["elapsed_high_s"])
-    elapsed.fill_between(x, *ends, color=line["color"], alpha=_BAND_ALPHA, linewidth=0)
-    elapsed.plot(x, 1e3 * own["elapsed_s"], **line)
-
-
-def _lay_out(panels: np.ndarray, shares: list[float]) -> None:
-    axes: Axes
-    for row, label in zip(panels, _ROWS, strict=True):
-        row[0].set_ylabel(label)
-        for axes in row:
-            axes.set_xticks(range(len(shares)), [f"{100 * share:g}" for share in shares])
-            axes.grid(visible=False, axis="x")
-    panels[0, 0].set_ylim(-3, 103)
-    for axes in panels[1:].flat:
-        axes.set_yscale("log")
-        style.write_plainly(axes.yaxis)
-    drawn = [line.get_ydata() for axes in panels[1] for line in axes.get_lines()]
-    ratios = np.concatenate([*drawn, _RATIO_RANGE])
-    panels[1, 0].set_yticks(_RATIO_TICKS)
-    panels[1, 0].set_ylim(np.nanmin(ratios) / _MARGIN, np.nanmax(ratios) * _MARGIN)
-    panels[1, 0].yaxis.set_minor_locator(NullLocator())
-
-
 FIGURE = "independence"
 # Columns of `at_the_end` that people are shown: headings of a page and of a screen.
 SHOWN = {
@@ -265,7 +196,7 @@ def write_independence(
     write_text(folder / "summary.md", independence_markdown(scenarios, summary))
     write_json(folder / "provenance.json", _provenance(scenarios))
     try:
-        save_figure(folder, FIGURE, independence_figure.draw, found.teams, found.costs)
+        save_figure(folder, FIGURE, study_figures.draw_independence, found.teams, found.costs)
     except NothingToDraw as reason:
         return [f"{FIGURE}: {reason}"]
     return []
@@ -379,10 +310,10 @@ def draw_refusals(
     place, files = folder / "figures", []
     if len(ordinary(refusals)):
         data = (refusals, calibration, false_alarms)
-        files += save_figure(place, "refusal", refusal_figures.draw, *data)
-    files += save_figure(place, "refusal_kinds", verdict_figures.draw_kinds, refusals)
-    files += save_figure(place, "refusal_roc", verdict_figures.draw_roc, refusals)
+        files += save_figure(place, "refusal", study_figures.draw_refusal, *data)
+    files += save_figure(place, "refusal_kinds", study_figures.draw_refusal_kinds, refusals)
+    files += save_figure(place, "refusal_roc", study_figures.draw_refusal_roc, refusals)
     if held is not None:
-        draw = verdict_figures.draw_reliability
+        draw = study_figures.draw_refusal_reliability
         files += save_figure(place, "refusal_reliability", draw, held)
     return files

@@ -1,7 +1,6 @@
 """Contents of a report of one or several runs, as values for the template."""
 
 import base64
-import importlib
 import io
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -19,7 +18,7 @@ from experiments.evaluation.evaluated_run import lines_of
 from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.path_errors import path_rms
 from experiments.evaluation.result import require_result
-from experiments.reports.figures.drawing import FIGURES
+from experiments.reports.figures.drawing import FIGURES, caption
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.reports.figures.style import aligner_styles
 from experiments.reports.report.charts import (
@@ -224,13 +223,12 @@ def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
     for name in names:
         files = (folder / "figures" / f"{name}.png", folder / f"{name}.png")
         if file := next(filter(Path.is_file, files), None):
-            about = importlib.import_module(f"experiments.reports.figures.{name}").__doc__ or name
             data = read_png(file)
             with Image.open(io.BytesIO(data)) as picture:  # so that the page does not jump
                 size = dict(zip(("width", "height"), picture.size, strict=True))
             png = base64.b64encode(data).decode()
             how = _OF_FUSERS.get(name, "")
-            yield {"about": about.splitlines()[0], "how": how, "png": png, **size}
+            yield {"about": caption(name), "how": how, "png": png, **size}
 
 
 def _as_yaml(scenario: dict[str, Any]) -> str:

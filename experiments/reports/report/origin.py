@@ -8,7 +8,8 @@ from typing import Any
 from experiments.evaluation import tables
 from experiments.evaluation.result_files import read_provenance
 from experiments.reports.figures.result_tables import json_object
-from experiments.studies.run_tables import Runs, setting_columns
+from experiments.evaluation.alignment_summary import setting_columns
+from experiments.studies.run_tables import Runs
 
 _SOURCE_DIGITS = 16
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from experiments.evaluation import tables
-from experiments.reports.figures import (
-    fig04_translation_error,
-    fig05_rotation_error,
-    fig06_aligner_time,
+from experiments.reports.figures.error_figures import (
+    draw_aligner_time,
+    draw_rotation_error,
+    draw_translation_error,
 )
 from experiments.reports.figures.result_tables import ResultTables
 
@@ -38,12 +38,10 @@ def without_svd(trio_copy: Path) -> ResultTables:
     return ResultTables(trio_copy)
 
 
-@pytest.mark.parametrize(
-    "module", [fig04_translation_error, fig05_rotation_error, fig06_aligner_time]
-)
-def test_legends_say_absent(module, trio_result: Path, without_svd: ResultTables) -> None:
+@pytest.mark.parametrize("draw", [draw_translation_error, draw_rotation_error, draw_aligner_time])
+def test_legends_say_absent(draw, trio_result: Path, without_svd: ResultTables) -> None:
     def labels(data: ResultTables) -> list[str]:
-        return [text.get_text() for text in module.draw(data).legends[0].get_texts()]
+        return [text.get_text() for text in draw(data).legends[0].get_texts()]
 
     before, after = labels(ResultTables(trio_result)), labels(without_svd)
     assert "svd" in before

@@ -13,7 +13,7 @@ import pytest
 from experiments.evaluation.result import run_scenario
 from experiments.pipeline.tables import read_rows
 from experiments.reports.figures.drawing import save_figure
-from experiments.reports.figures.refusal_figures import draw
+from experiments.reports.figures.study_figures import draw_refusal
 from experiments.reports.study_files import KINDS
 from experiments.scenario.settings import Simulation
 from experiments.scenario.world_settings import Render
@@ -310,7 +310,7 @@ def test_worlds_of_one_name_are_refused(
 def test_the_figure_is_the_same_bytes(tmp_path: Path) -> None:
     calibration = calibrate(Acceptance(), np.random.default_rng(0), n_pairs=20)
     data = (TABLE, calibration, 1e-3)
-    first = save_figure(tmp_path / "a", "refusal", draw, *data)
-    second = save_figure(tmp_path / "b", "refusal", draw, *data)
+    first = save_figure(tmp_path / "a", "refusal", draw_refusal, *data)
+    second = save_figure(tmp_path / "b", "refusal", draw_refusal, *data)
     for one, other in zip(first, second, strict=True):
         assert one.read_bytes() == other.read_bytes()

@@ -9,7 +9,11 @@ import pandas as pd
 import pytest
 
 from experiments.reports.figures.drawing import save_figure
-from experiments.reports.figures.verdict_figures import draw_kinds, draw_reliability, draw_roc
+from experiments.reports.figures.study_figures import (
+    draw_refusal_kinds,
+    draw_refusal_reliability,
+    draw_refusal_roc,
+)
 from experiments.reports.terminal.study_screen import print_kinds, print_reliability
 from experiments.studies.refusal.rates import (
     N_BINS,
@@ -204,9 +208,9 @@ def test_what_is_shown_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[s
     for word in ("first", "second", "1/2", "2/3", "calibration error", "Brier"):
         assert word in shown
     for name, draw, data in (
-        ("kinds", draw_kinds, rows),
-        ("roc", draw_roc, rows),
-        ("reliability", draw_reliability, found),
+        ("kinds", draw_refusal_kinds, rows),
+        ("roc", draw_refusal_roc, rows),
+        ("reliability", draw_refusal_reliability, found),
     ):
         one, other = (save_figure(tmp_path / part, name, draw, data)[0] for part in "ab")
         assert one.read_bytes() == other.read_bytes()
