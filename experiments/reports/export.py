@@ -1,4 +1,4 @@
-"""Tables as CSV, Markdown and LaTeX."""
+"""Tables as CSV, Markdown and LaTeX, and the page that documents the columns of all files."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +14,7 @@ from mapfusion.files import write_whole
 from mapfusion.geometry.joint_covariance import RANK
 from mapfusion.tables import HEIGHT, about, default_of
 
-# The CSV keeps every digit.
-_SIGNIFICANT_DIGITS = 4
+_SIGNIFICANT_DIGITS = 4  # in Markdown and LaTeX; CSV files have all digits
 
 
 def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> None:
@@ -28,7 +27,7 @@ def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file as a whole."""
-    data = text.encode("utf-8", "backslashreplace")  # text of users may hold half characters
+    data = text.encode("utf-8", "backslashreplace")  # text of users may contain lone surrogates
     write_whole(path, lambda file: file.write_bytes(data))
 
 
@@ -97,7 +96,7 @@ def _lines() -> Iterator[str]:
         for field in schema:
             yield _row(field.name, field.type, _if_absent(field), about(field))
     yield "\n## A result: `RESULT/tables/*.parquet`\n"
-    yield "What the rows are, `experiments/evaluation/tables.py` says. All columns are there.\n"
+    yield "`experiments/evaluation/tables.py` describes the rows. All columns are present.\n"
     yield from ("| table | column | type | unit |", "|---" * 4 + "|")
     for name, schema in tables.ALL.items():
         for field in schema:

@@ -48,11 +48,10 @@ _FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_ti
 
 
 def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = False) -> None:
-    """Show the main tables; write all, and figures 4 to 6, where an output folder is given.
+    """Print the main tables, or all as JSON; write all and figures 4 to 6 into an output folder.
 
-    As JSON, all tables are shown.
-
-    Raises InputError where a path holds no runs, no run knows the truth, or a table is damaged.
+    Raises:
+        InputError: a path has no runs, no run knows the truth, or a table is damaged.
     """
     summary = summarise(find_runs(paths))
     if not {"success_at_the_end", "paths"} & summary.tables.keys():
@@ -73,7 +72,7 @@ def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = F
 def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
     """Draw the figures over several runs of each scenario and setting; yield those not drawn.
 
-    With one such configuration the pictures go to `folder`, with more to a folder each in it.
+    The pictures of several configurations go to one folder each in `folder`.
     """
     drawn = {
         "-".join([labels.pop("scenario"), *(f"{key}={labels[key]}" for key in labels)]): medians
@@ -167,7 +166,7 @@ def cell_text(cell: pd.Series) -> str:
 
 
 FIGURE = "independence"
-# Columns of `at_the_end` that people are shown: headings of a page and of a screen.
+# Columns of `at_the_end` in reports: headings of a page and of a screen.
 SHOWN = {
     "robots_s": ("robots' own work, CPU s", "robots'\nCPU s"),
     "busiest_robot_s": ("of the busiest robot", "busiest\nCPU s"),
@@ -179,7 +178,7 @@ SHOWN = {
     "fitted_rmse_m": ("map after a fit, mm", "fitted\nmm"),
     "path_rmse_m": ("paths after a fit, mm", "paths\nmm"),
 }
-_MM_A_M = 1000.0
+_MM_PER_M = 1000.0
 
 
 def write_independence(
@@ -187,23 +186,15 @@ def write_independence(
 ) -> list[str]:
     """Write `teams`, `costs` (Parquet), `summary` (CSV, Markdown), the figure and provenance.
 
-    Returns why there is no figure, if there is none.
+    Returns:
+        The reason if there is no figure, else an empty list.
     """
     summary = at_the_end(found)
     write_rows(folder / "teams.parquet", TEAMS, found.teams)
     write_rows(folder / "costs.parquet", COSTS, found.costs)
     write_text(folder / "summary.csv", summary.to_csv(index=False))
     write_text(folder / "summary.md", independence_markdown(scenarios, summary))
-    write_json(folder / "provenance.json", _provenance(scenarios))
-    try:
-        save_figure(folder, FIGURE, study_figures.draw_independence, found.teams, found.costs)
-    except NothingToDraw as reason:
-        return [f"{FIGURE}: {reason}"]
-    return []
-
-
-def _provenance(scenarios: Sequence[AnyScenario]) -> dict[str, object]:
-    return {
+    provenance = {
         "schema_version": SCHEMA_VERSION,
         "scenarios": [scenario.resolved() for scenario in scenarios],
         "python": platform.python_version(),
@@ -211,6 +202,12 @@ def _provenance(scenarios: Sequence[AnyScenario]) -> dict[str, object]:
         "libraries": library_versions(),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    write_json(folder / "provenance.json", provenance)
+    try:
+        save_figure(folder, FIGURE, study_figures.draw_independence, found.teams, found.costs)
+    except NothingToDraw as reason:
+        return [f"{FIGURE}: {reason}"]
+    return []
 
 
 def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFrame) -> str:
@@ -224,31 +221,28 @@ def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFram
         "compare them with each other. Errors are root mean squares, of landmarks without the "
         "gross ones. `experiments/docs/independence.md` defines all of it.\n"
     ]
+    labels = {strategy.name: strategy.label for strategy in STRATEGIES}
     for n_robots, rows in summary.groupby("n_robots"):
         whole, n = rows["n_whole"].min(), rows["n_seeds"].max()
+        shown = {heading: shown_numbers(rows, name) for name, (heading, _) in SHOWN.items()}
+        table = pd.DataFrame({"way to one map": rows["strategy"].map(labels)} | shown)
         parts += [
             f"## {n_robots} robots\n",
             f"All robots' maps became one in {whole} of {n} runs.\n",
-            to_markdown(_for_people(rows)),
+            to_markdown(table),
         ]
     return "\n".join(parts)
 
 
-def _for_people(rows: pd.DataFrame) -> pd.DataFrame:
-    labels = {strategy.name: strategy.label for strategy in STRATEGIES}
-    shown = {heading: shown_numbers(rows, name) for name, (heading, _) in SHOWN.items()}
-    return pd.DataFrame({"way to one map": rows["strategy"].map(labels)} | shown)
-
-
 def shown_numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     """Return a column of `SHOWN` in the unit of its heading: errors in mm."""
-    return rows[name] * (_MM_A_M if name.endswith("rmse_m") else 1.0)
+    return rows[name] * (_MM_PER_M if name.endswith("rmse_m") else 1.0)
 
 
 _RATES = ("false_runs", "false_pairs", "false_by_chance", "wrong_pairs", "on_ground", "ambiguous")
 _RATES += tuple(f"right_{verdict}" for verdict in VERDICTS)
 _FIRST = ("first_iteration", "first_true_pairs")
-# A row for each kind of world and method: NAME of NAME_of, with Wilson's interval (`kind_rates`).
+# One row for each kind of world and method: NAME of NAME_of, with Wilson's interval (`by_kind`).
 KINDS = schema(
     "refusal.kinds",
     1,
@@ -265,38 +259,39 @@ KINDS = schema(
 
 
 def write_kinds(folder: Path, refusals: pd.DataFrame, rows: list[dict[str, Any]]) -> Path:
-    """Write rows of `kind_rates.by_kind` as the table `kinds` and, for people, `kinds.md`.
+    """Write rows of `by_kind` as the table `kinds` and as the page `kinds.md`.
 
-    The page begins with what any method does (`of_any_method`), and how early ordinary worlds are
-    come upon (`first_of_ordinary`).
+    The page begins with the rates over all methods (`of_any_method`) and with the iteration of the
+    first right answer in ordinary worlds (`first_of_ordinary`).
     """
-    write_rows(table_path(folder, "kinds"), KINDS, [_flat(row) for row in rows])
+    flat_rows = []
+    for row in rows:
+        flat: dict[str, Any] = {}
+        for name, value in row.items():
+            if isinstance(value, Rate):
+                low, high = value.interval
+                flat |= {name: value.hits, f"{name}_of": value.n}
+                flat |= {f"{name}_low": low, f"{name}_high": high}
+            else:
+                flat[name] = value
+        flat_rows.append(flat)
+    write_rows(table_path(folder, "kinds"), KINDS, flat_rows)
     page, text = folder / "kinds.md", "# Verdicts by kind of world\n"
     parts = {"Any method": of_any_method(refusals)}
     if first := first_of_ordinary(refusals):
         parts["First right answers in worlds that do not repeat themselves"] = first
     parts["Each method"] = rows
     for title, part in parts.items():
-        shown = [{name: _told(value) for name, value in row.items()} for row in part]
+        shown = [
+            {
+                name: f"{value.hits}/{value.n}" if isinstance(value, Rate) else value
+                for name, value in row.items()
+            }
+            for row in part
+        ]
         text += f"\n## {title}\n\n{to_markdown(pd.DataFrame(shown))}\n"
     write_text(page, text)
     return page
-
-
-def _flat(row: dict[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in row.items():
-        if isinstance(value, Rate):
-            low, high = value.interval
-            flat |= {name: value.hits, f"{name}_of": value.n}
-            flat |= {f"{name}_low": low, f"{name}_high": high}
-        else:
-            flat[name] = value
-    return flat
-
-
-def _told(value: Any) -> Any:
-    return f"{value.hits}/{value.n}" if isinstance(value, Rate) else value
 
 
 def draw_refusals(

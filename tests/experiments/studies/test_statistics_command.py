@@ -89,7 +89,7 @@ def test_a_single_run_is_weak_and_its_figures_are_elsewhere(
 ) -> None:
     folder = write_result(tmp_path, 0, tables_of(0))
     reply = command(capsys, "statistics", folder, "-o", tmp_path / "out")
-    assert "One run: the brackets tell of the maps of one run" in reply.out
+    assert "One run: the intervals are over the maps of one run" in reply.out
     assert "`mapfusion report --figures` draws it" in reply.out
     assert not (tmp_path / "out/figures").exists()
 

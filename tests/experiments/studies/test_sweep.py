@@ -32,10 +32,18 @@ from experiments.pipeline.cluster import Terms, code_version, connected
 from experiments.pipeline.store import Store
 from experiments.pipeline.tasks import Task, unfinished
 from experiments.studies import sweep as driver_module
-from experiments.studies import sweep_plan as plan_module
-from experiments.studies.sweep import OnSweepProgress, SweepDriver, SweepProgress, execute
+from experiments.studies import sweep as plan_module
+from experiments.studies.sweep import (
+    OnSweepProgress,
+    PlannedRun,
+    Sweep,
+    SweepDriver,
+    SweepProgress,
+    execute,
+    planned,
+    prepare,
+)
 from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_plan import PlannedRun, Sweep, planned, prepare
 from experiments.studies.sweep_tables import RUN_TIMES, JoinedTables, SweepDataset
 from mapfusion.errors import InputError, MendedWarning
 from tests.helpers import acting

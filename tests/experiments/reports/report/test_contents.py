@@ -5,7 +5,7 @@ from pathlib import Path
 
 from experiments.evaluation import tables
 from experiments.reports.figures.result_tables import ResultTables
-from experiments.reports.report.contents import verdicts_and_places
+from experiments.reports.report.document import verdicts_and_places
 from tests.helpers.report_page import page_of
 
 
