@@ -1,10 +1,10 @@
-"""Tables of many runs as one: result folders of `run` and of `sweep`.
+"""Tables of many runs, read from result folders of `run` and folders of `sweep`.
 
 Files are read in batches and only in the requested columns. If each batch is reduced before the
 next one is read, memory does not grow with the number of runs.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -34,7 +34,7 @@ class RunPath(NamedTuple):
         path: folder or file.
         run: columns that describe the run, for files that lack them.
         finished: ids of the finished runs of a sweep; rows of other runs are incomplete and left
-            out. None if the sweep does not tell.
+            out. None if the sweep does not list its runs.
     """
 
     path: Path
@@ -183,7 +183,16 @@ def _read(
     """Yield rows of whole runs, one row group at a time."""
 
     def wanted(found: pa.Schema) -> Sequence[str]:
-        _require_readable(file.path, table, text_attributes(file.path, found.empty_table()))
+        attributes = text_attributes(file.path, found.empty_table())
+        kind = attributes.get("kind", table)
+        if kind.rpartition(".")[2] != table:
+            raise InputError(f"{file.path}: kind is {kind}, expected {table}")
+        if kind == f"result.{table}":  # tables of sweeps have their own version
+            known = int(tables.ALL[table].metadata[_VERSION])
+            version = attributes.get("schema_version", "0")
+            if not version.isdecimal() or int(version) > known:
+                reads = f"this program reads up to {known}"
+                raise InputError(f"{file.path}: schema_version is {version}, {reads}")
         of_run = () if file.run else RUN_KEYS
         missing = [name for name in (*of_run, *(columns or ())) if name not in found.names]
         if missing:
@@ -203,16 +212,3 @@ def _read(
             is_finished = rows["run_id"].isin(file.finished)
             rows = rows if is_finished.all() else rows[is_finished]
         yield rows.assign(**{name: float("nan") for name in optional if name not in rows})
-
-
-def _require_readable(path: Path, table: str, attributes: Mapping[str, str]) -> None:
-    """Raise InputError for another table, or one of a newer version."""
-    kind = attributes.get("kind", table)
-    if kind.rpartition(".")[2] != table:
-        raise InputError(f"{path}: kind is {kind}, expected {table}")
-    if kind != f"result.{table}":  # a sweep has its own version
-        return
-    known = int(tables.ALL[table].metadata[_VERSION])
-    version = attributes.get("schema_version", "0")
-    if not version.isdecimal() or int(version) > known:
-        raise InputError(f"{path}: schema_version is {version}, this program reads up to {known}")

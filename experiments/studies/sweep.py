@@ -186,8 +186,8 @@ _COUNT_WORKERS_EVERY_S = 10.0
 # worker was killed four times is at fault.
 RETRIES = 3
 _ATTEMPTS = "attempts"
-# Rows are written, and can be read, after a minute; or later, because to replace files shall not
-# take more than a twentieth of the time. Rows of this size are always written: memory is bounded.
+# Rows are written every minute, or less often so that writing takes at most a twentieth of the
+# time. Rows of more bytes than the last constant are always written, which bounds the memory.
 _WRITE_EVERY_S, _TIMES_AS_LONG, _MOST_WAITING_BYTES = 60.0, 20.0, 50_000_000
 _OLD_S = 24 * 3600  # a folder of attempts that has not changed for so long is not in use
 
@@ -217,7 +217,7 @@ OnSweepProgress = Callable[[SweepProgress], None]
 
 
 class SweepDriver:
-    """Driver of all runs that are not finished; a run that fails does not stop the others."""
+    """Driver of all runs that are not finished; a failed run does not stop the others."""
 
     def __init__(
         self,
@@ -254,7 +254,11 @@ class SweepDriver:
         todo = iter(self._sweep.runs)
         try:
             while True:
-                while self._has_room() and (run := next(todo, None)) is not None:
+                if time.monotonic() - self._counted_at > _COUNT_WORKERS_EVERY_S:
+                    self._n_workers = len(cast(Sized, self._client.nthreads()))
+                    self._counted_at = time.monotonic()
+                limit = TASKS_PER_WORKER * max(self._n_workers, MIN_WORKERS)
+                while len(self._futures) < limit and (run := next(todo, None)) is not None:
                     self._begin(run)
                 self._on_progress(self.progress)
                 if not self._open:
@@ -263,13 +267,8 @@ class SweepDriver:
         finally:  # also after Ctrl-C
             self._tables.write()
 
-    def _has_room(self) -> bool:
-        if time.monotonic() - self._counted_at > _COUNT_WORKERS_EVERY_S:
-            self._n_workers = len(cast(Sized, self._client.nthreads()))
-            self._counted_at = time.monotonic()
-        return len(self._futures) < TASKS_PER_WORKER * max(self._n_workers, MIN_WORKERS)
-
     def _begin(self, run: SweepRun) -> None:
+        """Plan a run and submit its tasks, except those that others have submitted."""
         try:
             laid_out = planned(run, self._sweep.store, self._tables, self._jobs)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
@@ -282,29 +281,27 @@ class SweepDriver:
             if task.name in self._failures or blocked.intersection(task.needs):
                 blocked.add(task.name)
                 continue
-            if task.name not in self._futures:  # else another run has submitted it
-                self._submit(task)
+            if task.name not in self._futures:  # else another run has submitted the task
+                self.progress.tasks[task.label] += 1
+                number = self.progress.tasks.total()
+                future = self._client.submit(
+                    cluster.perform,
+                    task.name,
+                    pickle.dumps(task),
+                    self._terms,
+                    *(self._futures[need] for need in task.needs if need in self._futures),
+                    # A new key at each attempt: Dask does not repeat a failed task of the same key.
+                    key=f"{task.label}-{self._suffix}{number}-{task.name}",
+                    pure=False,
+                    priority=-number,  # earlier tasks first: a run is finished before others begin
+                )
+                self._futures[task.name] = future
+                self._ended.add(future)
             self._open[laid_out].add(task.name)
         self._end_if_over(laid_out)
 
-    def _submit(self, task: Task) -> None:
-        self.progress.tasks[task.label] += 1
-        future = self._client.submit(
-            cluster.perform,
-            task.name,
-            pickle.dumps(task),
-            self._terms,
-            *(self._futures[need] for need in task.needs if need in self._futures),
-            # new at each attempt: Dask does not repeat a task that failed under the same key
-            key=f"{task.label}-{self._suffix}{self.progress.tasks.total()}-{task.name}",
-            pure=False,
-            # earlier tasks first: a run is finished before others begin
-            priority=-self.progress.tasks.total(),
-        )
-        self._futures[task.name] = future
-        self._ended.add(future)
-
     def _task_ended(self, future: Future) -> None:
+        """Take the result or the failure of a task, and end the runs that waited for the task."""
         label, name = _label_and_name(future.key)
         waiting = [each for each, waits_for in self._open.items() if name in waits_for]
         own = [laid_out.run for laid_out in waiting if laid_out.last == name]
@@ -352,6 +349,7 @@ class SweepDriver:
         raise InputError(f"a worker cannot run {name}: {type(error).__name__}: {error}")
 
     def _end_if_over(self, laid_out: PlannedRun) -> None:
+        """End a run without open tasks, or plan the run again if a stage was damaged."""
         if self._open[laid_out]:
             return
         del self._open[laid_out]
@@ -359,7 +357,7 @@ class SweepDriver:
             self._again.remove(laid_out)
             self._begin(laid_out.run)
             return
-        # All tasks that could be done were done, so which comes first does not depend on chance.
+        # All possible tasks were done, so the first failure does not depend on timing.
         failures = (self._failures.get(task.name) for task in laid_out.left)
         if first := next(filter(None, failures), None):
             self._failed(laid_out.run, first.reason, first.details, laid_out.stages)
@@ -382,6 +380,7 @@ class SweepDriver:
         return self._sweep.dataset.folder / "failures" / f"{run.run_id}.txt"
 
     def _run_ended(self, run: SweepRun) -> None:
+        """Count a run, and write the tables if that is due."""
         self.progress.done += 1
         number, began = self._tables.number(run), time.monotonic()
         self._left_in[number] -= 1

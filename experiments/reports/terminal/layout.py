@@ -1,4 +1,4 @@
-"""Tables, lines and progress displays on the terminal.
+"""Tables, lines, progress displays and listings on the terminal.
 
 All output goes through `_console`, which interprets no markup: texts may come from users.
 """
@@ -167,3 +167,36 @@ def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()
 def print_skipped(skipped: Sequence[str]) -> None:
     """Print a line for each figure that could not be drawn."""
     print_lines(f"  not drawn: {line}" for line in skipped)
+
+
+def print_methods() -> None:
+    """Print every alignment method with kind, package and version, and reasons of absence."""
+    from experiments.plugins.discovery import known_methods, name_clashes
+
+    methods = known_methods().values()
+    rows = [
+        (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
+        for each in methods
+    ]
+    headings = ("method", "kind", "package", "version")
+    print_table([(heading, "") for heading in headings], rows, "Alignment methods")
+    absent = [f"{each.name}: {each.absence}" for each in methods if each.absence]
+    print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
+
+
+def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:
+    """Print the scenarios of a folder."""
+    shown = [("scenario", ""), ("tags", ""), ("robots", "g"), ("iterations", ">")]
+    shown += [("overlap", ".2f"), ("description", "")]
+    rows = [
+        (
+            each["name"],
+            " ".join(each["tags"]),
+            each["robots"],
+            "recorded" if each["recorded"] else each["iterations"],
+            each["overlap"],
+            each["description"],
+        )
+        for each in entries
+    ]
+    print_table(shown, rows)

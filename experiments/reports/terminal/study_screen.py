@@ -1,13 +1,11 @@
-"""Screens of `study`, `sweep`, `calibrate` and `scenarios`."""
-
-from __future__ import annotations
+"""Screens of `study`, `sweep` and `calibrate`."""
 
 import itertools
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 from ruamel.yaml import YAML
@@ -20,6 +18,7 @@ from experiments.evaluation.criteria import (
 )
 from experiments.evaluation.odometry_calibration import filter_settings
 from experiments.reports.formatting import interval, two_digits
+from experiments.reports.study_files import SHOWN, shown_numbers
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
     Column,
@@ -29,23 +28,18 @@ from experiments.reports.terminal.layout import (
     print_skipped,
     print_table,
 )
+from experiments.studies.independence.independence_trial import STRATEGIES
 from experiments.studies.refusal.rates import VERDICTS, Rate, Reliability, pooled, worst
 from experiments.studies.sweep import Survey, SweepProgress
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_tables import ERRORS, GIVEN, SweepDataset, medians_over_runs
+from mapfusion.align.alignment import Status
 from mapfusion.smoother.noise_estimation import LEVELS
 from mapfusion.smoother.odometry_calibration import Calibration
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-
-# Methods and studies are imported where they are shown: a listing of scenarios needs neither.
 
 
 def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
     """Print successes and times for each number of pairs, and the folder of the results."""
-    from mapfusion.align.alignment import Status
 
     def text(row: dict[Any, Any]) -> str:
         if row["status"] == Status.ABSENT:
@@ -70,9 +64,6 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
 
 def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[str]) -> None:
     """Print costs and errors of each strategy (rows of `at_the_end`), and the folder."""
-    from experiments.reports.study_files import SHOWN, shown_numbers
-    from experiments.studies.independence.independence_trial import STRATEGIES
-
     headings = [("way", ""), *((heading, ">") for _, heading in SHOWN.values())]
     note = "; ".join(f"{strategy.name}: {strategy.label}" for strategy in STRATEGIES)
     for n_robots, rows in summary.groupby("n_robots"):
@@ -83,39 +74,6 @@ def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[st
         print_table(headings, cells, title, note)
     print_lines([f"Tables and figure: {folder}"])
     print_skipped(skipped)
-
-
-def print_methods() -> None:
-    """Print every alignment method with kind, package and version, and reasons of absence."""
-    from experiments.plugins.discovery import known_methods, name_clashes
-
-    methods = known_methods().values()
-    rows = [
-        (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
-        for each in methods
-    ]
-    headings = ("method", "kind", "package", "version")
-    print_table([(heading, "") for heading in headings], rows, "Alignment methods")
-    absent = [f"{each.name}: {each.absence}" for each in methods if each.absence]
-    print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
-
-
-def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:
-    """Print the scenarios of a folder."""
-    shown = [("scenario", ""), ("tags", ""), ("robots", "g"), ("iterations", ">")]
-    shown += [("overlap", ".2f"), ("description", "")]
-    rows = [
-        (
-            each["name"],
-            " ".join(each["tags"]),
-            each["robots"],
-            "recorded" if each["recorded"] else each["iterations"],
-            each["overlap"],
-            each["description"],
-        )
-        for each in entries
-    ]
-    print_table(shown, rows)
 
 
 MAX_ROWS_SHOWN = 60
