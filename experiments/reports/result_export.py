@@ -138,21 +138,16 @@ def _g2o_files(data: ResultTables) -> Iterator[tuple[str, str]]:
         seen = zip(points.tolist(), position[:, :2], covariance[:, :2, :2], strict=True)
         for point, p, S in seen:
             graph.add_sighting(first[robot], point, p, S)
-    for a, b, row in _used_alignments(data):
-        found = alignment_of(row, int(row["n_correspondences"]))
-        graph.add_motion(first[a], first[b], found.T_a_b, found.covariance)
-    yield "team.g2o", graph.text()
-
-
-def _used_alignments(data: ResultTables) -> Iterator[tuple[str, str, dict[Any, Any]]]:
-    """Yield robots a and b with the row of `estimates` that merged their maps."""
     edges, estimates = data.rows("team_edges"), data.rows("estimates")
     used = estimates["aligner"] == data.scenario.get("merge", {}).get("aligner")
     used &= estimates["repetition"] == 0
     for a, b in edges.loc[believed(edges), ["robot_a", "robot_b"]].itertuples(index=False):
         of_pair = used & (estimates["robot_a"] == a) & (estimates["robot_b"] == b)
         rows = estimates[of_pair].sort_values("iteration")
-        yield a, b, rows.iloc[-1].to_dict()
+        row: dict[Any, Any] = rows.iloc[-1].to_dict()
+        found = alignment_of(row, int(row["n_correspondences"]))
+        graph.add_motion(first[a], first[b], found.T_a_b, found.covariance)
+    yield "team.g2o", graph.text()
 
 
 def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:

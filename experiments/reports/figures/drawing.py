@@ -161,11 +161,6 @@ class _Record:
         except (OSError, KeyError, TypeError, ValueError):
             return {}
 
-    def _last(self, name: str) -> dict[str, Any]:
-        """Return the last entry of a figure, or {} if sources or libraries have changed."""
-        known = self._known.get(name)
-        return known if isinstance(known, dict) and known.get("code") == _code(name) else {}
-
     @cached_property
     def _common_inputs(self) -> str:
         """Digest of the inputs of all figures."""
@@ -179,7 +174,9 @@ class _Record:
         scenario = [self._result / "scenario.json"] if "scenario" in reads else []
         inputs = _digest([*tables, *scenario]) + self._common_inputs
         self._now[name] = {"code": _code(name), "inputs": inputs}
-        known, pictures = self._last(name), _pictures(self._result, name)
+        known, pictures = self._known.get(name), _pictures(self._result, name)
+        if not isinstance(known, dict) or known.get("code") != _code(name):
+            return None
         if known.get("inputs") != inputs or known.get("pictures") != _digest(pictures):
             return None
         skipped, elapsed_s = known.get("skipped"), known.get("elapsed_s")
@@ -329,13 +326,20 @@ def caption(name: str) -> str:
 def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any) -> list[Path]:
     """Write the figure `draw(*data)` in the common style and all formats; return the files."""
     import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from experiments.reports.figures.style import house_style
 
     files = [folder / f"{name}.{kind}" for kind in _DPI]
     with house_style():
         figure = draw(*data)
-        _lay_out(figure)
+        # Lay out the figure once for all formats, at the resolution of the first one.
+        engine = figure.get_layout_engine()
+        if engine is not None:
+            FigureCanvasAgg(figure)
+            own, figure.dpi = figure.dpi, next(iter(_DPI.values()))
+            engine.execute(figure)
+            figure.dpi = own
         # Without a layout engine Matplotlib does not lay out the figure again for each format.
         with matplotlib.rc_context({"figure.constrained_layout.use": False}):
             figure.set_layout_engine(None)
@@ -343,18 +347,6 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
                 picture = _picture(figure, kind)
                 write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
     return files
-
-
-def _lay_out(figure: Figure) -> None:
-    """Lay out a figure for all formats, at the resolution of the first one."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        FigureCanvasAgg(figure)
-        own, figure.dpi = figure.dpi, next(iter(_DPI.values()))
-        engine.execute(figure)
-        figure.dpi = own
 
 
 def _picture(figure: Figure, kind: str) -> bytes:

@@ -4,7 +4,6 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -63,7 +62,11 @@ def draw_two_maps(data: ResultTables) -> Figure:
         raise NothingToDraw("no robot has a landmark in its map")
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     panels = figure.subplots(1, len(robots), squeeze=False)[0]
-    particles = {robot: _last_particles(data, robot) for robot in robots}
+    particles: dict[str, Float] = {}  # of the last iteration, shape (M, 2)
+    for robot in robots:
+        clouds = data.of_robot("clouds", robot)
+        last = clouds["iteration"] == clouds["iteration"].max()
+        particles[robot] = clouds.loc[last, ["x_m", "y_m"]].to_numpy()
     extent_m = min(
         float(np.ptp(data.landmarks_of(robot)[0][:, :2], axis=0).max()) for robot in robots
     )
@@ -72,43 +75,32 @@ def draw_two_maps(data: ResultTables) -> Figure:
     )
     magnification = plan.magnification(extent_m, widest_m)
     for axes, robot in zip(panels, robots, strict=True):
-        _draw_map(axes, data, robot, particles[robot], magnification)
+        position, covariance = data.landmarks_of(robot)
+        path, colour, own = data.path_of(robot), data.colours[robot], particles[robot]
+        walls = plan.start_plan(axes, data, robot)
+        points = {"marker": ".", "markersize": 1.5, "color": colour, "zorder": 2}
+        plan.add_points(axes, position, label="landmarks", **points)
+        ellipses = {"edgecolors": colour, "linewidths": 0.4, "alpha": 0.6, "zorder": 2}
+        plan.add_ellipses(axes, position, covariance, rasterized=True, **ellipses)
+        axes.plot(*path.T, color=GRAY, label="path of the best particle", zorder=3)
+        if len(smoothed := data.smoothed_path_of(robot)):
+            line = {"color": BLACK, "linewidth": 0.5, "zorder": 4}
+            axes.plot(*smoothed.T, label="path of the smoother", **line)
+        start = {"linestyle": "none", "marker": "o", "color": BLACK}
+        axes.plot(0, 0, label="start pose, the map's frame", **start)
+        mean = own.mean(axis=0) if len(own) else 0.0
+        points = {"marker": ".", "markersize": 2.5, "markeredgewidth": 0, "color": BLACK}
+        label = "particles at the end"
+        label += f", spread x{magnification}" if magnification > 1 else ""
+        plan.add_points(axes, mean + magnification * (own - mean), label=label, zorder=5, **points)
+        plan.add_frame(axes)
+        n_landmarks = plan.set_view(axes, position, path, walls)
+        axes.set_title(f"{robot}: {n_landmarks}\n({data.sightings})")
     plan.set_one_scale(panels)
     handles, _ = panels[0].get_legend_handles_labels()
     handles.insert(1, plan.ellipse_handle(data.colours[robots[0]]))
     plan.finish_plans(figure, panels, handles, 3)
     return figure
-
-
-def _last_particles(data: ResultTables, robot: str) -> Float:
-    """Return the positions of a robot's particles at the last iteration, shape (M, 2)."""
-    clouds = data.of_robot("clouds", robot)
-    last = clouds["iteration"] == clouds["iteration"].max()
-    return clouds.loc[last, ["x_m", "y_m"]].to_numpy()
-
-
-def _draw_map(
-    axes: Axes, data: ResultTables, robot: str, particles: Float, magnification: int
-) -> None:
-    """Draw one robot's map in its own frame."""
-    position, covariance = data.landmarks_of(robot)
-    path, colour = data.path_of(robot), data.colours[robot]
-    walls = plan.start_plan(axes, data, robot)
-    points = {"marker": ".", "markersize": 1.5, "color": colour, "zorder": 2}
-    plan.add_points(axes, position, label="landmarks", **points)
-    ellipses = {"edgecolors": colour, "linewidths": 0.4, "alpha": 0.6, "zorder": 2}
-    plan.add_ellipses(axes, position, covariance, rasterized=True, **ellipses)
-    axes.plot(*path.T, color=GRAY, label="path of the best particle", zorder=3)
-    if len(smoothed := data.smoothed_path_of(robot)):
-        axes.plot(*smoothed.T, color=BLACK, linewidth=0.5, label="path of the smoother", zorder=4)
-    axes.plot(0, 0, linestyle="none", marker="o", color=BLACK, label="start pose, the map's frame")
-    mean = particles.mean(axis=0) if len(particles) else 0.0
-    points = {"marker": ".", "markersize": 2.5, "markeredgewidth": 0, "color": BLACK, "zorder": 5}
-    label = "particles at the end" + (f", spread x{magnification}" if magnification > 1 else "")
-    plan.add_points(axes, mean + magnification * (particles - mean), label=label, **points)
-    plan.add_frame(axes)
-    n_landmarks = plan.set_view(axes, position, path, walls)
-    axes.set_title(f"{robot}: {n_landmarks}\n({data.sightings})")
 
 
 def draw_correspondences(data: ResultTables) -> Figure:
@@ -128,7 +120,18 @@ def draw_correspondences(data: ResultTables) -> Figure:
         look |= {"color": data.colours[robot], "label": f"{robot}: {len(points)} landmarks"}
         axes.plot(*points.T, **look, **_IN_SPACE)
     _add_correspondences(axes, data, pair, position_a, position_b)
-    _set_space(axes, np.concatenate([position_a, position_b]))
+    # Limits and proportions of the box, and the view
+    points = np.concatenate([position_a, position_b])
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    low[2], high[2] = min(0.0, low[2]), max(high[2], low[2] + 0.1)
+    limits = dict(zip(("xlim", "ylim", "zlim"), zip(low, high, strict=True), strict=True))
+    axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
+    box = high - low
+    box[2] = max(box[2], _MIN_HEIGHT * max(box[:2]))
+    axes.set_box_aspect(tuple(box))  # pyright: ignore[reportArgumentType]  # takes floats
+    for axis in (axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(4))
+    axes.view_init(elev=32.0, azim=-72.0)
     title = f"each map in its own frame; {pair[1]}'s is drawn {shift_m:.1f} m along x"
     legend = figure.legend(loc="upper center", ncols=2, title=title, title_fontsize=7.5)
     _fill_page(figure, axes, legend)
@@ -190,20 +193,6 @@ def _add_correspondences(
         axes.add_collection3d(lines, autolim=False)
 
 
-def _set_space(axes: Axes3D, points: Float) -> None:
-    """Set limits, proportions and view of the axes in space."""
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    low[2], high[2] = min(0.0, low[2]), max(high[2], low[2] + 0.1)
-    limits = dict(zip(("xlim", "ylim", "zlim"), zip(low, high, strict=True), strict=True))
-    axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", **limits)
-    box = high - low
-    box[2] = max(box[2], _MIN_HEIGHT * max(box[:2]))
-    axes.set_box_aspect(tuple(box))  # pyright: ignore[reportArgumentType]  # takes floats
-    for axis in (axes.yaxis, axes.zaxis):
-        axis.set_major_locator(MaxNLocator(4))
-    axes.view_init(elev=32.0, azim=-72.0)
-
-
 def _fill_page(figure: Figure, axes: Axes3D, legend: Legend) -> None:
     """Make the box as wide as the page, and the page as high as box and legend.
 
@@ -215,25 +204,20 @@ def _fill_page(figure: Figure, axes: Axes3D, legend: Legend) -> None:
     for _ in range(_FITTING_STEPS):
         page_in = np.array([PAGE_WIDTH_IN, figure.get_figheight()])
         axes.set_position((*([left_in, bottom_in] / page_in), *(width_in / page_in)))
-        drawn = _extent_px(axes, canvas)
+        # Bounds of the box and of its labels on the page
+        axes.apply_aspect()
+        axes.M = axes.get_proj()  # places the labels; otherwise only set while drawing
+        corners = np.array(list(product(axes.get_xlim(), axes.get_ylim(), axes.get_zlim())))
+        x, y, _ = proj_transform(corners[:, 0], corners[:, 1], corners[:, 2], axes.get_proj())
+        box = Bbox.null()
+        box.update_from_data_xy(axes.transData.transform(np.stack([x, y], -1)))
+        renderer = canvas.get_renderer()
+        labels = [axis.get_tightbbox(renderer) for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+        drawn = Bbox.union([box, *filter(None, labels)])
         left_in += _PADDING_IN - drawn.x0 / dpi
         bottom_in += _PADDING_IN - drawn.y0 / dpi
         width_in *= (PAGE_WIDTH_IN - 2 * _PADDING_IN) / (drawn.width / dpi)
         figure.set_figheight(drawn.height / dpi + legend_in + 4 * _PADDING_IN)
-
-
-def _extent_px(axes: Axes3D, canvas: FigureCanvasAgg) -> Bbox:
-    """Return the bounds of the box and its labels on the page."""
-    axes.apply_aspect()
-    axes.M = axes.get_proj()  # places the labels; otherwise only set while drawing
-    corners = np.array(list(product(axes.get_xlim(), axes.get_ylim(), axes.get_zlim())))
-    x, y, _ = proj_transform(corners[:, 0], corners[:, 1], corners[:, 2], axes.get_proj())
-    box = Bbox.null()
-    box.update_from_data_xy(axes.transData.transform(np.stack([x, y], -1)))
-    labels = [
-        axis.get_tightbbox(canvas.get_renderer()) for axis in (axes.xaxis, axes.yaxis, axes.zaxis)
-    ]
-    return Bbox.union([box, *filter(None, labels)])
 
 
 def draw_fused_landmark(data: ResultTables) -> Figure:
@@ -257,7 +241,16 @@ def draw_fused_landmark(data: ResultTables) -> Figure:
     thin = {"edgecolors": [colour for *_, colour in parts[:2]], "linewidths": 0.6}
     plan.add_ellipses(axes, position[:2], own, **thin)
     axes.plot(*position[:2, :2].T, color="gray", linewidth=0.6, linestyle=":", zorder=1)
-    _name_points(axes, position)
+    # Label the points; the labels of the parents point away from each other.
+    along = position[1, :2] - position[0, :2]
+    length = float(np.linalg.norm(along))
+    along = along / length if length > 0 else np.array([1.0, 0.0])
+    across = np.array([-along[1], along[0]])
+    text = {"ha": "center", "va": "center", "fontsize": 10, "zorder": 5}
+    text |= {"path_effects": [withStroke(linewidth=2.5, foreground="white")]}
+    for name, (x, y, _), side in zip("ijF", position, (-along, along, across), strict=True):
+        offset = {"xytext": tuple(14 * side), "textcoords": "offset points"}
+        axes.annotate(f"$L_{name}$", xy=(x, y), **offset, **text)
     centre = position[2, :2]
     reach = (np.abs(position[:, :2] - centre).max(axis=1) + plan.semi_axes(covariance)[0]).max()
     plan.set_square(axes, centre, _MARGIN * reach)
@@ -297,19 +290,6 @@ def choose_landmark(pairs: FusedPairs) -> int | None:
     return None
 
 
-def _name_points(axes: Axes, position_m: np.ndarray) -> None:
-    """Label the points; the labels of the parents point away from each other."""
-    along = position_m[1, :2] - position_m[0, :2]
-    length = float(np.linalg.norm(along))
-    along = along / length if length > 0 else np.array([1.0, 0.0])
-    across = np.array([-along[1], along[0]])
-    look = {"ha": "center", "va": "center", "fontsize": 10, "zorder": 5}
-    look |= {"path_effects": [withStroke(linewidth=2.5, foreground="white")]}
-    for name, (x, y, _), side in zip("ijF", position_m, (-along, along, across), strict=True):
-        offset = {"xytext": tuple(14 * side), "textcoords": "offset points"}
-        axes.annotate(f"$L_{name}$", xy=(x, y), **offset, **look)
-
-
 def draw_aligned_maps(data: ResultTables) -> Figure:
     """Draw all corresponding landmarks in one frame, with ellipses, and a part enlarged."""
     pairs = data.fused_pairs()
@@ -320,7 +300,19 @@ def draw_aligned_maps(data: ResultTables) -> Figure:
     (x, y), side = part.corner_m, part.side_m
     for axes, rows, scale in ((overview, slice(None), 0.3), (zoom, part.whole, 1.0)):
         plan.start_plan(axes, data, data.fused_frame)
-        _draw_landmarks(axes, data, pairs, rows, scale)
+        position, covariance = pairs.position_m[:, rows], pairs.covariance_m2[:, rows]
+        parents = list(np.stack(list(position[:2, :, :2]), axis=1))
+        lines = {"colors": GRAY, "linewidths": 0.6, "rasterized": True}
+        both = LineCollection(parents, label="correspondences", **lines)
+        axes.add_collection(both, autolim=False)
+        for k, (name, marker, colour) in enumerate(data.parents_and_fused(pairs.robots)):
+            style = {"marker": marker, "markersize": 6 * scale, "markeredgewidth": 0.8 * scale}
+            style |= {"markerfacecolor": "none", "color": colour, "zorder": 3 + 0.1 * k}
+            label = name if k == 2 else f"map of {name}"
+            plan.add_points(axes, position[k], label=label, **style)
+            style = {"edgecolors": colour, "linewidths": (1.4 if k == 2 else 0.8) * scale}
+            style |= {"rasterized": True, "zorder": 2 + 0.1 * k}
+            plan.add_ellipses(axes, position[k], covariance[k], **style)
     plan.set_view(overview, fused, fused[:0])
     zoom.set(xlim=(x, x + side), ylim=(y, y + side), aspect="equal")
     dashed = {"fill": False, "edgecolor": BLACK, "linestyle": "--", "zorder": 6}
@@ -332,24 +324,6 @@ def draw_aligned_maps(data: ResultTables) -> Figure:
     legend = {"title": f"{plan.LEVEL_TEXT} ellipses, to scale", "title_fontsize": 7.5}
     plan.finish_plans(figure, [overview, zoom], handles, len(handles), **legend)
     return figure
-
-
-def _draw_landmarks(
-    axes: Axes, data: ResultTables, pairs: FusedPairs, rows: slice | np.ndarray, scale: float
-) -> None:
-    """Draw the parents of the selected landmarks, the fused landmarks and all their ellipses."""
-    position, covariance = pairs.position_m[:, rows], pairs.covariance_m2[:, rows]
-    parents = list(np.stack(list(position[:2, :, :2]), axis=1))
-    style = {"colors": GRAY, "linewidths": 0.6, "rasterized": True}
-    axes.add_collection(LineCollection(parents, label="correspondences", **style), autolim=False)
-    for k, (name, marker, colour) in enumerate(data.parents_and_fused(pairs.robots)):
-        look = {"marker": marker, "markersize": 6 * scale, "markeredgewidth": 0.8 * scale}
-        look |= {"markerfacecolor": "none", "color": colour, "zorder": 3 + 0.1 * k}
-        label = name if k == 2 else f"map of {name}"
-        plan.add_points(axes, position[k], label=label, **look)
-        look = {"edgecolors": colour, "linewidths": (1.4 if k == 2 else 0.8) * scale}
-        look |= {"rasterized": True, "zorder": 2 + 0.1 * k}
-        plan.add_ellipses(axes, position[k], covariance[k], **look)
 
 
 class Zoom(NamedTuple):

@@ -49,14 +49,28 @@ def draw_tracks(data: ResultTables) -> Figure:
         axes.imshow(image, cmap="gray", vmin=0, vmax=1)
         axes.autoscale(enable=False)  # points near the border must not widen the view
         axes.grid(visible=False)
-        _add_tracks(axes, tracks, iteration, {"cmap": colours.cmap, "norm": colours.norm})
+        now = tracks[tracks["iteration"] == iteration]
+        if len(now):
+            # Trails of the points over the last frames, and the points
+            since = tracks["iteration"].between(iteration - _TRAIL_FRAMES, iteration)
+            recent = tracks[tracks["track"].isin(now["track"]) & since]
+            recent = recent.sort_values("track", kind="stable")
+            track = recent["track"].to_numpy()
+            ends = np.flatnonzero(np.append(track[1:] != track[:-1], True))
+            trails = np.split(recent[["u_px", "v_px"]].to_numpy(), ends[:-1] + 1)
+            ages = recent["length"].to_numpy(np.float64)[ends]
+            by_age: dict[str, Any] = {"cmap": colours.cmap, "norm": colours.norm, "zorder": 2}
+            lines = LineCollection(trails, array=ages, linewidths=1.2, **by_age)
+            axes.add_collection(lines, autolim=False)
+            rim = {"s": 14, "edgecolors": "white", "linewidths": 0.5}
+            axes.scatter(now["u_px"], now["v_px"], c=now["length"], **rim, **by_age | {"zorder": 3})
         axes.set_title(f"{robot}, k = {iteration}")
     for axes in panels[len(frames) :]:
         axes.set_axis_off()
     figure.supxlabel("u (pixels)", fontsize=8)
     figure.supylabel("v (pixels)", fontsize=8)
-    ages = {"label": "age of the track (frames)", "ticks": MaxNLocator(integer=True)}
-    figure.colorbar(colours, ax=list(panels), shrink=0.8, aspect=30, **ages)
+    scale = {"label": "age of the track (frames)", "ticks": MaxNLocator(integer=True)}
+    figure.colorbar(colours, ax=list(panels), shrink=0.8, aspect=30, **scale)
     return figure
 
 
@@ -74,23 +88,6 @@ def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
     if not best:
         raise NothingToDraw("no key frames were kept: no images, or none from `keep.images_at` on")
     return robot, dict(list(best.items())[-_MAX_FRAMES:])
-
-
-def _add_tracks(axes: Axes, tracks: pd.DataFrame, iteration: int, colours: dict[str, Any]) -> None:
-    """Draw the points tracked at an iteration and their trails over the last frames."""
-    now = tracks[tracks["iteration"] == iteration]
-    if now.empty:
-        return
-    since = tracks["iteration"].between(iteration - _TRAIL_FRAMES, iteration)
-    recent = tracks[tracks["track"].isin(now["track"]) & since].sort_values("track", kind="stable")
-    track = recent["track"].to_numpy()
-    ends = np.flatnonzero(np.append(track[1:] != track[:-1], True))
-    trails = np.split(recent[["u_px", "v_px"]].to_numpy(), ends[:-1] + 1)
-    lengths = recent["length"].to_numpy(np.float64)[ends]
-    lines = LineCollection(trails, array=lengths, linewidths=1.2, zorder=2, **colours)
-    axes.add_collection(lines, autolim=False)
-    rim = {"s": 14, "edgecolors": "white", "linewidths": 0.5, "zorder": 3}
-    axes.scatter(now["u_px"], now["v_px"], c=now["length"], **rim, **colours)
 
 
 def draw_dispersion(data: ResultTables) -> Figure:

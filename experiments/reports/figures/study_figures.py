@@ -102,15 +102,6 @@ def draw_benchmark(summary: pd.DataFrame) -> Figure:
             elapsed.plot(x, 1e3 * own["elapsed_s"], **line)
         column[0].set_title(f"{count} pairs")
         column[-1].set_xlabel("outliers (%)")
-    _set_benchmark_axes(panels, shares)
-    absent = set(summary["method"][summary["status"] == Status.ABSENT])
-    labelled = {f"{m} (absent)" if m in absent else m: styles[m] for m in methods}
-    style.aligner_legend(figure, labelled, columns=5)
-    return figure
-
-
-def _set_benchmark_axes(panels: np.ndarray, shares: list[float]) -> None:
-    """Set labels, scales and limits of the benchmark's panels."""
     axes: Axes
     for row, label in zip(panels, _ROWS, strict=True):
         row[0].set_ylabel(label)
@@ -126,6 +117,10 @@ def _set_benchmark_axes(panels: np.ndarray, shares: list[float]) -> None:
     panels[1, 0].set_yticks(_RATIO_TICKS)
     panels[1, 0].set_ylim(np.nanmin(ratios) / _MARGIN, np.nanmax(ratios) * _MARGIN)
     panels[1, 0].yaxis.set_minor_locator(NullLocator())
+    absent = set(summary["method"][summary["status"] == Status.ABSENT])
+    labelled = {f"{m} (absent)" if m in absent else m: styles[m] for m in methods}
+    style.aligner_legend(figure, labelled, columns=5)
+    return figure
 
 
 def draw_independence(teams: pd.DataFrame, costs: pd.DataFrame) -> Figure:
@@ -215,7 +210,18 @@ def draw_refusal(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms
     line = {"color": GRAY, "linestyle": ":", "label": label}
     _draw_sweep(curve, own.assign(score=-own["n_inliers"]), _floor(refusals), **line)
     _draw_accepted_shares(rates, refusals[refusals["aligner"] == first])
-    _draw_calibration(calibrated, calibration)
+    # Measured against stated number of false alarms
+    stated, measured = calibration["stated"], calibration["motions_a_pair"]
+    n = int(calibration["n_pairs"].iloc[0])
+    upper = [Rate(k, n).interval[1] for k in calibration["n_accepted"]]
+    calibrated.plot(stated, stated, color=GRAY, linewidth=0.8, label="stated")
+    found = measured > 0
+    calibrated.plot(stated[found], measured[found], color=BLACK, marker="o", label="measured")
+    label = "pairs of maps with one, upper 97.5 %"
+    calibrated.plot(stated, upper, color=BLACK, linestyle=":", label=label)
+    calibrated.set(xscale="log", yscale="log", xlabel="false alarms stated, a pair of maps")
+    calibrated.set_ylabel(f"measured on {n} pairs of random maps")
+    calibrated.legend(loc="upper left")
     for axes, threshold in ((rates, np.log10(false_alarms)), (calibrated, false_alarms)):
         axes.axvline(threshold, color=GRAY, linewidth=0.8)
     legend = {"loc": "outside upper center", "ncols": 4, "handlelength": 2.6}
@@ -245,21 +251,6 @@ def _draw_accepted_shares(axes: Axes, own: pd.DataFrame) -> None:
     axes.set_ylabel(f"share accepted, {own['aligner'].iloc[0]}")
 
 
-def _draw_calibration(axes: Axes, calibration: pd.DataFrame) -> None:
-    """Draw the measured number of false alarms against the stated number."""
-    stated, measured = calibration["stated"], calibration["motions_a_pair"]
-    n = int(calibration["n_pairs"].iloc[0])
-    upper = [Rate(k, n).interval[1] for k in calibration["n_accepted"]]
-    axes.plot(stated, stated, color=GRAY, linewidth=0.8, label="stated")
-    found = measured > 0
-    axes.plot(stated[found], measured[found], color=BLACK, marker="o", label="measured")
-    label = "pairs of maps with one, upper 97.5 %"
-    axes.plot(stated, upper, color=BLACK, linestyle=":", label=label)
-    axes.set(xscale="log", yscale="log", xlabel="false alarms stated, a pair of maps")
-    axes.set_ylabel(f"measured on {n} pairs of random maps")
-    axes.legend(loc="upper left")
-
-
 def draw_refusal_kinds(refusals: pd.DataFrame) -> Figure:
     """Draw the verdicts on right and on wrong answers, by kind of world, all methods together."""
     rows = as_they_came(refusals)
@@ -269,28 +260,25 @@ def draw_refusal_kinds(refusals: pd.DataFrame) -> Figure:
     panels = figure.subplots(1, 2, sharey=True)
     titles = (f"right, {MERGEABLE_PAIRS} or more true pairs", "wrong, though more than chance")
     for axes, own, title in zip(panels, (right, wrong), titles, strict=True):
-        _draw_verdict_shares(axes, own, kinds)
+        # A bar for each kind of world, followed by the number of answers
+        table = pd.crosstab(own["kind"], own["verdict"]).reindex(
+            index=kinds, columns=list(VERDICTS), fill_value=0
+        )
+        n = table.sum(axis=1)
+        left = np.zeros(len(kinds))
+        for verdict in VERDICTS:
+            share = (100 * table[verdict] / n.clip(lower=1)).to_numpy()
+            colour = _COLOURS[verdict]
+            axes.barh(kinds, share, left=left, color=colour, label=verdict, height=0.75)
+            left += share
+        for place, count in enumerate(n):
+            axes.text(101, place, f"{count}", va="center", fontsize=6.5, clip_on=False)
+        axes.grid(visible=False)
         axes.set(title=title, xlabel="share of answers (%)", xlim=(0, 100))
     handles, labels = panels[0].get_legend_handles_labels()
     shown = [label.replace("_", " ") for label in labels]
     figure.legend(handles, shown, loc="outside upper center", ncols=len(VERDICTS))
     return figure
-
-
-def _draw_verdict_shares(axes: Axes, rows: pd.DataFrame, kinds: list[str]) -> None:
-    """Draw the shares of the verdicts, a bar for each kind, followed by the number of answers."""
-    table = pd.crosstab(rows["kind"], rows["verdict"]).reindex(
-        index=kinds, columns=list(VERDICTS), fill_value=0
-    )
-    n = table.sum(axis=1)
-    left = np.zeros(len(kinds))
-    for verdict in VERDICTS:
-        share = (100 * table[verdict] / n.clip(lower=1)).to_numpy()
-        axes.barh(kinds, share, left=left, color=_COLOURS[verdict], label=verdict, height=0.75)
-        left += share
-    for place, count in enumerate(n):
-        axes.text(101, place, f"{count}", va="center", fontsize=6.5, clip_on=False)
-    axes.grid(visible=False)
 
 
 def draw_refusal_roc(refusals: pd.DataFrame) -> Figure:

@@ -268,8 +268,21 @@ def reliability(answers: pd.DataFrame, rng: np.random.Generator) -> Reliability:
     def brier(counts: Float) -> Float:
         return (counts @ squared) / (counts @ n_of_run)
 
+    rows = []
+    for k in range(N_BINS):
+        n, held = sums["n"][:, k], sums["right"][:, k]
+        if not n.sum():
+            continue
+
+        def share(counts: Float, n: Float = n, held: Float = held) -> Float:
+            total = counts @ n
+            return counts @ held / np.where(total > 0, total, np.nan)
+
+        found = percentile_interval(share, len(n), rng, RESAMPLES)
+        row = {"n": int(n.sum()), "stated": float(sums["stated"][:, k].sum() / n.sum())}
+        rows.append(row | found.columns("right"))
     return Reliability(
-        _bins(sums, rng),
+        pd.DataFrame(rows),
         percentile_interval(error, len(runs), rng, RESAMPLES),
         percentile_interval(brier, len(runs), rng, RESAMPLES),
         _brier_of_support(answers),
@@ -290,24 +303,6 @@ def _bins_of(order: np.ndarray) -> np.ndarray:
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order)) * N_BINS // len(order)
     return place
-
-
-def _bins(sums: dict[str, Float], rng: np.random.Generator) -> pd.DataFrame:
-    """Return the bins of a `Reliability` from sums of runs, each of shape (runs, N_BINS)."""
-    rows = []
-    for k in range(N_BINS):
-        n, held = sums["n"][:, k], sums["right"][:, k]
-        if not n.sum():
-            continue
-
-        def share(counts: Float, n: Float = n, held: Float = held) -> Float:
-            total = counts @ n
-            return counts @ held / np.where(total > 0, total, np.nan)
-
-        found = percentile_interval(share, len(n), rng, RESAMPLES)
-        row = {"n": int(n.sum()), "stated": float(sums["stated"][:, k].sum() / n.sum())}
-        rows.append(row | found.columns("right"))
-    return pd.DataFrame(rows)
 
 
 def _brier_of_support(answers: pd.DataFrame) -> float:
