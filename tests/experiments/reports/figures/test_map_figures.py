@@ -1,4 +1,4 @@
-"""Parents of fused landmarks, moved as the merge moved them."""
+"""Figures of maps: fused pairs of landmarks, chosen landmark and enlarged part."""
 
 from pathlib import Path
 
