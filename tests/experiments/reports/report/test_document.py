@@ -88,7 +88,7 @@ def test_fusers_stand_with_their_figures_and_how_to_read_them(trio_copy: Path) -
     section = page.words.split("Maps of all robots together")[1]
     assert all(name in section for name in rows["fuser"])
     assert "Figure 11" in section
-    assert "Below it a map is too sure" in section
+    assert "Below the diagonal a map is overconfident" in section
     assert "fusers" in [attributes.get("id") for tag, attributes in page.tags if tag == "section"]
 
 
@@ -189,5 +189,5 @@ def test_verdicts_and_places_are_of_the_last_maps(trio_result: Path) -> None:
 
 def test_they_stand_in_the_page(trio_result: Path, tmp_path: Path) -> None:
     words = re.sub(r"\s+", " ", page_of(trio_result, tmp_path / "r.html").words)
-    assert "Where the maps fit each other" in words
+    assert "Verdicts and rival alignments" in words
     assert re.search("R2 – R3 ?accepted", words)
