@@ -87,7 +87,7 @@ def of_map(
     path: Path, log: Path, seed: int, landmarks: LandmarkMap, findings: Sequence[Finding] = ()
 ) -> dict[str, Any]:
     """Return the document of `slam`: the map and the findings about the log."""
-    told = [
+    observed = [
         {
             "check": finding.kind,
             "iteration": finding.frame if finding.frame >= 0 else None,
@@ -95,7 +95,7 @@ def of_map(
         }
         for finding in findings
     ]
-    found = {"robot": landmarks.name, "n_landmarks": len(landmarks), "findings": told}
+    found = {"robot": landmarks.name, "n_landmarks": len(landmarks), "findings": observed}
     return {"log": log, "seed": seed, "map": path} | found
 
 
@@ -140,7 +140,11 @@ def of_checks(checks: Sequence[CheckedScenario]) -> dict[str, Any]:
             | {"max": each.bound.max, "passed": each.passed, "by_seed": each.per_seed}
             for each in check.outcomes
         ]
-        told = {"scenario": check.scenario, "passed": check.passed, "error": check.error or None}
-        told |= {"merged_nothing": list(check.unmerged)}
-        scenarios.append(told | {"elapsed_s_by_seed": check.elapsed_s, "outcomes": outcomes})
+        scenario = {
+            "scenario": check.scenario,
+            "passed": check.passed,
+            "error": check.error or None,
+        }
+        scenario |= {"merged_nothing": list(check.unmerged)}
+        scenarios.append(scenario | {"elapsed_s_by_seed": check.elapsed_s, "outcomes": outcomes})
     return {"passed": all(each.passed for each in checks), "scenarios": scenarios}

@@ -34,7 +34,7 @@ from experiments.studies.refusal.rates import (
     VERDICTS,
     Rate,
     Reliability,
-    first_of_ordinary,
+    first_right_answers,
     of_any_method,
     ordinary,
 )
@@ -62,9 +62,9 @@ def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = F
         write_tables(output, summary.tables)
         skipped += _draw_over_runs(summary, output / "figures")
     if as_json:
-        told = {"n_runs": summary.n_runs, "n_configurations": summary.n_configurations}
-        told |= {"missing_tables": summary.missing, "failed_runs": summary.failed}
-        publish("statistics", told | {"written": output, "tables": summary.tables}, shown=True)
+        contents = {"n_runs": summary.n_runs, "n_configurations": summary.n_configurations}
+        contents |= {"missing_tables": summary.missing, "failed_runs": summary.failed}
+        publish("statistics", contents | {"written": output, "tables": summary.tables}, shown=True)
     else:
         print_summary(summary, output, skipped)
 
@@ -278,7 +278,7 @@ def write_kinds(folder: Path, refusals: pd.DataFrame, rows: list[dict[str, Any]]
     write_rows(table_path(folder, "kinds"), KINDS, flat_rows)
     page, text = folder / "kinds.md", "# Verdicts by kind of world\n"
     parts = {"Any method": of_any_method(refusals)}
-    if first := first_of_ordinary(refusals):
+    if first := first_right_answers(refusals):
         parts["First right answers in worlds that do not repeat themselves"] = first
     parts["Each method"] = rows
     for title, part in parts.items():

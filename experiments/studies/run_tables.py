@@ -54,10 +54,10 @@ class Runs:
         paths = [RunPath(tables.table_path(path, table), run) for path, run, _ in self.results]
         found = [file for file in paths if file.path.is_file()]
         for sweep in self.sweeps:
-            told = self._told[self._told["sweep"] == str(sweep)]
+            run_rows = self._run_rows[self._run_rows["sweep"] == str(sweep)]
             finished = None  # an earlier version did not write `runs`
-            if len(told):
-                finished = frozenset(told.loc[told["status"] == "finished", "run_id"])
+            if len(run_rows):
+                finished = frozenset(run_rows.loc[run_rows["status"] == "finished", "run_id"])
             if finished is None or finished:
                 found += [RunPath(path, {}, finished) for path in _whole_files(sweep / table)]
         return found
@@ -121,7 +121,7 @@ class Runs:
         return pd.concat(parts).drop_duplicates("run_id") if parts else none
 
     @cached_property
-    def _told(self) -> pd.DataFrame:
+    def _run_rows(self) -> pd.DataFrame:
         """Tables `runs` of all sweeps, with the sweep's folder."""
         parts = [
             rows.assign(sweep=str(sweep))
@@ -135,8 +135,8 @@ class Runs:
     @property
     def failed(self) -> pd.DataFrame:
         """Failed runs of sweeps: run_id, scenario, seed, reason."""
-        is_failed = self._told["status"] == "failed"
-        return self._told.loc[is_failed, [*RUN_KEYS, "reason"]].reset_index(drop=True)
+        is_failed = self._run_rows["status"] == "failed"
+        return self._run_rows.loc[is_failed, [*RUN_KEYS, "reason"]].reset_index(drop=True)
 
 
 def find_runs(paths: Path | Sequence[Path]) -> Runs:

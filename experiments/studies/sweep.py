@@ -33,7 +33,7 @@ from experiments.studies.sweep_tables import (
     RUN_TIMES,
     JoinedTables,
     SweepDataset,
-    written_by_nobody_else,
+    locked_folder,
 )
 from mapfusion.errors import InputError
 from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whole
@@ -95,7 +95,7 @@ class PlannedRun:
         return f"run/{self.run.run_id}"
 
 
-def planned(
+def plan_run(
     run: SweepRun, store: Store, tables: JoinedTables, jobs: int | None = None
 ) -> PlannedRun:
     """Plan a run; nothing is computed.
@@ -164,16 +164,16 @@ def survey(sweep: Sweep) -> Survey:
     known: set[str] = set()
     for run in sweep.runs:
         try:
-            laid_out = planned(run, sweep.store, tables)
+            plan = plan_run(run, sweep.store, tables)
         except InputError:
             found.runs_refused += 1
             continue
-        found.runs_finished += not laid_out.left
-        left = {task.name for task in laid_out.left}
-        found.wanted.update(task.label for task in laid_out.tasks.values())
-        for name in laid_out.tasks.keys() - known:
-            (found.left if name in left else found.finished)[laid_out.tasks[name].label] += 1
-        known.update(laid_out.tasks)
+        found.runs_finished += not plan.left
+        left = {task.name for task in plan.left}
+        found.wanted.update(task.label for task in plan.tasks.values())
+        for name in plan.tasks.keys() - known:
+            (found.left if name in left else found.finished)[plan.tasks[name].label] += 1
+        known.update(plan.tasks)
     return found
 
 
@@ -246,7 +246,7 @@ class SweepDriver:
         self.progress = SweepProgress(len(sweep.runs))
 
     def execute(self) -> None:
-        """Finish all runs; `progress` says how they ended.
+        """Finish all runs; `progress` has the outcomes.
 
         Raises:
             InputError: workers cannot take part, or the scheduler was lost.
@@ -270,14 +270,14 @@ class SweepDriver:
     def _begin(self, run: SweepRun) -> None:
         """Plan a run and submit its tasks, except those that others have submitted."""
         try:
-            laid_out = planned(run, self._sweep.store, self._tables, self._jobs)
+            plan = plan_run(run, self._sweep.store, self._tables, self._jobs)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
             self._failed(run, " ".join(str(error).split()))
             self._run_ended(run)
             return
-        self._open[laid_out] = set()
+        self._open[plan] = set()
         blocked: set[str] = set()
-        for task in laid_out.left:
+        for task in plan.left:
             if task.name in self._failures or blocked.intersection(task.needs):
                 blocked.add(task.name)
                 continue
@@ -297,14 +297,14 @@ class SweepDriver:
                 )
                 self._futures[task.name] = future
                 self._ended.add(future)
-            self._open[laid_out].add(task.name)
-        self._end_if_over(laid_out)
+            self._open[plan].add(task.name)
+        self._end_if_over(plan)
 
     def _task_ended(self, future: Future) -> None:
         """Take the result or the failure of a task, and end the runs that waited for the task."""
         label, name = _label_and_name(future.key)
         waiting = [each for each, waits_for in self._open.items() if name in waits_for]
-        own = [laid_out.run for laid_out in waiting if laid_out.last == name]
+        own = [plan.run for plan in waiting if plan.last == name]
         rows: Any = None
         if own and future.status == "finished":
             try:
@@ -323,9 +323,9 @@ class SweepDriver:
             self._details(own[0]).unlink(missing_ok=True)
         del self._futures[name]
         self.progress.tasks_done[label] += 1
-        for laid_out in waiting:
-            self._open[laid_out].remove(name)
-            self._end_if_over(laid_out)
+        for plan in waiting:
+            self._open[plan].remove(name)
+            self._end_if_over(plan)
 
     def _failure(self, future: Future, name: str) -> cluster.TaskFailedError:
         """Return the failure of a task or of the task that it needed.
@@ -348,20 +348,20 @@ class SweepDriver:
             raise InputError(str(error))
         raise InputError(f"a worker cannot run {name}: {type(error).__name__}: {error}")
 
-    def _end_if_over(self, laid_out: PlannedRun) -> None:
+    def _end_if_over(self, plan: PlannedRun) -> None:
         """End a run without open tasks, or plan the run again if a stage was damaged."""
-        if self._open[laid_out]:
+        if self._open[plan]:
             return
-        del self._open[laid_out]
-        if laid_out in self._again:
-            self._again.remove(laid_out)
-            self._begin(laid_out.run)
+        del self._open[plan]
+        if plan in self._again:
+            self._again.remove(plan)
+            self._begin(plan.run)
             return
         # All possible tasks were done, so the first failure does not depend on timing.
-        failures = (self._failures.get(task.name) for task in laid_out.left)
+        failures = (self._failures.get(task.name) for task in plan.left)
         if first := next(filter(None, failures), None):
-            self._failed(laid_out.run, first.reason, first.details, laid_out.stages)
-        self._run_ended(laid_out.run)
+            self._failed(plan.run, first.reason, first.details, plan.stages)
+        self._run_ended(plan.run)
 
     def _failed(
         self, run: SweepRun, reason: str, traceback: str = "", stages: Sequence[str] = ()
@@ -392,7 +392,7 @@ class SweepDriver:
 
 
 def _label_and_name(key: object) -> tuple[str, str]:
-    """Return label and name of the task that Dask knows under this key."""
+    """Return label and name of the task of this key at Dask."""
     label, _, name = str(key).split("-", 2)
     return label, name
 
@@ -410,7 +410,7 @@ def execute(
             scheduler answers, or no worker can take part.
     """
     folder = sweep.dataset.folder
-    with written_by_nobody_else(folder):
+    with locked_folder(folder):
         tables = JoinedTables(sweep.dataset)
         tables.ask_for(sweep.runs)
         for abandoned in folder.glob(f".{_ATTEMPTS}.*"):  # by a sweep that was killed
@@ -436,7 +436,7 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     single_threaded()
     label, done = "time the aligners", 0
     runs = [run for run in sweep.runs if run.run_id not in failed]
-    with written_by_nobody_else(sweep.dataset.folder):
+    with locked_folder(sweep.dataset.folder):
         tables = JoinedTables(sweep.dataset)
         tables.ask_for(runs)
         for number, group in itertools.groupby(sorted(runs, key=tables.number), tables.number):

@@ -303,7 +303,7 @@ def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
     return points_from(pa.table({name: columns[name].to_numpy() for name in columns}))
 
 
-def json_object(text: str, where: Path) -> dict[str, Any]:
+def parse_json_object(text: str, where: Path) -> dict[str, Any]:
     """Parse a JSON object; raises InputError that names its origin if the text is no object."""
     try:
         found = json.loads(text)

@@ -20,11 +20,11 @@ from experiments.studies.refusal.rates import (
     VERDICTS,
     Rate,
     Reliability,
-    as_they_came,
     mergeable,
     ordinary,
     right_answers,
-    swept,
+    share_up_to,
+    unchanged_pairs,
     without_common_ground,
 )
 from mapfusion.align.alignment import Status
@@ -244,7 +244,7 @@ def _draw_accepted_shares(axes: Axes, own: pd.DataFrame) -> None:
         kinds.append((own[own["poster_radius_m"] == radius_m], label, colour, ":"))
     for rows, label, colour, dashes in kinds:
         if len(rows):
-            accepted = swept(rows["log10_false_alarms"], _THRESHOLDS)
+            accepted = share_up_to(rows["log10_false_alarms"], _THRESHOLDS)
             text = f"{label} ({len(rows)})"
             axes.plot(_THRESHOLDS, accepted, color=colour, linestyle=dashes, label=text)
     axes.set_xlabel("threshold on log10 of the false alarms")
@@ -253,7 +253,7 @@ def _draw_accepted_shares(axes: Axes, own: pd.DataFrame) -> None:
 
 def draw_refusal_kinds(refusals: pd.DataFrame) -> Figure:
     """Draw the verdicts on right and on wrong answers, by kind of world, all methods together."""
-    rows = as_they_came(refusals)
+    rows = unchanged_pairs(refusals)
     right, wrong = right_answers(rows), rows[rows["beats_chance"] & ~rows["right"]]
     kinds = sorted(rows["kind"].unique())[::-1]
     figure = Figure(figsize=(style.PAGE_WIDTH_IN, _MARGIN_IN + _KIND_IN * len(kinds)))
@@ -373,6 +373,6 @@ def _floor(refusals: pd.DataFrame) -> np.ndarray:
 def _draw_sweep(axes: Axes, own: pd.DataFrame, floor: np.ndarray, **line: Any) -> None:
     """Draw false against missed merges as the threshold on the column `score` moves."""
     thresholds = np.unique(own["score"].dropna())
-    false = swept(without_common_ground(own)["score"], thresholds)
-    found = swept(mergeable(own)["score"], thresholds)
+    false = share_up_to(without_common_ground(own)["score"], thresholds)
+    found = share_up_to(mergeable(own)["score"], thresholds)
     axes.plot(np.maximum(false, floor[0]), np.maximum(1 - found, floor[1]), **line)

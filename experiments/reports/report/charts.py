@@ -261,7 +261,7 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
                 100 * np.array(own[end], dtype=float) for end in ("rate", "low", "high")
             )
             shown = escaped(name)
-            said = "%{y:.0f} % (%{customdata[0]:.0f} to %{customdata[1]:.0f} %), "
+            hover = "%{y:.0f} % (%{customdata[0]:.0f} to %{customdata[1]:.0f} %), "
             interval = {"type": "data", "array": rounded(high - rate), "width": 0}
             interval |= {"arrayminus": rounded(rate - low), "thickness": 1.5}
             trace = go.Scatter(
@@ -275,7 +275,7 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
                 line={"color": style["hex"], "dash": style["dash"], "width": 1.5},
                 marker={"size": 6, "symbol": style["marker"]},
                 error_y=interval | {"color": faint(style["hex"], 0.45)},
-                hovertemplate=f"{shown}: {said}%{{customdata[2]}} maps<extra></extra>",
+                hovertemplate=f"{shown}: {hover}%{{customdata[2]}} maps<extra></extra>",
             )
             figure.add_trace(trace, row, col)
         ticks = {"tickvals": bins.tolist(), "ticktext": each["bins"], "showgrid": False}

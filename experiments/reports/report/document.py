@@ -29,8 +29,8 @@ from experiments.reports.export import write_text
 from experiments.reports.figures.drawing import FIGURES, caption
 from experiments.reports.figures.result_tables import (
     ResultTables,
-    json_object,
     of_pair,
+    parse_json_object,
     read_png,
 )
 from experiments.reports.figures.style import ROBOT_COLOURS, aligner_styles
@@ -83,7 +83,7 @@ def _provenance(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
                 "settings": {name: row[name] for name in setting_columns(rows)},
                 "renderer": row["renderer"],
                 "source_hash": str(row["source_hash"])[:_SOURCE_DIGITS],
-                "libraries": json_object(str(row["libraries"]), path / "runs"),
+                "libraries": parse_json_object(str(row["libraries"]), path / "runs"),
             }
             for row in rows[rows["status"] == "finished"].to_dict("records")
         ]

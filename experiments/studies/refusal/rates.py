@@ -87,7 +87,7 @@ def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     return rows
 
 
-def swept(score: pd.Series, thresholds: Float) -> Float:
+def share_up_to(score: pd.Series, thresholds: Float) -> Float:
     """Return the share of scores up to each threshold, shape (T,); NaN is never accepted."""
     values = np.sort(score.dropna().to_numpy())
     return np.searchsorted(values, thresholds, side="right") / max(len(score), 1)
@@ -99,7 +99,7 @@ _MAPS = ["world_a", "robot_a", "world_b", "robot_b", "iteration"]
 _RUN = ["kind", "world_a", "robot_a", "robot_b"]  # and aligner: one series of maps
 
 
-def as_they_came(refusals: pd.DataFrame) -> pd.DataFrame:
+def unchanged_pairs(refusals: pd.DataFrame) -> pd.DataFrame:
     """Return the unchanged pairs of maps, with columns `right`, `false` and `verdict`.
 
     The verdict is one of VERDICTS; REFUSED includes all other reasons for refusal.
@@ -125,7 +125,7 @@ def by_kind(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     `by_chance` uses only the test against chance. They are NaN if half of the runs have none.
     """
     rows = []
-    for kind, all_methods in as_they_came(refusals).groupby("kind"):
+    for kind, all_methods in unchanged_pairs(refusals).groupby("kind"):
         for name, own in all_methods.groupby("aligner", sort=False):
             in_one_world = own[own["world_a"] == own["world_b"]]
             apart, ground = without_common_ground(own), own[has_common_ground(own)]
@@ -151,7 +151,7 @@ def of_any_method(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     For false merges, a pair of maps or a run counts once for all aligners.
     """
     rows = []
-    for kind, own in as_they_came(refusals).groupby("kind"):
+    for kind, own in unchanged_pairs(refusals).groupby("kind"):
         in_one_world, right = own[own["world_a"] == own["world_b"]], right_answers(own)
         found = {
             "false_runs": in_one_world.groupby("world_a")["false"].any(),
@@ -164,12 +164,12 @@ def of_any_method(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     return rows
 
 
-def first_of_ordinary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
+def first_right_answers(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     """Return the `first_*` columns of `by_kind` for each aligner, and the number of runs.
 
     Medians are over all runs with common ground in worlds without repetition.
     """
-    rows = as_they_came(ordinary(refusals))
+    rows = unchanged_pairs(ordinary(refusals))
     in_one_world = rows[rows["world_a"] == rows["world_b"]]
     ground = has_common_ground(in_one_world).groupby([in_one_world[name] for name in _RUN])
     in_reach = in_one_world[ground.transform("any")]
@@ -242,7 +242,7 @@ class Reliability(NamedTuple):
 
 def judged_answers(refusals: pd.DataFrame) -> pd.DataFrame:
     """Return the answers that beat chance and have a probability, with `right` and `run`."""
-    rows = as_they_came(refusals)
+    rows = unchanged_pairs(refusals)
     rows = rows[rows["beats_chance"] & rows["probability"].notna()]
     return rows.assign(run=rows["world_a"] + " " + rows["world_b"])
 
@@ -259,8 +259,8 @@ def reliability(answers: pd.DataFrame, rng: np.random.Generator) -> Reliability:
         np.add.at(sums[name], (codes, place), values)
 
     def error(counts: Float) -> Float:
-        n, said, held = (np.einsum("bc,ck->bk", counts, sums[name]) for name in sums)
-        return np.sum(np.abs(said - held), axis=1) / np.sum(n, axis=1)
+        n, stated, held = (np.einsum("bc,ck->bk", counts, sums[name]) for name in sums)
+        return np.sum(np.abs(stated - held), axis=1) / np.sum(n, axis=1)
 
     squared = np.bincount(codes, (stated - right) ** 2, len(runs))
     n_of_run = np.bincount(codes, minlength=len(runs))

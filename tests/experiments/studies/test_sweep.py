@@ -40,7 +40,7 @@ from experiments.studies.sweep import (
     SweepDriver,
     SweepProgress,
     execute,
-    planned,
+    plan_run,
     prepare,
 )
 from experiments.studies.sweep_combinations import SweepRun
@@ -206,7 +206,7 @@ def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
     assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason
     rows = pd.read_parquet(asked.dataset.folder / "runs")
     assert rows[["status", "reason"]].to_numpy().tolist() == [["failed", reason]]
-    assert planned(asked.runs[0], asked.store, JoinedTables(asked.dataset)).left
+    assert plan_run(asked.runs[0], asked.store, JoinedTables(asked.dataset)).left
 
 
 def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(

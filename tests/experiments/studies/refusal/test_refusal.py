@@ -19,7 +19,7 @@ from experiments.scenario.settings import Simulation
 from experiments.scenario.world_settings import Render
 from experiments.studies.refusal import cases
 from experiments.studies.refusal import refusal_trial as results
-from experiments.studies.refusal.rates import Rate, summary, swept
+from experiments.studies.refusal.rates import Rate, share_up_to, summary
 from experiments.studies.refusal.refusal_trial import (
     STATED,
     accepted_motions,
@@ -146,7 +146,9 @@ def test_wilsons_interval() -> None:
 
 def test_sweeping_accepts_up_to_the_threshold_and_never_nan() -> None:
     score = pd.Series([-5.0, -3.0, 1.0, math.nan])
-    np.testing.assert_allclose(swept(score, np.array([-6, -5, -3.5, 99])), [0, 0.25, 0.25, 0.75])
+    np.testing.assert_allclose(
+        share_up_to(score, np.array([-6, -5, -3.5, 99])), [0, 0.25, 0.25, 0.75]
+    )
 
 
 def test_calibration_counts_every_motion_of_two_pairs() -> None:

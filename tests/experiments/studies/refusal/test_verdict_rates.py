@@ -19,7 +19,7 @@ from experiments.studies.refusal.rates import (
     N_BINS,
     Rate,
     by_kind,
-    first_of_ordinary,
+    first_right_answers,
     judged_answers,
     of_any_method,
     pooled,
@@ -97,11 +97,11 @@ def test_first_answers_are_of_all_ordinary_worlds_with_common_ground() -> None:
     third["accepted"] = third["status"] == "accepted"
     apart = third.assign(kind="m", n_common=0)
     given = [ordinary, third, apart, table("posters")]
-    (row,) = first_of_ordinary(pd.concat(given, ignore_index=True))
+    (row,) = first_right_answers(pd.concat(given, ignore_index=True))
     assert (row["aligner"], row["n_runs"]) == ("ransac", 3)
     assert (row["first_iteration"], row["first_true_pairs"]) == (40, 40)
     assert (row["first_iteration_by_chance"], row["first_true_pairs_by_chance"]) == (20, 4)
-    assert not first_of_ordinary(table())
+    assert not first_right_answers(table())
 
 
 def test_a_run_that_never_comes_to_it_is_later_than_all_others() -> None:
