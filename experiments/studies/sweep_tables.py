@@ -94,7 +94,7 @@ class SweepDataset:
             return own_schema.empty_table()
         names = pd.Index([field.name for field in own])
         frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(rows, columns=names)
-        columns = [pa.repeat(pa.scalar(told[f.name], f.type), len(frame)) for f in leading]
+        columns = [pa.repeat(pa.scalar(described[f.name], f.type), len(frame)) for f in leading]
         columns += [pa.array(frame[field.name].to_numpy(), field.type) for field in own]
         return pa.Table.from_arrays(columns, schema=own_schema)
 
