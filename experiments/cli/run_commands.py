@@ -213,9 +213,9 @@ def list_scenarios(
 
         typer.echo(schema_text(), nl=False)
         return
-    from experiments.reports.terminal import study_screen
+    from experiments.reports.terminal import layout
 
     if aligners:
-        study_screen.print_methods()
+        layout.print_methods()
     else:
-        study_screen.print_scenarios(entries(folder))
+        layout.print_scenarios(entries(folder))

@@ -103,12 +103,12 @@ def sweep(
     from experiments.cli.options import require_folder
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.seeds import parse_seeds
-    from experiments.studies import sweep, sweep_plan
+    from experiments.studies import sweep
 
     require_folder(output, scenarios)
-    asked = sweep_plan.prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
+    asked = sweep.prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
     if dry_run:
-        study_screen.print_survey(sweep_plan.survey(asked))
+        study_screen.print_survey(sweep.survey(asked))
         return
     with layout.progress() as show:
         ended = sweep.execute(asked, jobs, scheduler, study_screen.shown_by(show))

@@ -1,6 +1,5 @@
-"""Tables as CSV, Markdown and LaTeX."""
+"""Tables as CSV, Markdown and LaTeX, and the page that documents the columns of all files."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,7 @@ from mapfusion.files import write_whole
 from mapfusion.geometry.joint_covariance import RANK
 from mapfusion.tables import HEIGHT, default_of, description_of
 
-# The CSV keeps every digit.
-_SIGNIFICANT_DIGITS = 4
+_SIGNIFICANT_DIGITS = 4  # in Markdown and LaTeX; CSV files have all digits
 
 
 def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> None:
@@ -28,7 +26,7 @@ def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file as a whole."""
-    data = text.encode("utf-8", "backslashreplace")  # text of users may hold half characters
+    data = text.encode("utf-8", "backslashreplace")  # text of users may contain lone surrogates
     write_whole(path, lambda file: file.write_bytes(data))
 
 
@@ -47,15 +45,15 @@ def to_latex(table: pd.DataFrame) -> str:
 
 def rounded(table: pd.DataFrame) -> pd.DataFrame:
     """Return all cells as text: four significant digits, and a dash for unknown values."""
-    return table.astype(object).map(_text).where(table.notna(), "-")
+
+    def text(value: object) -> str:
+        return f"{value:.{_SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else str(value)
+
+    return table.astype(object).map(text).where(table.notna(), "-")
 
 
 def _numbers(table: pd.DataFrame) -> set[str]:
     return set(table.select_dtypes("number").columns)
-
-
-def _text(value: object) -> str:
-    return f"{value:.{_SIGNIFICANT_DIGITS}g}" if isinstance(value, float) else str(value)
 
 
 PAGE = Path(__file__).parents[1] / "docs" / "formats.md"
@@ -84,38 +82,32 @@ _OPEN = {
 
 def page(text: str) -> str:
     """Return the page with the tables of the schemas; text before the tables is kept."""
-    return "\n".join([text.partition(TABLES_BEGIN)[0] + TABLES_BEGIN, *_lines(), ""])
-
-
-def _lines() -> Iterator[str]:
+    lines = [text.partition(TABLES_BEGIN)[0] + TABLES_BEGIN]
     for title, schema in _OPEN.items():
-        yield from (
-            f"\n## {title}\n",
-            "| column | type | unit | if absent | meaning |",
-            "|---" * 5 + "|",
-        )
+        lines.append(f"\n## {title}\n")
+        lines += ["| column | type | unit | if absent | meaning |", "|---" * 5 + "|"]
         for field in schema:
-            yield _row(field.name, field.type, _if_absent(field), description_of(field))
-    yield "\n## A result: `RESULT/tables/*.parquet`\n"
-    yield "What the rows are, `experiments/evaluation/tables.py` says. All columns are there.\n"
-    yield from ("| table | column | type | unit |", "|---" * 4 + "|")
+            default = default_of(field)
+            if field.name in HEIGHT:
+                absent = "planar, if all four are"
+            elif default is None:
+                absent = "required"
+            else:
+                absent = "none" if np.isnan(default) else f"{default:g}"
+            lines.append(_row(field.name, field.type, absent, description_of(field)))
+    lines.append("\n## A result: `RESULT/tables/*.parquet`\n")
+    lines.append(
+        "`experiments/evaluation/tables.py` describes the rows. All columns are present.\n"
+    )
+    lines += ["| table | column | type | unit |", "|---" * 4 + "|"]
     for name, schema in tables.ALL.items():
-        for field in schema:
-            yield f"| {name} {_row(field.name, field.type)}"
+        lines += [f"| {name} {_row(field.name, field.type)}" for field in schema]
+    return "\n".join([*lines, ""])
 
 
 def _row(name: str, kind: pa.DataType, *more: str) -> str:
     shown = f"{kind.list_size} × {kind.value_type}" if pa.types.is_fixed_size_list(kind) else kind
     return "| " + " | ".join([f"`{name}`", str(shown), unit_of(name), *more]) + " |"
-
-
-def _if_absent(field: pa.Field) -> str:
-    if field.name in HEIGHT:
-        return "planar, if all four are"
-    default = default_of(field)
-    if default is None:
-        return "required"
-    return "none" if np.isnan(default) else f"{default:g}"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Numbers and foreign text as text for screens, reports and files."""
+"""Formatting of numbers and of text from users, for screens, reports and files."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ def plain(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 
-_SPACE = "\u00a0"  # a number stays beside its unit
+_SPACE = "\u00a0"  # keeps a number and its unit on one line
 UNKNOWN = "–"
 
 

@@ -18,12 +18,12 @@ from mapfusion.tables import is_csv, read_open_table
 from sim import trajectory
 
 _PREFIX, _KIND, _VERSION = "mapfusion.", "kind", "schema_version"
-# What people bring or take away is checked; tables of stages and studies tell what they are.
+# Files that users read and write are checked; tables of stages and studies name their kind.
 _SCHEMAS = [*tables.ALL.values(), landmark_map.LANDMARKS, trajectory.TRAJECTORY]
 _SCHEMAS += [robot_log.FRAMES, robot_log.OBSERVATIONS, robot_log.ODOMETRY_COVARIANCE]
 _SCHEMAS += [attitude.ATTITUDE]
 _SCHEMAS += [robot_log.TRUTH_POSES, robot_log.TRUTH_POINTS]
-# Tables that anybody may write; without metadata their file's name tells which one it is.
+# Tables that other programs may write; without metadata the name of the file gives the kind.
 _OPEN = {
     "frames": robot_log.FRAMES,
     "observations": robot_log.OBSERVATIONS,
@@ -32,7 +32,7 @@ _OPEN = {
 }
 _CHECKED = {each.metadata[f"{_PREFIX}{_KIND}".encode()].decode(): each for each in _SCHEMAS}
 _UNITS = {"m": "m", "m2": "m²", "rad": "rad", "s": "s", "ms": "ms", "px": "px"}
-# the upper triangle of an alignment's covariance names its axes instead
+# Columns of the upper triangle of an alignment's covariance end in the names of both axes.
 _OF_AXES = {"xx": "m²", "xy": "m²", "yy": "m²", "xt": "m rad", "yt": "m rad", "tt": "rad²"}
 _RESOLVED, _RESULT, _LOG = "scenario, resolved", "result of a run", "robot log"
 _JSON_KEYS = {
@@ -45,7 +45,7 @@ _JSON_KEYS = {
 }
 _NAMES_SHOWN = 10
 _DESCRIPTIONS = ("sweep.json", "scenario.json", "provenance.json", "done.json")
-# The first that a folder holds tells its kind.
+# The first pattern with a match gives the kind of a folder.
 _FOLDER_MARKS = {
     "sweep.json": "sweep",
     "scenario.json": _RESULT,
@@ -60,7 +60,7 @@ _FOLDER_MARKS = {
 
 
 class Contents(NamedTuple):
-    """Kind of a file or folder in words, facts by name, and a table of its columns or files."""
+    """Kind of a file or folder, facts by name, and a table of its columns or files."""
 
     kind: str
     facts: dict[str, Any]
@@ -78,20 +78,20 @@ def inspect(path: Path) -> None:
 
 
 def contents_of(path: Path) -> Contents:
-    """Describe a file or folder; raises InputError if missing, damaged, or none of mapfusion's."""
+    """Describe a file or folder; raises InputError if missing, damaged or of no known kind."""
     if path.is_dir():
-        return _folder(path)
+        return _folder_contents(path)
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if path.suffix.lower() in landmark_map.MAP_ENDINGS:
-        return _table(path)
+        return _table_contents(path)
     if path.suffix in {".yaml", ".yml"}:
         return Contents("scenario", _brief(_resolved(path)))
     if path.suffix != ".json":
         raise InputError(f"{path}: no file of mapfusion's (known: .parquet, .csv, .yaml, .json)")
     found = _json(path)
     if found.kind == _RESOLVED:
-        _resolved(path)  # raises where it is none of this program's
+        _resolved(path)  # raises if the settings are not valid
     return found
 
 
@@ -106,7 +106,39 @@ def unit_of(name: str) -> str:
     return (_OF_AXES if stem == "cov" else _UNITS).get(end, "") if stem else ""
 
 
-def _table(path: Path) -> Contents:
+def _folder_contents(path: Path) -> Contents:
+    """Describe a folder by its descriptions and tables."""
+    kind = next((kind for mark, kind in _FOLDER_MARKS.items() if any(path.glob(mark))), None)
+    if kind is None:
+        known = ", ".join(dict.fromkeys(_FOLDER_MARKS.values()))
+        raise InputError(f"{path}: no folder of mapfusion's (known: {known})")
+    if kind == _LOG:
+        log = robot_log.read_log(path)
+        facts: dict[str, Any] = {"robot": log.robot, "planar": log.planar}
+    else:
+        told = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
+        facts = {name: value for each in told for name, value in each.facts.items()}
+    if kind == _RESULT:
+        require_as_written(path)
+    # Files and rows by table, or by folder and table in a result
+    n_levels = 2 if kind == _RESULT else 1
+    files = sorted(path.rglob("[!.]*.parquet"))
+    csv = [file for name in _OPEN for file in path.rglob(f"{name}.csv")]
+    files += sorted(file for file in csv if file.with_suffix(".parquet") not in files)
+    inside = [file.relative_to(path).with_suffix("").parts[:n_levels] for file in files]
+    n_files, n_rows = Counter[str](), Counter[str]()
+    for name, file in zip(map("/".join, inside), files, strict=True):
+        n_files[name] += 1
+        if is_csv(file):
+            n_rows[name] += read_open_table(file, _open_schema(file))[0].num_rows
+        else:
+            n_rows[name] += read_parquet(file, "table").num_rows
+    rows = [(name, n, n_rows[name]) for name, n in n_files.items()]
+    return Contents(kind, facts, [("holds", ""), ("files", "d"), ("rows", "d")], rows)
+
+
+def _table_contents(path: Path) -> Contents:
+    """Describe a table by the kind in its metadata, or by its file's name without metadata."""
     if is_csv(path):
         return _open_table(path, _open_schema(path))
     table = read_parquet(path, "table")
@@ -120,36 +152,38 @@ def _table(path: Path) -> Contents:
     if table_schema in (landmark_map.LANDMARKS, *_OPEN.values()):
         return _open_table(path, table_schema)
     if table_schema is not None:
-        read_table(path, table_schema)  # raises where version or columns are others
-    return _of_table(path, str(kind), table, facts)
+        read_table(path, table_schema)  # raises if version or columns differ
+    return _columns_of(path, str(kind), table, facts)
 
 
-def _of_table(path: Path, kind: str, table: pa.Table, facts: dict[str, Any]) -> Contents:
+def _columns_of(path: Path, kind: str, table: pa.Table, facts: dict[str, Any]) -> Contents:
+    """Return the contents of a table with its columns, types and units."""
     facts = facts | {"rows": table.num_rows, "MB": f"{path.stat().st_size / 1e6:.2f}"}
     rows = [(field.name, str(field.type), unit_of(field.name)) for field in table.schema]
     return Contents(kind, facts, [(name, "") for name in ("column", "type", "unit")], rows)
 
 
 def _open_schema(path: Path) -> pa.Schema:
-    """Return which table a file without metadata is read as."""
+    """Return the schema for a file without metadata, by its name."""
     return _OPEN.get(path.stem, landmark_map.LANDMARKS)
 
 
 def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
-    """Describe a table of any writer, read as `align`, `merge` and `slam` do; raises InputError."""
+    """Describe a table of any program as `align`, `merge` and `slam` read it."""
     table, facts = read_open_table(path, table_schema)
     kind = table_schema.metadata[f"{_PREFIX}{_KIND}".encode()].decode()
     known: dict[str, Any] = {name: value for name, value in facts.items() if name != _KIND}
     if table_schema is landmark_map.LANDMARKS:
         landmarks = landmark_map.read_map(path)
         known |= {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
-        looks = {"descriptors": landmarks.descriptor, "labels": landmarks.label}
-        there = [name for name, values in looks.items() if values is not None]
+        keys = {"descriptors": landmarks.descriptor, "labels": landmarks.label}
+        there = [name for name, values in keys.items() if values is not None]
         known["matched by"] = " and ".join(there) or "nothing: neither descriptors nor labels"
-    return _of_table(path, kind, table, known)
+    return _columns_of(path, kind, table, known)
 
 
 def _json(path: Path) -> Contents:
+    """Describe a JSON file by its keys."""
     found = read_json(path, "file of mapfusion's")
     for kind, keys in _JSON_KEYS.items():
         if keys <= set(found):
@@ -158,49 +192,14 @@ def _json(path: Path) -> Contents:
 
 
 def _brief(found: dict[str, Any]) -> dict[str, Any]:
-    """Select single values and names; the file itself shows the rest."""
+    """Select single values and lists of names."""
     facts = {}
     for name, value in found.items():
-        is_names = isinstance(value, list) and all(isinstance(each, str) for each in value)
-        shown = _listed(value) if is_names else value
+        shown = value
+        if isinstance(value, list) and all(isinstance(each, str) for each in value):
+            shown = ", ".join(value)
+            if len(value) > _NAMES_SHOWN:
+                shown = f"{len(value)}, from {value[0]} to {value[-1]}"
         if name != _KIND and isinstance(shown, str | float | int) and shown != "":
             facts[name] = shown
     return facts
-
-
-def _listed(names: list[str]) -> str:
-    if len(names) > _NAMES_SHOWN:
-        return f"{len(names)}, from {names[0]} to {names[-1]}"
-    return ", ".join(names)
-
-
-def _folder(path: Path) -> Contents:
-    kind = next((kind for mark, kind in _FOLDER_MARKS.items() if any(path.glob(mark))), None)
-    if kind is None:
-        known = ", ".join(dict.fromkeys(_FOLDER_MARKS.values()))
-        raise InputError(f"{path}: no folder of mapfusion's (known: {known})")
-    if kind == _LOG:
-        log = robot_log.read_log(path)
-        facts: dict[str, Any] = {"robot": log.robot, "planar": log.planar}
-    else:
-        told = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
-        facts = {name: value for each in told for name, value in each.facts.items()}
-    if kind == _RESULT:
-        require_as_written(path)
-    n_levels = 2 if kind == _RESULT else 1
-    files = sorted(path.rglob("[!.]*.parquet"))
-    csv = [file for name in _OPEN for file in path.rglob(f"{name}.csv")]
-    files += sorted(file for file in csv if file.with_suffix(".parquet") not in files)
-    inside = [file.relative_to(path).with_suffix("").parts[:n_levels] for file in files]
-    n_files, n_rows = Counter[str](), Counter[str]()
-    for name, file in zip(map("/".join, inside), files, strict=True):
-        n_files[name] += 1
-        n_rows[name] += _n_rows(file)
-    rows = [(name, n, n_rows[name]) for name, n in n_files.items()]
-    return Contents(kind, facts, [("holds", ""), ("files", "d"), ("rows", "d")], rows)
-
-
-def _n_rows(path: Path) -> int:
-    if is_csv(path):
-        return read_open_table(path, _open_schema(path))[0].num_rows
-    return read_parquet(path, "table").num_rows

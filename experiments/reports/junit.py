@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from experiments.evaluation.checks import CheckedScenario, Outcome
+from experiments.evaluation.checks import CheckedScenario
 from experiments.reports.formatting import plain
 from mapfusion.files import write_whole
 
 
 def write_junit(path: Path, checks: Sequence[CheckedScenario]) -> None:
-    """Return one suite for each scenario, with a case for each run and for each expectation."""
+    """Write one suite for each scenario, with a case for each run and for each expectation."""
     root = ET.Element("testsuites", name="mapfusion check")
     for check in checks:
         suite = ET.SubElement(root, "testsuite", name=plain(check.scenario))
@@ -25,7 +25,13 @@ def write_junit(path: Path, checks: Sequence[CheckedScenario]) -> None:
             elif seed in check.unmerged:
                 ET.SubElement(case, "failure", message=check.unmerged[seed].text)
         for outcome in check.outcomes:
-            _add_outcome(_case(suite, check, outcome.metric), outcome)
+            case = _case(suite, check, outcome.metric)
+            by_seed = ", ".join(f"{seed}: {value:.4g}" for seed, value in outcome.per_seed.items())
+            text = f"{outcome.value:.6g}, expected {outcome.bound_text}; by seed {by_seed}"
+            if outcome.passed:
+                ET.SubElement(case, "system-out").text = text
+            else:
+                ET.SubElement(case, "failure", message=text)
         _count(suite)
     _count(root)
     document = ET.ElementTree(root)
@@ -35,17 +41,9 @@ def write_junit(path: Path, checks: Sequence[CheckedScenario]) -> None:
 def _case(
     suite: ET.Element, check: CheckedScenario, name: str, elapsed_s: float = 0.0
 ) -> ET.Element:
+    """Add a test case to a suite."""
     named = {"classname": plain(check.scenario), "name": name}
     return ET.SubElement(suite, "testcase", named, time=f"{elapsed_s:.3f}")
-
-
-def _add_outcome(case: ET.Element, outcome: Outcome) -> None:
-    seeds = ", ".join(f"{seed}: {value:.4g}" for seed, value in outcome.per_seed.items())
-    text = f"{outcome.value:.6g}, expected {outcome.bound_text}; by seed {seeds}"
-    if outcome.passed:
-        ET.SubElement(case, "system-out").text = text
-    else:
-        ET.SubElement(case, "failure", message=text)
 
 
 def _count(node: ET.Element) -> None:

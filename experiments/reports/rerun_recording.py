@@ -1,7 +1,7 @@
 """Recording of a result for the Rerun viewer: pictures, maps, paths and alignments over time.
 
-The timeline `frame` is the iteration. What lies where, `experiments/docs/export.md` says. The
-viewer's package is an extra of 500 MB, and imported here alone.
+The timeline `frame` is the iteration. `experiments/docs/export.md` lists the entities. The package
+of the viewer (500 MB) is optional and imported only here.
 """
 
 from importlib import import_module
@@ -35,86 +35,95 @@ def write_rerun(data: ResultTables, path: Path) -> None:
     def write(temporary: Path) -> None:
         recording = _Recording(name, temporary)
         for robot in data.robots:
-            _add_images(recording, data, robot)
             _add_robot(recording, data, robot)
         for pair in data.pairs:
             _add_pair(recording, data, pair)
-        _add_fused(recording, data)
+        # The fused map at the end, coloured by the robots that each landmark comes from, and walls
+        fused: pd.DataFrame = data.fused_map()
+        recording.at(int(data.table("paths")["iteration"].max()))
+        position = fused[["x_m", "y_m", "z_m"]].to_numpy(np.float64)
+        several = fused["n_parents"].to_numpy() > 1
+        recording.points("fused/several", position[several], FUSED_COLOUR, _POINT_M)
+        for robot in data.robots:
+            own = ~several & (fused["robot_a"] == robot).to_numpy()
+            recording.points(f"fused/{robot}", position[own], data.colours[robot], _POINT_M)
+        walls = [_in_plan(*wall[:, :2].T) for wall in data.walls_in_frame_of(data.fused_frame)]
+        if walls:
+            recording.lines("fused/walls", walls, FUSED_COLOUR)
         recording.close()
 
     write_whole(path, write)
 
 
 class _Recording:
-    """What is logged, in the terms of this project."""
+    """Rerun recording in a file."""
 
     def __init__(self, name: str, path: Path) -> None:
         rerun: Any = import_module("rerun")
         self._rerun = rerun
-        # an identifier of its own, in place of a random one: the viewer shows a result once
+        # A fixed identifier instead of a random one: the viewer shows a result only once.
         self._stream: Any = rerun.RecordingStream(f"mapfusion {name}", recording_id=name)
         self._stream.save(path)
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
 
     def at(self, iteration: int) -> None:
-        """What follows is of this frame."""
+        """Set the frame of all later entries."""
         self._stream.set_time(_TIMELINE, sequence=iteration)
 
     def points(self, where: str, position_m: Float, colour: str, radius_m: float) -> None:
-        """Points (N, 3)."""
+        """Log points, shape (N, 3)."""
         own = self._rerun.Points3D(position_m, radii=radius_m, colors=[_rgb(colour)])
         self._stream.log(where, own)
 
     def lines(self, where: str, strips_m: list[Float], colour: str) -> None:
-        """Lines (n, 3) each."""
+        """Log lines, each of shape (n, 3)."""
         own = self._rerun.LineStrips3D(strips_m, radii=_LINE_M, colors=[_rgb(colour)])
         self._stream.log(where, own)
 
     def image(self, where: str, png: bytes) -> None:
-        """A picture."""
+        """Log a picture."""
         own = self._rerun.EncodedImage(contents=png, media_type="image/png")
         self._stream.log(where, own)
 
     def features(self, where: str, uv_px: Float, labels: list[str], colour: str) -> None:
-        """Points (N, 2) of a picture."""
+        """Log points of a picture, shape (N, 2)."""
         own = self._rerun.Points2D(
             uv_px, radii=_FEATURE_PX, colors=[_rgb(colour)], labels=labels, show_labels=False
         )
         self._stream.log(where, own)
 
     def close(self) -> None:
-        """Everything is in the file."""
+        """Write everything to the file."""
         self._stream.flush()
         self._stream.disconnect()
 
 
 def _rgb(colour: str) -> tuple[int, ...]:
+    """Convert #RRGGBB to three values from 0 to 255."""
     return tuple(bytes.fromhex(colour.removeprefix("#")))
 
 
 def _in_plan(x_m: Float, y_m: Float, z_m: float = 0.0) -> Float:
+    """Return points at one height, shape (N, 3)."""
     return np.column_stack([x_m, y_m, np.full(len(x_m), z_m)])
 
 
-def _add_images(recording: _Recording, data: ResultTables, robot: str) -> None:
+def _add_robot(recording: _Recording, data: ResultTables, robot: str) -> None:
+    """Log key frames with features; path, particles and map in the robot's own frame."""
+    where, colour = f"robots/{robot}", data.colours[robot]
     tracks = data.rows("tracks")
     tracks = tracks[tracks["robot"] == robot]
-    for path in sorted((data.folder / "keyframes").glob(f"{robot}_[0-9]*.png")):
-        iteration = int(path.stem.removeprefix(f"{robot}_"))
+    for file in sorted((data.folder / "keyframes").glob(f"{robot}_[0-9]*.png")):
+        iteration = int(file.stem.removeprefix(f"{robot}_"))
         now = tracks[tracks["iteration"] == iteration]
         recording.at(iteration)
-        recording.image(f"images/{robot}", read_png(path))
+        recording.image(f"images/{robot}", read_png(file))
         labels = [
             f"track {t}, {n} frames" for t, n in zip(now["track"], now["length"], strict=True)
         ]
         uv_px = now[["u_px", "v_px"]].to_numpy(np.float64)
-        recording.features(f"images/{robot}/features", uv_px, labels, data.colours[robot])
-
-
-def _add_robot(recording: _Recording, data: ResultTables, robot: str) -> None:
-    """Log path, particles and map in the robot's own frame at each evaluated iteration."""
-    where, colour = f"robots/{robot}", data.colours[robot]
+        recording.features(f"images/{robot}/features", uv_px, labels, colour)
     path = _in_plan(*data.path_of(robot).T)
     for iteration, landmarks in _history(data, robot).items():
         recording.at(iteration)
@@ -128,7 +137,7 @@ def _add_robot(recording: _Recording, data: ResultTables, robot: str) -> None:
 
 
 def _history(data: ResultTables, robot: str) -> dict[int, Float]:
-    """Landmarks (N, 3) at each evaluated iteration, in plan."""
+    """Return the landmarks in plan, shape (N, 3), by evaluated iteration."""
     rows = data.rows("map_history")
     rows = rows[rows["robot"] == robot].sort_values(["iteration", "landmark"])
     groups = rows.groupby("iteration")
@@ -160,18 +169,3 @@ def _add_pair(recording: _Recording, data: ResultTables, pair: Pair) -> None:
         now = fused[fused["iteration"] == k]
         position = _in_plan(now["x_m"].to_numpy(), now["y_m"].to_numpy())
         recording.points(f"{where}/fused", position, FUSED_COLOUR, _POINT_M)
-
-
-def _add_fused(recording: _Recording, data: ResultTables) -> None:
-    """Log the fused map at the end, coloured by the number of robots, and the walls if known."""
-    fused: pd.DataFrame = data.fused_map()
-    recording.at(int(data.table("paths")["iteration"].max()))
-    position = fused[["x_m", "y_m", "z_m"]].to_numpy(np.float64)
-    several = fused["n_parents"].to_numpy() > 1
-    recording.points("fused/several", position[several], FUSED_COLOUR, _POINT_M)
-    for robot in data.robots:
-        own = ~several & (fused["robot_a"] == robot).to_numpy()
-        recording.points(f"fused/{robot}", position[own], data.colours[robot], _POINT_M)
-    walls = [_in_plan(*wall[:, :2].T) for wall in data.walls_in_frame_of(data.fused_frame)]
-    if walls:
-        recording.lines("fused/walls", walls, FUSED_COLOUR)

@@ -1,7 +1,7 @@
 """Export of a result: trajectories, pose graphs, point clouds.
 
-Made from the result folder alone. How files, keys and frames are to be read is said in
-`experiments/docs/export.md`.
+Everything comes from the result folder. `experiments/docs/export.md` describes files, keys and
+frames.
 """
 
 import re
@@ -28,11 +28,11 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import POSE_FIELDS
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.landmark_map import LandmarkMap, joint_path, read_map
+from mapfusion.landmark_map import joint_path, read_map
 from mapfusion.viewing import viewing_paths
 
-# The least an odometry edge may claim to know: a solver cannot weigh what has no error at all, as
-# standing still has none. A tenth of what encoders resolve over a frame.
+# Smallest standard deviation of an odometry edge. A solver needs a positive one, but the motion
+# noise of a robot at rest is zero. A tenth of the resolution of encoders over a frame.
 _LEAST_SIGMA = np.array([1e-4, 1e-4, 1e-4])  # m, m, rad
 _SOURCES = ("final", "online", "odometry", "truth")
 _MOTION = ["tx_m", "ty_m", "theta_rad"]
@@ -57,9 +57,8 @@ def export_result(result: Path, kind: str, folder: Path | None = None) -> list[P
         path = target / f"{result.resolve().name}.rrd"
         write_rerun(data, path)
         return [path]
-    made = [
-        (target / name, text) for name, text in _FILES[kind](data)
-    ]  # all, before any is written
+    # All texts are made before the first file is written.
+    made = [(target / name, text) for name, text in _FILES[kind](data)]
     for path, text in made:
         write_text(path, text)
     return [path for path, _ in made]
@@ -114,8 +113,13 @@ def _placed(data: ResultTables, robot: str) -> Float | None:
 
 
 def _g2o_files(data: ResultTables) -> Iterator[tuple[str, str]]:
-    """Yield poses, landmarks and odometry of all robots, and the alignments that the team uses."""
-    graph, first, noise = G2oGraph(), dict[str, int](), _motion_noise(data)
+    """Yield one graph of all robots: poses, landmarks, odometry and the alignments used."""
+    try:
+        noise = MotionNoise(**data.scenario["slam"]["filter"]["motion"])  # assumed by the filter
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"slam.filter.motion: cannot be read ({error})"
+        raise InputError(f"{data.folder / 'scenario.json'}: {reason}") from error
+    graph, first = G2oGraph(), dict[str, int]()
     for robot in data.robots:
         T = _placed(data, robot)
         whose = robot if T is None else data.fused_frame
@@ -123,71 +127,48 @@ def _g2o_files(data: ResultTables) -> Iterator[tuple[str, str]]:
         graph.add_comment(f"{robot}, in the frame of {whose}: poses, one a frame; then landmarks")
         poses = graph.add_poses(se2.compose(T, _path(data, robot, "final")))
         first[robot] = int(poses[0])
-        _add_odometry(graph, poses, _path(data, robot, "odometry"), noise)
-        _add_map(graph, int(poses[0]), T, *data.landmarks_of(robot))
-    for a, b, row in _believed_alignments(data):
-        found = alignment_of(row, int(row["n_correspondences"]))
-        graph.add_motion(first[a], first[b], found.T_a_b, found.covariance)
-    yield "team.g2o", graph.text()
-
-
-def _motion_noise(data: ResultTables) -> MotionNoise:
-    """Return the motion noise that the filter assumed."""
-    try:
-        return MotionNoise(**data.scenario["slam"]["filter"]["motion"])
-    except (KeyError, TypeError, ValueError) as error:
-        reason = f"slam.filter.motion: cannot be read ({error})"
-        raise InputError(f"{data.folder / 'scenario.json'}: {reason}") from error
-
-
-def _add_odometry(graph: G2oGraph, poses: np.ndarray, path: Float, noise: MotionNoise) -> None:
-    motions = se2.between(path[:-1], path[1:])
-    for i, j, motion in zip(poses[:-1].tolist(), poses[1:].tolist(), motions, strict=True):
-        sigma = np.maximum(noise.standard_deviations(motion), _LEAST_SIGMA)
-        graph.add_motion(i, j, motion, np.diag(sigma**2))
-
-
-def _add_map(graph: G2oGraph, pose: int, T: Float, position: Float, covariance: Float) -> None:
-    """Return landmarks (N, 3) in the frame of the robot's first pose, the origin of its map."""
-    points = graph.add_points(se2.transform_points(T, position)[:, :2])
-    for point, p, S in zip(points.tolist(), position[:, :2], covariance[:, :2, :2], strict=True):
-        graph.add_sighting(pose, point, p, S)
-
-
-def _believed_alignments(data: ResultTables) -> Iterator[tuple[str, str, dict[Any, Any]]]:
-    """Yield robots a and b with the row of `estimates` that merged their maps."""
+        path = _path(data, robot, "odometry")
+        motions = se2.between(path[:-1], path[1:])
+        for i, j, motion in zip(poses[:-1].tolist(), poses[1:].tolist(), motions, strict=True):
+            sigma = np.maximum(noise.standard_deviations(motion), _LEAST_SIGMA)
+            graph.add_motion(i, j, motion, np.diag(sigma**2))
+        # Landmarks are seen from the first pose, the origin of the robot's map.
+        position, covariance = data.landmarks_of(robot)
+        points = graph.add_points(se2.transform_points(T, position)[:, :2])
+        seen = zip(points.tolist(), position[:, :2], covariance[:, :2, :2], strict=True)
+        for point, p, S in seen:
+            graph.add_sighting(first[robot], point, p, S)
     edges, estimates = data.rows("team_edges"), data.rows("estimates")
     used = estimates["aligner"] == data.scenario.get("merge", {}).get("aligner")
     used &= estimates["repetition"] == 0
     for a, b in edges.loc[is_used_by_team(edges), ["robot_a", "robot_b"]].itertuples(index=False):
         of_pair = used & (estimates["robot_a"] == a) & (estimates["robot_b"] == b)
         rows = estimates[of_pair].sort_values("iteration")
-        yield a, b, rows.iloc[-1].to_dict()
+        row: dict[Any, Any] = rows.iloc[-1].to_dict()
+        found = alignment_of(row, int(row["n_correspondences"]))
+        graph.add_motion(first[a], first[b], found.T_a_b, found.covariance)
+    yield "team.g2o", graph.text()
 
 
 def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:
     """Yield one file for each map of the result."""
     files = sorted((data.folder / "maps").glob("*.parquet"))
-    # what a map's landmarks have in common, and how they were seen, is no map
+    # Joint covariances and viewing evidence are stored beside the maps.
     beside = {each for path in files for each in (joint_path(path), *viewing_paths(path))}
     for path in (file for file in files if file not in beside):
         landmarks, name = read_map(path), path.stem
-        robot = name.partition(".")[0]  # R1.smoothed is R1's, too
+        robot = name.partition(".")[0]  # R1.smoothed belongs to R1 too
         colours = np.tile(_rgb(data.colours.get(robot, FUSED_COLOUR)), (len(landmarks), 1))
         if name == _FUSED:
-            _colour_single(colours, data, landmarks)
+            # Fused landmarks of a single robot have the colour of this robot.
+            rows: pd.DataFrame = data.fused_map().sort_values("landmark")
+            if len(rows) != len(landmarks):
+                counts = f"{len(rows)} rows, the fused map has {len(landmarks)} landmarks"
+                raise InputError(f"{data.folder}: table of fused landmarks has {counts}")
+            for parent, colour in data.colours.items():
+                alone = (rows["n_parents"] == 1) & (rows["robot_a"] == parent)
+                colours[alone.to_numpy()] = _rgb(colour)
         yield f"{name}.ply", ply_text(landmarks, colours)
-
-
-def _colour_single(colours: np.ndarray, data: ResultTables, landmarks: LandmarkMap) -> None:
-    """Colour fused landmarks of a single robot in its colour."""
-    rows: pd.DataFrame = data.fused_map().sort_values("landmark")
-    if len(rows) != len(landmarks):
-        counts = f"{len(rows)} rows, the fused map has {len(landmarks)} landmarks"
-        raise InputError(f"{data.folder}: table of fused landmarks has {counts}")
-    for robot, colour in data.colours.items():
-        alone = (rows["n_parents"] == 1) & (rows["robot_a"] == robot)
-        colours[alone.to_numpy()] = _rgb(colour)
 
 
 def _rgb(colour: str) -> np.ndarray:

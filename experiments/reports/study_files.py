@@ -8,11 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
 
 from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.evaluation.tables import table_path
@@ -20,7 +16,7 @@ from experiments.pipeline.code_version import library_versions
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, write_rows
 from experiments.plugins.discovery import find_method
 from experiments.reports.export import to_markdown, write_tables, write_text
-from experiments.reports.figures import independence_figure, refusal_figures, style, verdict_figures
+from experiments.reports.figures import study_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
 from experiments.reports.json_document import publish
@@ -38,7 +34,7 @@ from experiments.studies.refusal.rates import (
     VERDICTS,
     Rate,
     Reliability,
-    first_of_ordinary,
+    first_right_answers,
     of_any_method,
     ordinary,
 )
@@ -52,11 +48,10 @@ _FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_ti
 
 
 def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = False) -> None:
-    """Show the main tables; write all, and figures 4 to 6, where an output folder is given.
+    """Print the main tables, or all as JSON; write all and figures 4 to 6 into an output folder.
 
-    As JSON, all tables are shown.
-
-    Raises InputError where a path holds no runs, no run knows the truth, or a table is damaged.
+    Raises:
+        InputError: a path has no runs, no run knows the truth, or a table is damaged.
     """
     summary = summarise(find_runs(paths))
     if not {"success_at_the_end", "paths"} & summary.tables.keys():
@@ -67,9 +62,9 @@ def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = F
         write_tables(output, summary.tables)
         skipped += _draw_over_runs(summary, output / "figures")
     if as_json:
-        told = {"n_runs": summary.n_runs, "n_configurations": summary.n_configurations}
-        told |= {"missing_tables": summary.missing, "failed_runs": summary.failed}
-        publish("statistics", told | {"written": output, "tables": summary.tables}, shown=True)
+        contents = {"n_runs": summary.n_runs, "n_configurations": summary.n_configurations}
+        contents |= {"missing_tables": summary.missing, "failed_runs": summary.failed}
+        publish("statistics", contents | {"written": output, "tables": summary.tables}, shown=True)
     else:
         print_summary(summary, output, skipped)
 
@@ -77,7 +72,7 @@ def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = F
 def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
     """Draw the figures over several runs of each scenario and setting; yield those not drawn.
 
-    With one such configuration the pictures go to `folder`, with more to a folder each in it.
+    The pictures of several configurations go to one folder each in `folder`.
     """
     drawn = {
         "-".join([labels.pop("scenario"), *(f"{key}={labels[key]}" for key in labels)]): medians
@@ -99,13 +94,6 @@ def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
 
 
 SCHEMA_VERSION = 1
-_BAND_ALPHA = 0.14
-_DODGE = 0.45  # of the distance between two shares, over which the methods are spread
-_MIN_SUCCESSES = 10  # the median error of fewer says little
-_RATIO_TICKS = (1, 2, 5, 10, 20, 50, 100)
-_RATIO_RANGE = (0.9, 11.0)  # shown at least
-_MARGIN = 1.15  # about what is drawn
-_ROWS = ("success (%)", "error over the oracle's", "time of one call (ms)")
 
 
 def write_benchmark(
@@ -131,7 +119,7 @@ def write_benchmark(
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     write_json(folder / "provenance.json", provenance)
-    save_figure(folder, "benchmark", draw, summary)
+    save_figure(folder, "benchmark", study_figures.draw_benchmark, summary)
 
 
 def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
@@ -177,66 +165,8 @@ def cell_text(cell: pd.Series) -> str:
     return ", ".join(parts)
 
 
-def draw(summary: pd.DataFrame) -> Figure:
-    """Draw one column of panels for each number of pairs, with the rows of `_ROWS`.
-
-    Bands: Wilson's 95 % interval of the success, 10-90 % of the trials' times. The shares are
-    spaced evenly and the methods set a little apart, as most lie on one another.
-    """
-    counts = summary["n_pairs"].unique()
-    methods = summary["method"].unique().tolist()
-    styles = style.aligner_styles(methods)
-    shares = sorted(summary["outlier_share"].unique())
-    figure = Figure(figsize=(style.PAGE_WIDTH_IN, 6.6))
-    panels = figure.subplots(len(_ROWS), len(counts), sharex=True, sharey="row", squeeze=False)
-    ran = summary[summary["status"] != Status.ABSENT].sort_values("outlier_share")
-    for column, count in zip(panels.T, counts, strict=True):
-        for place, method in enumerate(methods):
-            own = ran[(ran["n_pairs"] == count) & (ran["method"] == method)]
-            offset = _DODGE * ((place + 0.5) / len(methods) - 0.5)
-            x = np.searchsorted(shares, own["outlier_share"]) + offset
-            _add_method(column, x, own, styles[method])
-        column[0].set_title(f"{count} pairs")
-        column[-1].set_xlabel("outliers (%)")
-    _lay_out(panels, shares)
-    absent = set(summary["method"][summary["status"] == Status.ABSENT])
-    looks = {f"{m} (absent)" if m in absent else m: styles[m] for m in methods}
-    style.aligner_legend(figure, looks, columns=5)
-    return figure
-
-
-def _add_method(axes: np.ndarray, x: np.ndarray, own: pd.DataFrame, line: dict) -> None:
-    success, ratio, elapsed = axes
-    line = line | {"linewidth": 0.8, "markersize": 2.8}
-    ends = (100 * own["success_low"], 100 * own["success_high"])
-    success.vlines(x, *ends, color=line["color"], linewidth=2.2, alpha=0.35)
-    success.plot(x, 100 * own["success"], **line)
-    ratio.plot(x, own["ratio_m"].where(own["n_success"] >= _MIN_SUCCESSES), **line)
-    ends = (1e3 * own["elapsed_low_s"], 1e3 * own["elapsed_high_s"])
-    elapsed.fill_between(x, *ends, color=line["color"], alpha=_BAND_ALPHA, linewidth=0)
-    elapsed.plot(x, 1e3 * own["elapsed_s"], **line)
-
-
-def _lay_out(panels: np.ndarray, shares: list[float]) -> None:
-    axes: Axes
-    for row, label in zip(panels, _ROWS, strict=True):
-        row[0].set_ylabel(label)
-        for axes in row:
-            axes.set_xticks(range(len(shares)), [f"{100 * share:g}" for share in shares])
-            axes.grid(visible=False, axis="x")
-    panels[0, 0].set_ylim(-3, 103)
-    for axes in panels[1:].flat:
-        axes.set_yscale("log")
-        style.write_plainly(axes.yaxis)
-    drawn = [line.get_ydata() for axes in panels[1] for line in axes.get_lines()]
-    ratios = np.concatenate([*drawn, _RATIO_RANGE])
-    panels[1, 0].set_yticks(_RATIO_TICKS)
-    panels[1, 0].set_ylim(np.nanmin(ratios) / _MARGIN, np.nanmax(ratios) * _MARGIN)
-    panels[1, 0].yaxis.set_minor_locator(NullLocator())
-
-
 FIGURE = "independence"
-# Columns of `at_the_end` that people are shown: headings of a page and of a screen.
+# Columns of `at_the_end` in reports: headings of a page and of a screen.
 SHOWN = {
     "robots_s": ("robots' own work, CPU s", "robots'\nCPU s"),
     "busiest_robot_s": ("of the busiest robot", "busiest\nCPU s"),
@@ -248,7 +178,7 @@ SHOWN = {
     "fitted_rmse_m": ("map after a fit, mm", "fitted\nmm"),
     "path_rmse_m": ("paths after a fit, mm", "paths\nmm"),
 }
-_MM_A_M = 1000.0
+_MM_PER_M = 1000.0
 
 
 def write_independence(
@@ -256,23 +186,15 @@ def write_independence(
 ) -> list[str]:
     """Write `teams`, `costs` (Parquet), `summary` (CSV, Markdown), the figure and provenance.
 
-    Returns why there is no figure, if there is none.
+    Returns:
+        The reason if there is no figure, else an empty list.
     """
     summary = at_the_end(found)
     write_rows(folder / "teams.parquet", TEAMS, found.teams)
     write_rows(folder / "costs.parquet", COSTS, found.costs)
     write_text(folder / "summary.csv", summary.to_csv(index=False))
     write_text(folder / "summary.md", independence_markdown(scenarios, summary))
-    write_json(folder / "provenance.json", _provenance(scenarios))
-    try:
-        save_figure(folder, FIGURE, independence_figure.draw, found.teams, found.costs)
-    except NothingToDraw as reason:
-        return [f"{FIGURE}: {reason}"]
-    return []
-
-
-def _provenance(scenarios: Sequence[AnyScenario]) -> dict[str, object]:
-    return {
+    provenance = {
         "schema_version": SCHEMA_VERSION,
         "scenarios": [scenario.resolved() for scenario in scenarios],
         "python": platform.python_version(),
@@ -280,6 +202,12 @@ def _provenance(scenarios: Sequence[AnyScenario]) -> dict[str, object]:
         "libraries": library_versions(),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    write_json(folder / "provenance.json", provenance)
+    try:
+        save_figure(folder, FIGURE, study_figures.draw_independence, found.teams, found.costs)
+    except NothingToDraw as reason:
+        return [f"{FIGURE}: {reason}"]
+    return []
 
 
 def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFrame) -> str:
@@ -293,31 +221,28 @@ def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFram
         "compare them with each other. Errors are root mean squares, of landmarks without the "
         "gross ones. `experiments/docs/independence.md` defines all of it.\n"
     ]
+    labels = {strategy.name: strategy.label for strategy in STRATEGIES}
     for n_robots, rows in summary.groupby("n_robots"):
         whole, n = rows["n_whole"].min(), rows["n_seeds"].max()
+        shown = {heading: shown_numbers(rows, name) for name, (heading, _) in SHOWN.items()}
+        table = pd.DataFrame({"way to one map": rows["strategy"].map(labels)} | shown)
         parts += [
             f"## {n_robots} robots\n",
             f"All robots' maps became one in {whole} of {n} runs.\n",
-            to_markdown(_for_people(rows)),
+            to_markdown(table),
         ]
     return "\n".join(parts)
 
 
-def _for_people(rows: pd.DataFrame) -> pd.DataFrame:
-    labels = {strategy.name: strategy.label for strategy in STRATEGIES}
-    shown = {heading: shown_numbers(rows, name) for name, (heading, _) in SHOWN.items()}
-    return pd.DataFrame({"way to one map": rows["strategy"].map(labels)} | shown)
-
-
 def shown_numbers(rows: pd.DataFrame, name: str) -> pd.Series:
     """Return a column of `SHOWN` in the unit of its heading: errors in mm."""
-    return rows[name] * (_MM_A_M if name.endswith("rmse_m") else 1.0)
+    return rows[name] * (_MM_PER_M if name.endswith("rmse_m") else 1.0)
 
 
 _RATES = ("false_runs", "false_pairs", "false_by_chance", "wrong_pairs", "on_ground", "ambiguous")
 _RATES += tuple(f"right_{verdict}" for verdict in VERDICTS)
 _FIRST = ("first_iteration", "first_true_pairs")
-# A row for each kind of world and method: NAME of NAME_of, with Wilson's interval (`kind_rates`).
+# One row for each kind of world and method: NAME of NAME_of, with Wilson's interval (`by_kind`).
 KINDS = schema(
     "refusal.kinds",
     1,
@@ -334,38 +259,39 @@ KINDS = schema(
 
 
 def write_kinds(folder: Path, refusals: pd.DataFrame, rows: list[dict[str, Any]]) -> Path:
-    """Write rows of `kind_rates.by_kind` as the table `kinds` and, for people, `kinds.md`.
+    """Write rows of `by_kind` as the table `kinds` and as the page `kinds.md`.
 
-    The page begins with what any method does (`of_any_method`), and how early ordinary worlds are
-    come upon (`first_of_ordinary`).
+    The page begins with the rates over all methods (`of_any_method`) and with the iteration of the
+    first right answer in ordinary worlds (`first_of_ordinary`).
     """
-    write_rows(table_path(folder, "kinds"), KINDS, [_flat(row) for row in rows])
+    flat_rows = []
+    for row in rows:
+        flat: dict[str, Any] = {}
+        for name, value in row.items():
+            if isinstance(value, Rate):
+                low, high = value.interval
+                flat |= {name: value.hits, f"{name}_of": value.n}
+                flat |= {f"{name}_low": low, f"{name}_high": high}
+            else:
+                flat[name] = value
+        flat_rows.append(flat)
+    write_rows(table_path(folder, "kinds"), KINDS, flat_rows)
     page, text = folder / "kinds.md", "# Verdicts by kind of world\n"
     parts = {"Any method": of_any_method(refusals)}
-    if first := first_of_ordinary(refusals):
+    if first := first_right_answers(refusals):
         parts["First right answers in worlds that do not repeat themselves"] = first
     parts["Each method"] = rows
     for title, part in parts.items():
-        shown = [{name: _told(value) for name, value in row.items()} for row in part]
+        shown = [
+            {
+                name: f"{value.hits}/{value.n}" if isinstance(value, Rate) else value
+                for name, value in row.items()
+            }
+            for row in part
+        ]
         text += f"\n## {title}\n\n{to_markdown(pd.DataFrame(shown))}\n"
     write_text(page, text)
     return page
-
-
-def _flat(row: dict[str, Any]) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in row.items():
-        if isinstance(value, Rate):
-            low, high = value.interval
-            flat |= {name: value.hits, f"{name}_of": value.n}
-            flat |= {f"{name}_low": low, f"{name}_high": high}
-        else:
-            flat[name] = value
-    return flat
-
-
-def _told(value: Any) -> Any:
-    return f"{value.hits}/{value.n}" if isinstance(value, Rate) else value
 
 
 def draw_refusals(
@@ -379,10 +305,10 @@ def draw_refusals(
     place, files = folder / "figures", []
     if len(ordinary(refusals)):
         data = (refusals, calibration, false_alarms)
-        files += save_figure(place, "refusal", refusal_figures.draw, *data)
-    files += save_figure(place, "refusal_kinds", verdict_figures.draw_kinds, refusals)
-    files += save_figure(place, "refusal_roc", verdict_figures.draw_roc, refusals)
+        files += save_figure(place, "refusal", study_figures.draw_refusal, *data)
+    files += save_figure(place, "refusal_kinds", study_figures.draw_refusal_kinds, refusals)
+    files += save_figure(place, "refusal_roc", study_figures.draw_refusal_roc, refusals)
     if held is not None:
-        draw = verdict_figures.draw_reliability
+        draw = study_figures.draw_refusal_reliability
         files += save_figure(place, "refusal_reliability", draw, held)
     return files

@@ -39,7 +39,7 @@ def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -
 def edge_lines(edges: pd.DataFrame) -> Iterator[str]:
     """Describe by `team_edges` how alignments agree; a single alignment gives no lines."""
     if len(edges) > 1:
-        told = edges[edges["place"] != EdgeStatus.REFUSED]
-        for place, rows in told.groupby("place", sort=True):
+        used = edges[edges["place"] != EdgeStatus.REFUSED]
+        for place, rows in used.groupby("place", sort=True):
             names = (rows["robot_a"] + "-" + rows["robot_b"]).tolist()
             yield f"alignments {place}: {listed(names)}"

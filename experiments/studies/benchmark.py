@@ -154,37 +154,33 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     started = time.perf_counter()
     n_pairs, share = settings.n_pairs, settings.outlier_share
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
-    registration = Registration(aligner, judge=None)  # methods are ranked by what they find
+    registration = Registration(
+        aligner, judge=None
+    )  # no verdict: methods are ranked by their estimates
     cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
     rows: list[dict[str, Any]] = []
     for trial in range(settings.trials):
         maps = ("benchmark", n_pairs, f"{share:g}", trial)
         pair = synthetic_pair(n_pairs, share, generator(settings.seed, *maps))
         for _ in range(2 if trial == 0 else 1):  # the first call compiles and fills caches
-            answer = _trial(registration, pair, generator(settings.seed, *maps, settings.name))
-        rows.append(cell | {"trial": trial} | answer)
+            rng = generator(settings.seed, *maps, settings.name)
+            answers = registration.register(pair.map_a, pair.map_b, pair.correspondences, rng)
+        estimated, refined, _ = answers
+        row = {
+            "status": str(estimated.status),
+            "reason": estimated.reason,
+            "refined_status": str(refined.status),
+            "elapsed_s": estimated.elapsed_s,
+        }
+        oracle = pair.least_squares() if pair.is_true.sum() >= 2 else np.full(3, np.nan)
+        for prefix, T in (("", estimated.T_a_b), ("refined_", refined.T_a_b), ("oracle_", oracle)):
+            x, y, theta = T - pair.T_a_b
+            row[f"{prefix}error_m"] = float(np.hypot(x, y))
+            row[f"{prefix}error_rad"] = abs(float(se2.wrap(theta)))
+        rows.append(cell | {"trial": trial} | row)
         if time.perf_counter() - started > settings.budget_s:
             break
     write_rows(job.output / TRIALS_FILE, TRIALS, rows)
-
-
-def _trial(
-    registration: Registration, pair: SyntheticPair, rng: np.random.Generator
-) -> dict[str, Any]:
-    """Return the columns of `TRIALS` that one answer determines."""
-    estimated, refined, _ = registration.register(pair.map_a, pair.map_b, pair.correspondences, rng)
-    row = {
-        "status": str(estimated.status),
-        "reason": estimated.reason,
-        "refined_status": str(refined.status),
-        "elapsed_s": estimated.elapsed_s,
-    }
-    oracle = pair.least_squares() if pair.is_true.sum() >= 2 else np.full(3, np.nan)
-    for prefix, T in (("", estimated.T_a_b), ("refined_", refined.T_a_b), ("oracle_", oracle)):
-        x, y, theta = T - pair.T_a_b
-        row[f"{prefix}error_m"] = float(np.hypot(x, y))
-        row[f"{prefix}error_rad"] = abs(float(se2.wrap(theta)))
-    return row
 
 
 OUTLIER_SHARES = (0.5, 0.8, 0.9, 0.95, 0.99)

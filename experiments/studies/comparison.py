@@ -18,11 +18,14 @@ from experiments.evaluation import criteria
 from experiments.evaluation.criteria import (
     ANSWERABLE_PAIRS,
     COMMON_LANDMARKS,
+    COUNTS,
     MAP_KEYS,
     MAP_PAIR,
     ORACLE,
     RICH_PAIRS,
+    RUN_KEYS,
     is_false_merge,
+    methods_in,
     right_refined,
     setting_columns,
 )
@@ -167,7 +170,7 @@ class VersionComparison(NamedTuple):
 
     @property
     def worse(self) -> bool:
-        """True if a metric got worse beyond noise. Times do not count: see `_notes_on`."""
+        """True if a metric got worse beyond noise; times depend on the load and do not count."""
         return bool(((self.table["verdict"] == WORSE) & ~self.table["timed"]).any())
 
 
@@ -193,7 +196,19 @@ def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> Versi
             f"the first has {_some(runs_a)}, the second {_some(runs_b)}"
         )
     unit = RUN if len(common) > 1 else MAPS_OF_ONE_RUN
-    rows = [_judged(*each, len(common)) for each in _all_values(a, b, apart_from)]
+    rows: list[dict[str, Any]] = []
+    for quantity, method, values in _all_values(a, b, apart_from):
+        is_share = quantity.scale == "share"
+        per_map, run_id = values["change"].to_numpy(), values["run_id"]
+        changes = intervals.change_of_each_run(per_map, run_id, len(common), is_share)
+        found = intervals.mean_change(changes)
+        limits = np.exp(found[:3]) if quantity.scale == "ratio" else found[:3]
+        of_a, of_b = values[["a", "b"]].agg("mean" if is_share else "median")
+        row = {"metric": quantity.metric, "method": method} | quantity._asdict()
+        row |= {"a": of_a, "b": of_b}
+        row |= dict(zip(("change", "low", "high"), limits, strict=True))
+        row |= {"n_units": len(changes), "n_rows": len(values), "p": found.p}
+        rows.append(row | {"identical": not values["change"].any()})
     if not rows:
         raise InputError(f"{path_a} and {path_b}: their common runs have no rows in common")
     table = pd.DataFrame(rows)
@@ -205,8 +220,23 @@ def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> Versi
             runs = f"{len(names)} run{'s' * (len(names) > 1)} of the {which}"
             notes.append(f"left out: {runs} that the other has not ({_some(names)})")
     is_common = match_names(a.described, apart_from).isin(common)
-    worlds = a.described.loc[is_common, ["scenario", "seed"]].drop_duplicates()
-    notes += _notes_on(table, unit, len(common), len(worlds))
+    n_worlds = len(a.described.loc[is_common, ["scenario", "seed"]].drop_duplicates())
+    if unit == MAPS_OF_ONE_RUN:
+        notes.append(
+            "weak: one run each. The noise is that between the robots and maps of this run, which "
+            "depend on each other; another seed may differ. Compare six seeds or more"
+        )
+    elif n_worlds < intervals.FEW_RUNS:
+        worlds = f"{n_worlds} world{'s' * (n_worlds > 1)} (scenario and seed)"
+        notes.append(
+            f"weak: {len(common)} runs in {worlds}. The test assumes normally distributed changes, "
+            f"which so few cannot confirm; compare {intervals.FEW_RUNS} seeds or more"
+        )
+    if table["timed"].any():
+        notes.append(
+            "times: all runs of a version share its machine and load; resampling of runs cannot "
+            "separate these from a change of the program. Times never count for --fail-if-worse"
+        )
     return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
 
 
@@ -237,21 +267,8 @@ def _apart_from(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
     return notes
 
 
-def _judged(quantity: Quantity, method: str, values: pd.DataFrame, n_runs: int) -> dict[str, Any]:
-    """Return one row of the table, without verdict and corrected p."""
-    is_share = quantity.scale == "share"
-    per_map, run_id = values["change"].to_numpy(), values["run_id"]
-    changes = intervals.change_of_each_run(per_map, run_id, n_runs, is_share)
-    found = intervals.mean_change(changes)
-    told = np.exp(found[:3]) if quantity.scale == "ratio" else found[:3]
-    a, b = values[["a", "b"]].agg("mean" if is_share else "median")
-    row = {"metric": quantity.metric, "method": method} | quantity._asdict() | {"a": a, "b": b}
-    row |= dict(zip(("change", "low", "high"), told, strict=True))
-    row |= {"n_units": len(changes), "n_rows": len(values), "p": found.p}
-    return row | {"identical": not values["change"].any()}
-
-
 def _verdict(row: dict[Any, Any]) -> str:
+    """Return the verdict on one row of the table, from its change and corrected p value."""
     if row["identical"]:
         return SAME
     if row["n_units"] < 2:
@@ -268,27 +285,6 @@ def _some(names: set[str]) -> str:
     """Return the first names, and the number of the others."""
     shown = ", ".join(islice(sorted(names), _SHOWN_NAMES))
     return shown + (f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else "")
-
-
-def _notes_on(table: pd.DataFrame, unit: str, n_runs: int, n_worlds: int) -> list[str]:
-    notes = []
-    if unit == MAPS_OF_ONE_RUN:
-        notes.append(
-            "weak: one run each. The noise is that between the robots and maps of this run, which "
-            "depend on each other; another seed may say otherwise. Compare six seeds or more"
-        )
-    elif n_worlds < intervals.FEW_RUNS:
-        worlds = f"{n_worlds} world{'s' * (n_worlds > 1)} (scenario and seed)"
-        notes.append(
-            f"weak: {n_runs} runs in {worlds}. The test takes the changes for normally "
-            f"distributed, which so few cannot show; compare {intervals.FEW_RUNS} seeds or more"
-        )
-    if table["timed"].any():
-        notes.append(
-            "times: all runs of a version share its machine and load, which no resampling of runs "
-            "can tell from a change of the program; they never count for --fail-if-worse"
-        )
-    return notes
 
 
 def _differing_settings(a: Runs, b: Runs) -> list[str]:
@@ -316,8 +312,25 @@ def _all_values(
     for table in READ:
         if not (a.has(table) and b.has(table)):
             continue
-        rows = _joined(a, b, table, apart_from)
-        methods = criteria.methods_in(rows, oracle=True) if "aligner" in rows else []
+        columns, optional, reduce = READ[table]
+        frames = []
+        for runs in (a, b):
+            parts = []
+            for batch in runs.batches(table, columns, optional):
+                of_run = [*RUN_KEYS, *setting_columns(batch)]
+                named = batch.drop(columns=of_run)
+                parts.append(reduce(named.assign(run_id=match_names(batch, apart_from))))
+            # A run of one robot has no rows, and its columns have no useful types.
+            parts = [part for part in parts if len(part)] or parts[:1]
+            frames.append(pd.concat(parts, ignore_index=True))
+        # Join the rows of both by run and keys; counts are the smaller ones of both.
+        keys = [name for name in _KEYS if name in frames[0]]
+        joined = frames[0].merge(frames[1], on=keys, suffixes=("_a", "_b"))
+        lesser = {
+            name: joined.filter(like=name).min(axis=1) for name in COUNTS if name in frames[0]
+        }
+        rows = joined.assign(**lesser)
+        methods = methods_in(rows, oracle=True) if "aligner" in rows else []
         for method in [*methods, ""]:
             own = rows[rows["aligner"] == method] if method else rows
             of = method if method in ("", ORACLE) else EACH_METHOD
@@ -328,34 +341,11 @@ def _all_values(
                         yield quantity, method, values
 
 
-def _joined(a: Runs, b: Runs, table: str, apart_from: Sequence[str]) -> pd.DataFrame:
-    """Join the rows of both by run and keys; values get suffixes _a and _b.
-
-    Counts are the smaller ones of both.
-    """
-    columns, optional, reduce = READ[table]
-    frames = []
-    for runs in (a, b):
-        parts = []
-        for rows in runs.batches(table, columns, optional):
-            named = rows.drop(columns=[*criteria.RUN_KEYS, *criteria.setting_columns(rows)])
-            parts.append(reduce(named.assign(run_id=match_names(rows, apart_from))))
-        # a run of one robot has no rows; its columns have no useful types
-        parts = [part for part in parts if len(part)] or parts[:1]
-        frames.append(pd.concat(parts, ignore_index=True))
-    keys = [name for name in _KEYS if name in frames[0]]
-    joined = frames[0].merge(frames[1], on=keys, suffixes=("_a", "_b"))
-    lesser = {
-        name: joined.filter(like=name).min(axis=1) for name in criteria.COUNTS if name in frames[0]
-    }
-    return joined.assign(**lesser)
-
-
 def _changes(quantity: Quantity, rows: pd.DataFrame) -> pd.DataFrame:
     """Return values and changes of rows with a finite change; success rates cover the others."""
     rows = rows.query(quantity.where) if quantity.where else rows
     a, b = (rows[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
-    if quantity.scale == "ln":  # too small covariances are as wrong as too large ones
+    if quantity.scale == "ln":  # distance from consistency, in either direction
         change = np.abs(intervals.log_ratio(b, np.ones(1))) - np.abs(
             intervals.log_ratio(a, np.ones(1))
         )

@@ -1,4 +1,4 @@
-"""Confidence intervals (Wilson, bootstrap), and the test whether one of two is better.
+"""Confidence intervals (Wilson, bootstrap), and a test of the difference of two methods.
 
 Rows of one run depend on each other, so an interval over rows is several times too narrow. The
 bootstrap resamples whole runs, and Wilson's interval uses the effective number of trials.
@@ -88,17 +88,16 @@ class WeightedMedian:
         if not len(self._values):
             return np.full(len(counts), np.nan)
         n_parts = max(1, min(len(counts), len(counts) * len(self._values) // _MAX_CELLS))
-        return np.concatenate([self._of(part) for part in np.array_split(counts, n_parts)])
-
-    def _of(self, counts: Float) -> Float:
-        cumulative = np.cumsum(counts[:, self._codes], axis=1)
-        half = cumulative[:, -1:] / 2
-        last = len(self._values) - 1
-        lower = self._values[np.minimum(np.sum(cumulative < half, axis=1), last)]
-        upper = self._values[np.minimum(np.sum(cumulative <= half, axis=1), last)]
-        finite = np.isfinite(lower) & np.isfinite(upper)
-        middle = lower + np.subtract(upper, lower, out=np.zeros(len(lower)), where=finite) / 2
-        return np.where(half[:, 0] > 0, middle, np.nan)
+        medians, last = [], len(self._values) - 1
+        for part in np.array_split(counts, n_parts):
+            cumulative = np.cumsum(part[:, self._codes], axis=1)
+            half = cumulative[:, -1:] / 2
+            lower = self._values[np.minimum(np.sum(cumulative < half, axis=1), last)]
+            upper = self._values[np.minimum(np.sum(cumulative <= half, axis=1), last)]
+            finite = np.isfinite(lower) & np.isfinite(upper)
+            difference = np.subtract(upper, lower, out=np.zeros(len(lower)), where=finite)
+            medians.append(np.where(half[:, 0] > 0, lower + difference / 2, np.nan))
+        return np.concatenate(medians)
 
 
 def percentile_interval(

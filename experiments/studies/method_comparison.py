@@ -7,7 +7,6 @@ repetitions share maps. So the trials of Wilson's interval are runs (`effective_
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import combinations, compress, pairwise
 from typing import Any
 
@@ -97,7 +96,7 @@ def success_rates(
         edges = [*(group[0] for group in groups), values.max() + 1]
     chosen = np.asarray(EDGES[by] if edges is None else edges, dtype=np.float64)
     if len(chosen) < 2 or np.any(np.diff(chosen) <= 0):
-        raise ValueError("edges: must be two or more that rise")
+        raise ValueError("edges: must be two or more in increasing order")
     place = np.searchsorted(chosen, values, side="right") - 1
     place[values == chosen[-1]] = len(chosen) - 2
     rows = []
@@ -156,17 +155,17 @@ def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
         row: dict[str, Any] = {"aligner": aligner, "n_runs": own["run_id"].nunique()}
         row |= {"n_maps": len(own), "unit": clusters.unit}
         for stage, column in STAGES.items():
-            ratio = partial(_ratio, median(aligner, column), below)
+            above = median(aligner, column)
+
+            def ratio(counts: Float, above: WeightedMedian = above) -> Float:
+                divisor = below(counts)
+                return above(counts) / np.where(divisor > 0, divisor, np.nan)
+
             interval = intervals.percentile_interval(ratio, clusters.n, rng)
             row |= {f"{stage}_share": own[f"{stage}_share"].mean()}
             row |= {f"{stage}_m": own[column].median()} | interval.columns(f"{stage}_ratio")
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _ratio(above: WeightedMedian, below: WeightedMedian, counts: Float) -> Float:
-    divisor = below(counts)
-    return above(counts) / np.where(divisor > 0, divisor, np.nan)
 
 
 def compare_methods(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
@@ -319,8 +318,8 @@ def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) ->
     """Rank aligners by rows of `maps_of` and of `aligner_timings`.
 
     The first criterion is the share of right results. Aligners equal to the first are ranked by the
-    estimated error on the same pairs of maps, and those that are still equal by time. See `better`
-    for the unit of the test; the ranking of a single run is a hint only.
+    estimated error on the same pairs of maps, and those that are still equal by time. The unit of
+    the tests is the run (see `intervals`); the ranking of a single run is a hint only.
 
     Args:
         maps: rows of `maps_of`.
@@ -329,7 +328,19 @@ def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) ->
     """
     ground = maps[has_common_ground(maps)]
     standings = _standings(maps, timings, [name for name in aligners if name != ORACLE])
-    ranked, equals = _ranked(standings, ground)
+    # Rank by success, then those equal to the first by error, then those still equal by time.
+    ranked = sorted(
+        standings, key=lambda s: (-_or_last(s.rate, 0.0), _or_last(s.estimated_m), s.time_ms)
+    )
+    equals: tuple[str, ...] = ()
+    if ranked and len(ground):
+        contenders = _equal_to_first(ranked, ground, "refined_success")
+        contenders.sort(key=lambda s: _or_last(s.estimated_m))
+        equal = _equal_to_first(contenders, ground, "translation_error_m")
+        equal.sort(key=lambda s: _or_last(s.time_ms))
+        rest = [s for s in contenders if s not in equal]
+        others = [s for s in ranked if s not in contenders]
+        ranked, equals = [*equal, *rest, *others], tuple(s.aligner for s in equal[1:])
     best = ranked[0] if ranked and ranked[0].rate > 0 else None
     oracle = answerable(maps[maps["aligner"] == ORACLE])
     return Recommendation(
@@ -347,6 +358,7 @@ def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) ->
 
 
 def _standings(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> list[Standing]:
+    """Return the results of each aligner, in the order of `aligners`."""
     is_ground = has_common_ground(maps)
     times = maps[["accepted", "false_accepted"]].mul(maps["n_repetitions"], axis=0)
     counted = times.set_axis(["n_accepted", "n_false"], axis=1).assign(n_maps=is_ground)
@@ -366,31 +378,13 @@ def _standings(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -
     return [Standing(aligner=name, shown=further.get(name, {}), **rows[name]) for name in aligners]
 
 
-def _ranked(
-    standings: list[Standing], ground: pd.DataFrame
-) -> tuple[list[Standing], tuple[str, ...]]:
-    """Return all standings, the best first, and the names of those equal to the best."""
-    by_rate = sorted(
-        standings, key=lambda s: (-_or_last(s.rate, 0.0), _or_last(s.estimated_m), s.time_ms)
-    )
-    if not by_rate or ground.empty:
-        return by_rate, ()
-    contenders = _equal_to_first(by_rate, ground, "refined_success")
-    contenders.sort(key=lambda s: _or_last(s.estimated_m))
-    equal = _equal_to_first(contenders, ground, "translation_error_m")
-    equal.sort(key=lambda s: _or_last(s.time_ms))
-    rest = [s for s in contenders if s not in equal]
-    others = [s for s in by_rate if s not in contenders]
-    return [*equal, *rest, *others], tuple(s.aligner for s in equal[1:])
-
-
 def _or_last(value: float, missing: float = math.inf) -> float:
     """Return a sorting key that is `missing` for NaN."""
     return missing if math.isnan(value) else value
 
 
 def _equal_to_first(standings: list[Standing], maps: pd.DataFrame, column: str) -> list[Standing]:
-    """Return the first and those that neither test nor tolerance tells from it in a column."""
+    """Return the first aligner and those equal to the first in a column, by test and tolerance."""
     values, is_share = paired_values(maps, column), column == "refined_success"
     p_values, near = [], []
     for standing in standings[1:]:

@@ -1,10 +1,10 @@
-"""Tables of many runs as one: result folders of `run` and of `sweep`.
+"""Tables of many runs, read from result folders of `run` and folders of `sweep`.
 
 Files are read in batches and only in the requested columns. If each batch is reduced before the
 next one is read, memory does not grow with the number of runs.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -34,7 +34,7 @@ class RunPath(NamedTuple):
         path: folder or file.
         run: columns that describe the run, for files that lack them.
         finished: ids of the finished runs of a sweep; rows of other runs are incomplete and left
-            out. None if the sweep does not tell.
+            out. None if the sweep does not list its runs.
     """
 
     path: Path
@@ -54,10 +54,10 @@ class Runs:
         paths = [RunPath(tables.table_path(path, table), run) for path, run, _ in self.results]
         found = [file for file in paths if file.path.is_file()]
         for sweep in self.sweeps:
-            told = self._told[self._told["sweep"] == str(sweep)]
+            run_rows = self._run_rows[self._run_rows["sweep"] == str(sweep)]
             finished = None  # an earlier version did not write `runs`
-            if len(told):
-                finished = frozenset(told.loc[told["status"] == "finished", "run_id"])
+            if len(run_rows):
+                finished = frozenset(run_rows.loc[run_rows["status"] == "finished", "run_id"])
             if finished is None or finished:
                 found += [RunPath(path, {}, finished) for path in _whole_files(sweep / table)]
         return found
@@ -121,7 +121,7 @@ class Runs:
         return pd.concat(parts).drop_duplicates("run_id") if parts else none
 
     @cached_property
-    def _told(self) -> pd.DataFrame:
+    def _run_rows(self) -> pd.DataFrame:
         """Tables `runs` of all sweeps, with the sweep's folder."""
         parts = [
             rows.assign(sweep=str(sweep))
@@ -135,8 +135,8 @@ class Runs:
     @property
     def failed(self) -> pd.DataFrame:
         """Failed runs of sweeps: run_id, scenario, seed, reason."""
-        is_failed = self._told["status"] == "failed"
-        return self._told.loc[is_failed, [*RUN_KEYS, "reason"]].reset_index(drop=True)
+        is_failed = self._run_rows["status"] == "failed"
+        return self._run_rows.loc[is_failed, [*RUN_KEYS, "reason"]].reset_index(drop=True)
 
 
 def find_runs(paths: Path | Sequence[Path]) -> Runs:
@@ -183,7 +183,16 @@ def _read(
     """Yield rows of whole runs, one row group at a time."""
 
     def wanted(found: pa.Schema) -> Sequence[str]:
-        _require_readable(file.path, table, text_attributes(file.path, found.empty_table()))
+        attributes = text_attributes(file.path, found.empty_table())
+        kind = attributes.get("kind", table)
+        if kind.rpartition(".")[2] != table:
+            raise InputError(f"{file.path}: kind is {kind}, expected {table}")
+        if kind == f"result.{table}":  # tables of sweeps have their own version
+            known = int(tables.ALL[table].metadata[_VERSION])
+            version = attributes.get("schema_version", "0")
+            if not version.isdecimal() or int(version) > known:
+                reads = f"this program reads up to {known}"
+                raise InputError(f"{file.path}: schema_version is {version}, {reads}")
         of_run = () if file.run else RUN_KEYS
         missing = [name for name in (*of_run, *(columns or ())) if name not in found.names]
         if missing:
@@ -203,16 +212,3 @@ def _read(
             is_finished = rows["run_id"].isin(file.finished)
             rows = rows if is_finished.all() else rows[is_finished]
         yield rows.assign(**{name: float("nan") for name in optional if name not in rows})
-
-
-def _require_readable(path: Path, table: str, attributes: Mapping[str, str]) -> None:
-    """Raise InputError for another table, or one of a newer version."""
-    kind = attributes.get("kind", table)
-    if kind.rpartition(".")[2] != table:
-        raise InputError(f"{path}: kind is {kind}, expected {table}")
-    if kind != f"result.{table}":  # a sweep has its own version
-        return
-    known = int(tables.ALL[table].metadata[_VERSION])
-    version = attributes.get("schema_version", "0")
-    if not version.isdecimal() or int(version) > known:
-        raise InputError(f"{path}: schema_version is {version}, this program reads up to {known}")

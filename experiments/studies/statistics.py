@@ -263,7 +263,12 @@ def summarise(runs: Runs) -> Summary:
     made = {name: _each(maps, partial(success_rates, by=by)) for by, name in _FILE_NAMES.items()}
     made["error_over_oracle"] = _each(maps, oracle_ratios, "oracle")
     made["methods_compared"] = _each(maps, compare_methods, "paired")
-    made["errors_by_iteration"] = _each(medians, _error_bands)
+
+    def bands(rows: pd.DataFrame) -> pd.DataFrame:
+        is_pooled = (rows["scenario"] == ALL_SCENARIOS).all()
+        return error_bands(with_common_ground_at_any_time(rows) if is_pooled else rows)
+
+    made["errors_by_iteration"] = _each(medians, bands)
     timings = pd.DataFrame()
     missing = tuple(table for table in _FURTHER if not runs.has(table))
     for table, (columns, name, made_of, seed) in _FURTHER.items():
@@ -324,11 +329,6 @@ def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
     # an empty map has nothing in common with another
     share = (maps["n_common"] / smaller.where(smaller > 0)).where(smaller != 0, 0.0)
     return maps.assign(overlap_share=share)
-
-
-def _error_bands(rows: pd.DataFrame) -> pd.DataFrame:
-    is_pooled = (rows["scenario"] == ALL_SCENARIOS).all()
-    return error_bands(with_common_ground_at_any_time(rows) if is_pooled else rows)
 
 
 def _each(

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence, Sized
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import pandas as pd
 import pyarrow as pa
@@ -19,17 +19,163 @@ from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.result import measure_aligners
+from experiments.evaluation.result import all_tables, measure_aligners, renderer
 from experiments.pipeline import cluster
 from experiments.pipeline.cluster import connected
-from experiments.pipeline.store import mending
-from experiments.pipeline.tasks import OnProgress, Task
+from experiments.pipeline.memory import require_memory
+from experiments.pipeline.store import Store, mending
+from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded
-from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_plan import PlannedRun, Sweep, planned
-from experiments.studies.sweep_tables import ALIGNER_TIMINGS, JoinedTables, written_by_nobody_else
+from experiments.scenario.suite import scenarios_of
+from experiments.studies.sweep_combinations import SweepRun, parse_axes, runs_of
+from experiments.studies.sweep_tables import (
+    ALIGNER_TIMINGS,
+    RUN_TIMES,
+    JoinedTables,
+    SweepDataset,
+    locked_folder,
+)
 from mapfusion.errors import InputError
 from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whole
+
+_LONGEST_NAME = 80
+_TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
+_TABLES += ("smoother", "team", "team_pairs", "fusers")
+
+
+class Sweep(NamedTuple):
+    """Runs of a sweep, the store that it shares with `mapfusion run`, and its tables."""
+
+    runs: list[SweepRun]
+    store: Store
+    dataset: SweepDataset
+
+
+def prepare(
+    asked: Sequence[str | Path],
+    seeds: Sequence[int],
+    settings: Sequence[str],
+    results: Path,
+    output: Path | None = None,
+) -> Sweep:
+    """Check what the user asked for, `settings` as in `--set`; nothing is written.
+
+    Without `output`, the sweep's folder is named after the scenario files, names and tags.
+
+    Raises:
+        InputError: a scenario, key or value is wrong.
+    """
+    axes = parse_axes(settings)
+    runs = runs_of(scenarios_of(asked), seeds, axes)
+    name = "-".join(Path(part).stem for part in asked)[:_LONGEST_NAME]
+    folder = output or results / "sweeps" / name
+    # absolute: workers may have been started elsewhere
+    return Sweep(runs, Store.of(results.resolve()), SweepDataset(folder.resolve(), tuple(axes)))
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedRun:
+    """A run and its tasks.
+
+    Attributes:
+        run: scenario, seed and values.
+        stages: STAGE/KEY of all stages that the run is made from.
+        tasks: all tasks by name; the last one, `run/RUN_ID`, returns the run's rows.
+        left: tasks to be done, each after those it needs; none if the tables hold the run.
+    """
+
+    run: SweepRun
+    stages: list[str]
+    tasks: dict[str, Task]
+    left: list[Task]
+
+    @property
+    def last(self) -> str:
+        """Name of the last task."""
+        return f"run/{self.run.run_id}"
+
+
+def plan_run(
+    run: SweepRun, store: Store, tables: JoinedTables, jobs: int | None = None
+) -> PlannedRun:
+    """Plan a run; nothing is computed.
+
+    Args:
+        run: scenario, seed and values.
+        store: finished stages.
+        tables: finished runs.
+        jobs: number of processes that share this machine's memory; None for a cluster.
+
+    Raises:
+        InputError: the run is impossible.
+    """
+    judged = EvaluatedRun.of(run.load(), store)
+    if jobs is not None:
+        require_memory(judged.pipeline, jobs)
+    pipeline, stages = judged.pipeline, [f"{each.name}/{each.key}" for each in judged.stages()]
+    read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam, robot.smooth)]
+    read += [*(pair.estimates for pair in pipeline.pairs), *judged.evaluations]
+    read += pipeline.fusers.values()
+    needs = tuple(name for stage in read for name in task_names(stage))
+    name, arguments = f"run/{run.run_id}", (run, judged, stages, tables.dataset)
+    last = Task(name, "write the tables", rows_of, arguments, (), needs)
+    tasks = judged.tasks | {name: last}
+    left = [] if tables.holds(run, stages) else unfinished(tasks, [name])
+    return PlannedRun(run, stages, tasks, left)
+
+
+def rows_of(
+    run: SweepRun, judged: EvaluatedRun, stages: Sequence[str], dataset: SweepDataset
+) -> dict[str, pa.Table]:
+    """Return a run's rows of all tables (work of the last task)."""
+    made = all_tables(judged, judged.team, _TABLES)
+    times = [
+        {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
+        for folder in judged.folders()
+        for name, seconds in folder.figures().items()
+    ]
+    return dataset.finished(run, renderer(judged.scenario), stages, {**made, RUN_TIMES: times})
+
+
+@dataclass
+class Survey:
+    """Counts of runs, and of tasks by label.
+
+    Attributes:
+        runs: number of all runs.
+        runs_finished: number of runs that the tables hold.
+        runs_refused: number of runs that are impossible.
+        wanted: tasks summed over all runs, without sharing.
+        finished: different tasks that are done.
+        left: different tasks to be done.
+    """
+
+    runs: int
+    runs_finished: int = 0
+    runs_refused: int = 0
+    wanted: Counter[str] = field(default_factory=Counter)
+    finished: Counter[str] = field(default_factory=Counter)
+    left: Counter[str] = field(default_factory=Counter)
+
+
+def survey(sweep: Sweep) -> Survey:
+    """Count runs and tasks, and how many of them are done; nothing is computed."""
+    found, tables = Survey(len(sweep.runs)), JoinedTables(sweep.dataset)
+    known: set[str] = set()
+    for run in sweep.runs:
+        try:
+            plan = plan_run(run, sweep.store, tables)
+        except InputError:
+            found.runs_refused += 1
+            continue
+        found.runs_finished += not plan.left
+        left = {task.name for task in plan.left}
+        found.wanted.update(task.label for task in plan.tasks.values())
+        for name in plan.tasks.keys() - known:
+            (found.left if name in left else found.finished)[plan.tasks[name].label] += 1
+        known.update(plan.tasks)
+    return found
+
 
 # Tasks that Dask holds for each worker. Enough that no worker waits while this process plans the
 # next run; few enough that memory does not grow with the number of runs.
@@ -40,8 +186,8 @@ _COUNT_WORKERS_EVERY_S = 10.0
 # worker was killed four times is at fault.
 RETRIES = 3
 _ATTEMPTS = "attempts"
-# Rows are written, and can be read, after a minute; or later, because to replace files shall not
-# take more than a twentieth of the time. Rows of this size are always written: memory is bounded.
+# Rows are written every minute, or less often so that writing takes at most a twentieth of the
+# time. Rows of more bytes than the last constant are always written, which bounds the memory.
 _WRITE_EVERY_S, _TIMES_AS_LONG, _MOST_WAITING_BYTES = 60.0, 20.0, 50_000_000
 _OLD_S = 24 * 3600  # a folder of attempts that has not changed for so long is not in use
 
@@ -71,7 +217,7 @@ OnSweepProgress = Callable[[SweepProgress], None]
 
 
 class SweepDriver:
-    """Driver of all runs that are not finished; a run that fails does not stop the others."""
+    """Driver of all runs that are not finished; a failed run does not stop the others."""
 
     def __init__(
         self,
@@ -100,7 +246,7 @@ class SweepDriver:
         self.progress = SweepProgress(len(sweep.runs))
 
     def execute(self) -> None:
-        """Finish all runs; `progress` says how they ended.
+        """Finish all runs; `progress` has the outcomes.
 
         Raises:
             InputError: workers cannot take part, or the scheduler was lost.
@@ -108,7 +254,11 @@ class SweepDriver:
         todo = iter(self._sweep.runs)
         try:
             while True:
-                while self._has_room() and (run := next(todo, None)) is not None:
+                if time.monotonic() - self._counted_at > _COUNT_WORKERS_EVERY_S:
+                    self._n_workers = len(cast(Sized, self._client.nthreads()))
+                    self._counted_at = time.monotonic()
+                limit = TASKS_PER_WORKER * max(self._n_workers, MIN_WORKERS)
+                while len(self._futures) < limit and (run := next(todo, None)) is not None:
                     self._begin(run)
                 self._on_progress(self.progress)
                 if not self._open:
@@ -117,51 +267,44 @@ class SweepDriver:
         finally:  # also after Ctrl-C
             self._tables.write()
 
-    def _has_room(self) -> bool:
-        if time.monotonic() - self._counted_at > _COUNT_WORKERS_EVERY_S:
-            self._n_workers = len(cast(Sized, self._client.nthreads()))
-            self._counted_at = time.monotonic()
-        return len(self._futures) < TASKS_PER_WORKER * max(self._n_workers, MIN_WORKERS)
-
     def _begin(self, run: SweepRun) -> None:
+        """Plan a run and submit its tasks, except those that others have submitted."""
         try:
-            laid_out = planned(run, self._sweep.store, self._tables, self._jobs)
+            plan = plan_run(run, self._sweep.store, self._tables, self._jobs)
         except InputError as error:  # no world can be made from this seed, a log is damaged, ...
             self._failed(run, " ".join(str(error).split()))
             self._run_ended(run)
             return
-        self._open[laid_out] = set()
+        self._open[plan] = set()
         blocked: set[str] = set()
-        for task in laid_out.left:
+        for task in plan.left:
             if task.name in self._failures or blocked.intersection(task.needs):
                 blocked.add(task.name)
                 continue
-            if task.name not in self._futures:  # else another run has submitted it
-                self._submit(task)
-            self._open[laid_out].add(task.name)
-        self._end_if_over(laid_out)
-
-    def _submit(self, task: Task) -> None:
-        self.progress.tasks[task.label] += 1
-        future = self._client.submit(
-            cluster.perform,
-            task.name,
-            pickle.dumps(task),
-            self._terms,
-            *(self._futures[need] for need in task.needs if need in self._futures),
-            # new at each attempt: Dask does not repeat a task that failed under the same key
-            key=f"{task.label}-{self._suffix}{self.progress.tasks.total()}-{task.name}",
-            pure=False,
-            # earlier tasks first: a run is finished before others begin
-            priority=-self.progress.tasks.total(),
-        )
-        self._futures[task.name] = future
-        self._ended.add(future)
+            if task.name not in self._futures:  # else another run has submitted the task
+                self.progress.tasks[task.label] += 1
+                number = self.progress.tasks.total()
+                future = self._client.submit(
+                    cluster.perform,
+                    task.name,
+                    pickle.dumps(task),
+                    self._terms,
+                    *(self._futures[need] for need in task.needs if need in self._futures),
+                    # A new key at each attempt: Dask does not repeat a failed task of the same key.
+                    key=f"{task.label}-{self._suffix}{number}-{task.name}",
+                    pure=False,
+                    priority=-number,  # earlier tasks first: a run is finished before others begin
+                )
+                self._futures[task.name] = future
+                self._ended.add(future)
+            self._open[plan].add(task.name)
+        self._end_if_over(plan)
 
     def _task_ended(self, future: Future) -> None:
+        """Take the result or the failure of a task, and end the runs that waited for the task."""
         label, name = _label_and_name(future.key)
         waiting = [each for each, waits_for in self._open.items() if name in waits_for]
-        own = [laid_out.run for laid_out in waiting if laid_out.last == name]
+        own = [plan.run for plan in waiting if plan.last == name]
         rows: Any = None
         if own and future.status == "finished":
             try:
@@ -180,9 +323,9 @@ class SweepDriver:
             self._details(own[0]).unlink(missing_ok=True)
         del self._futures[name]
         self.progress.tasks_done[label] += 1
-        for laid_out in waiting:
-            self._open[laid_out].remove(name)
-            self._end_if_over(laid_out)
+        for plan in waiting:
+            self._open[plan].remove(name)
+            self._end_if_over(plan)
 
     def _failure(self, future: Future, name: str) -> cluster.TaskFailedError:
         """Return the failure of a task or of the task that it needed.
@@ -205,19 +348,20 @@ class SweepDriver:
             raise InputError(str(error))
         raise InputError(f"a worker cannot run {name}: {type(error).__name__}: {error}")
 
-    def _end_if_over(self, laid_out: PlannedRun) -> None:
-        if self._open[laid_out]:
+    def _end_if_over(self, plan: PlannedRun) -> None:
+        """End a run without open tasks, or plan the run again if a stage was damaged."""
+        if self._open[plan]:
             return
-        del self._open[laid_out]
-        if laid_out in self._again:
-            self._again.remove(laid_out)
-            self._begin(laid_out.run)
+        del self._open[plan]
+        if plan in self._again:
+            self._again.remove(plan)
+            self._begin(plan.run)
             return
-        # All tasks that could be done were done, so which comes first does not depend on chance.
-        failures = (self._failures.get(task.name) for task in laid_out.left)
+        # All possible tasks were done, so the first failure does not depend on timing.
+        failures = (self._failures.get(task.name) for task in plan.left)
         if first := next(filter(None, failures), None):
-            self._failed(laid_out.run, first.reason, first.details, laid_out.stages)
-        self._run_ended(laid_out.run)
+            self._failed(plan.run, first.reason, first.details, plan.stages)
+        self._run_ended(plan.run)
 
     def _failed(
         self, run: SweepRun, reason: str, traceback: str = "", stages: Sequence[str] = ()
@@ -236,6 +380,7 @@ class SweepDriver:
         return self._sweep.dataset.folder / "failures" / f"{run.run_id}.txt"
 
     def _run_ended(self, run: SweepRun) -> None:
+        """Count a run, and write the tables if that is due."""
         self.progress.done += 1
         number, began = self._tables.number(run), time.monotonic()
         self._left_in[number] -= 1
@@ -247,7 +392,7 @@ class SweepDriver:
 
 
 def _label_and_name(key: object) -> tuple[str, str]:
-    """Return label and name of the task that Dask knows under this key."""
+    """Return label and name of the task of this key at Dask."""
     label, _, name = str(key).split("-", 2)
     return label, name
 
@@ -265,7 +410,7 @@ def execute(
             scheduler answers, or no worker can take part.
     """
     folder = sweep.dataset.folder
-    with written_by_nobody_else(folder):
+    with locked_folder(folder):
         tables = JoinedTables(sweep.dataset)
         tables.ask_for(sweep.runs)
         for abandoned in folder.glob(f".{_ATTEMPTS}.*"):  # by a sweep that was killed
@@ -291,7 +436,7 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     single_threaded()
     label, done = "time the aligners", 0
     runs = [run for run in sweep.runs if run.run_id not in failed]
-    with written_by_nobody_else(sweep.dataset.folder):
+    with locked_folder(sweep.dataset.folder):
         tables = JoinedTables(sweep.dataset)
         tables.ask_for(runs)
         for number, group in itertools.groupby(sorted(runs, key=tables.number), tables.number):

@@ -80,9 +80,13 @@ class SweepDataset:
     def rows(self, table: str, run: SweepRun, rows: Rows) -> pa.Table:
         """Return a run's rows of one table, with the columns that describe the run in front."""
         own = _OWN_FIELDS[table] if table in _OWN_FIELDS else list(tables.ALL[table])
-        told: dict[str, Any] = {"run_id": run.run_id, "scenario": run.scenario, "seed": run.seed}
-        told |= dict(run.settings)
-        leading = fields(**dict.fromkeys(told, TEXT) | {"seed": pa.int64()})
+        described: dict[str, Any] = {
+            "run_id": run.run_id,
+            "scenario": run.scenario,
+            "seed": run.seed,
+        }
+        described |= dict(run.settings)
+        leading = fields(**dict.fromkeys(described, TEXT) | {"seed": pa.int64()})
         own_schema = schema(
             f"sweep.{table}", SCHEMA_VERSION, [field.remove_metadata() for field in leading + own]
         )
@@ -90,7 +94,7 @@ class SweepDataset:
             return own_schema.empty_table()
         names = pd.Index([field.name for field in own])
         frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(rows, columns=names)
-        columns = [pa.repeat(pa.scalar(told[f.name], f.type), len(frame)) for f in leading]
+        columns = [pa.repeat(pa.scalar(described[f.name], f.type), len(frame)) for f in leading]
         columns += [pa.array(frame[field.name].to_numpy(), field.type) for field in own]
         return pa.Table.from_arrays(columns, schema=own_schema)
 
@@ -98,16 +102,16 @@ class SweepDataset:
         self, run: SweepRun, renderer: str, stages: Sequence[str], made: Mapping[str, Rows]
     ) -> dict[str, pa.Table]:
         """Return the rows of a finished run, by table."""
-        row = {"status": "finished", "reason": "", "renderer": renderer} | made_by(stages)
+        row = {"status": "finished", "reason": "", "renderer": renderer} | origin_columns(stages)
         return {name: self.rows(name, run, rows) for name, rows in {**made, RUNS: [row]}.items()}
 
     def failed(self, run: SweepRun, reason: str, stages: Sequence[str]) -> dict[str, pa.Table]:
         """Return the one row of a failed run, by table."""
-        row = {"status": "failed", "reason": reason, "renderer": ""} | made_by(stages)
+        row = {"status": "failed", "reason": reason, "renderer": ""} | origin_columns(stages)
         return {RUNS: self.rows(RUNS, run, [row])}
 
 
-def made_by(stages: Sequence[str]) -> dict[str, str]:
+def origin_columns(stages: Sequence[str]) -> dict[str, str]:
     """Return the columns of `runs` that identify the stages, libraries and source of a run."""
     return {
         "stages": json.dumps(list(stages)),
@@ -181,8 +185,12 @@ class JoinedTables:
             if run_id not in self._place:
                 self._place[run_id] = len(self.run_ids)
                 self.run_ids.append(run_id)
-        told = {"schema_version": SCHEMA_VERSION, "kind": "sweep", "settings": self.dataset.keys}
-        write_json(self._path, told | {"runs": self.run_ids})
+        description = {
+            "schema_version": SCHEMA_VERSION,
+            "kind": "sweep",
+            "settings": self.dataset.keys,
+        }
+        write_json(self._path, description | {"runs": self.run_ids})
 
     def number(self, run: SweepRun) -> int:
         """Return the number of the files that hold a run's rows."""
@@ -195,7 +203,7 @@ class JoinedTables:
         """
         if run.run_id not in self._place:
             return False
-        wanted = {"status": "finished"} | made_by(stages)
+        wanted = {"status": "finished"} | origin_columns(stages)
         found = self._runs_made(self.number(run)).get(run.run_id)
         return found == hash(tuple(wanted[name] for name in _MADE_FROM))
 
@@ -209,8 +217,8 @@ class JoinedTables:
                         if path.parent.name == RUNS:
                             self._made_from[number] |= _hashes(group)
             except DamagedFileError as error:
-                told = f"{error}; the runs in it are made again, when a sweep asks for them"
-                warnings.warn(told, StoreRepairWarning, stacklevel=2)
+                message = f"{error}; the runs in it are made again, when a sweep asks for them"
+                warnings.warn(message, StoreRepairWarning, stacklevel=2)
                 self._damaged.add(number)
                 self._made_from[number] = {}
         return self._made_from[number]
@@ -289,7 +297,7 @@ def _hashes(runs: pa.Table) -> dict[str, int]:
 
 
 @contextmanager
-def written_by_nobody_else(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path) -> Iterator[None]:
     """Lock a folder during a `with` block; the lock also ends with the process.
 
     Raises:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from experiments.cli.main import app
 from experiments.evaluation import tables
-from experiments.reports.report.contents import contents_of
+from experiments.reports.report.document import contents_of
 from experiments.reports.result_export import export_result
 from experiments.studies.comparison import compare
 from experiments.studies.run_tables import find_runs

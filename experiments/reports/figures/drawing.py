@@ -1,21 +1,19 @@
-"""All figures of a result, each from stored tables and key frames alone.
+"""Figures of a result, drawn from its stored tables and key frames.
 
-`figures/drawn.json` records a digest of what each figure was drawn from, and of its pictures. A run
-keeps a figure whose digests are still the same. Matplotlib is imported only to draw.
+`figures/drawn.json` records a digest of the inputs and of the pictures of each figure. A run keeps
+a figure whose digests have not changed. Matplotlib is imported only to draw.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import io
-import re
+import pkgutil
 import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
-from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from experiments.evaluation.tables import table_path
@@ -28,21 +26,114 @@ if TYPE_CHECKING:
 
     from experiments.reports.figures.result_tables import ResultTables
 
-# Each is a module `figNN_NAME` with a function `draw`; its docstring is the caption, and `READS`
-# names what it takes of a result: tables, and `scenario`.
-_MODULES = iter_modules([str(Path(__file__).parent)])
-FIGURES = tuple(sorted(each.name for each in _MODULES if re.match(r"fig\d\d_", each.name)))
+
+class _Figure(NamedTuple):
+    """Entry of the registry of figures.
+
+    Attributes:
+        module: module of this package with the function.
+        function: draws the figure from `ResultTables`.
+        caption: caption in reports.
+        reads: names of the tables that the function reads, and `scenario` if it reads this.
+    """
+
+    module: str
+    function: str
+    caption: str
+    reads: tuple[str, ...]
+
+
+_ANSWERS = ("errors", "estimates")
+_MERGE = ("fused", "fused_motions", "landmarks", "robots")
+_REGISTRY = {
+    "fig01_tracks": _Figure(
+        "slam_figures",
+        "draw_tracks",
+        "Figure 1: Harris points, described by U-SURF, tracked over consecutive key frames.",
+        ("robots", "tracks"),
+    ),
+    "fig02_two_maps": _Figure(
+        "map_figures",
+        "draw_two_maps",
+        "Figure 2: the local maps of two robots before alignment, each in its own frame.",
+        ("clouds", "landmarks", "paths", "robots", "scenario", "smoothed_paths"),
+    ),
+    "fig03_dispersion": _Figure(
+        "slam_figures",
+        "draw_dispersion",
+        "Figure 3: dispersion of the particles along the paths, and its fall at known ground.",
+        ("clouds", "paths", "robots"),
+    ),
+    "fig04_translation_error": _Figure(
+        "error_figures",
+        "draw_translation_error",
+        "Figure 4: error of the alignments' translation against the iteration.",
+        _ANSWERS,
+    ),
+    "fig05_rotation_error": _Figure(
+        "error_figures",
+        "draw_rotation_error",
+        "Figure 5: signed error of the alignments' rotation against the iteration.",
+        _ANSWERS,
+    ),
+    "fig06_aligner_time": _Figure(
+        "error_figures",
+        "draw_aligner_time",
+        "Figure 6: time of the aligners against the number of overlapping points.",
+        ("aligner_timings", *_ANSWERS),
+    ),
+    "fig07_correspondences": _Figure(
+        "map_figures",
+        "draw_correspondences",
+        "Figure 7: two maps in their own frames, in space, and the correspondences between them.",
+        ("correspondences", *_ANSWERS, "landmarks", "robots", "true_pairs"),
+    ),
+    "fig08_fused_landmark": _Figure(
+        "map_figures",
+        "draw_fused_landmark",
+        "Figure 8: one landmark in the maps of two robots and in the fused map.",
+        _MERGE,
+    ),
+    "fig09_aligned_maps": _Figure(
+        "map_figures",
+        "draw_aligned_maps",
+        "Figure 9: corresponding landmarks of two aligned maps, and the fused landmarks.",
+        _MERGE,
+    ),
+    "fig10_fused_map": _Figure(
+        "map_figures",
+        "draw_fused_map",
+        "Figure 10: the fused map in plan.",
+        ("fused", "fused_map", "fused_motions", "robots"),
+    ),
+    "fig11_fusers": _Figure(
+        "error_figures",
+        "draw_fusers",
+        "Figure 11: error of the fused map against the iteration, for each fuser.",
+        ("fusers",),
+    ),
+    "fig12_coverage": _Figure(
+        "error_figures",
+        "draw_coverage",
+        "Figure 12: true points inside the error ellipses against the ellipses' probability.",
+        ("fuser_coverage",),
+    ),
+}
+FIGURES = tuple(_REGISTRY)
 _RECORD = "drawn.json"
-# An SVG's are of the parts that are drawn as pixels, which make up most of the file.
+# The resolution of an SVG is of the parts drawn as pixels, which make up most of the file.
 _DPI = {"png": 200, "svg": 150}
-# No date: the same tables give the same bytes. PNG are packed faster than by default, and larger.
+# No date: the same tables give the same bytes. PNG files are compressed faster, and less.
 _SAVED = {"png": {"pil_kwargs": {"compress_level": 2}}, "svg": {"metadata": {"Date": None}}}
 
 
 class Drawn(NamedTuple):
-    """The pictures written, and one line each which figures there is no data for, and why.
+    """Outcome of drawing figures.
 
-    `elapsed_s` has the seconds that each figure took when it was drawn.
+    Attributes:
+        files: pictures written.
+        skipped: one line for each figure without data, with the reason.
+        elapsed_s: time of each figure when it was last drawn, in seconds.
     """
 
     files: list[Path]
@@ -51,48 +142,41 @@ class Drawn(NamedTuple):
 
 
 class _Record:
-    """The digests of one result's figures: what each was drawn from, and its pictures.
+    """Digests of the inputs and of the pictures of the figures of one result.
 
-    It is made once the key frames and `world.json` are written. All figures count as drawn from
-    these.
+    Create the record after the key frames and `world.json` are written: they are inputs of all
+    figures.
     """
 
     def __init__(self, result: Path) -> None:
         self._result = result
         self._file = result / "figures" / _RECORD
-        self._now: dict[str, dict[str, Any]] = {}  # entries of figures as they are to be drawn
+        self._now: dict[str, dict[str, Any]] = {}  # new entries
 
     @cached_property
     def _known(self) -> dict[str, Any]:
-        """The record of the last drawing; empty if there is none that can be read."""
+        """The record of the last drawing; empty if there is no readable one."""
         try:
             return dict(read_json(self._file, "record of drawn figures")["figures"])
         except (OSError, KeyError, TypeError, ValueError):
             return {}
 
-    def _last(self, name: str) -> dict[str, Any]:
-        """Return a figure's entry in that record, if it is of the same source and libraries."""
-        known = self._known.get(name)
-        return known if isinstance(known, dict) and known.get("code") == _code(name) else {}
-
-    def reads(self, name: str) -> list[str]:
-        """Return what a figure takes of a result; as its module says, if that has changed."""
-        reads = self._last(name).get("reads")
-        return reads if isinstance(reads, list) else list(_module(name).READS)
-
     @cached_property
-    def _pictured(self) -> str:
+    def _common_inputs(self) -> str:
+        """Digest of the inputs of all figures."""
         frames = sorted((self._result / "keyframes").glob("*.png"))
         return _digest([self._result / "world.json", *frames])
 
     def unchanged(self, name: str) -> Drawn | None:
-        """Return the last drawing of a figure if its inputs and pictures are still the same."""
-        reads = self.reads(name)
+        """Return the last drawing of a figure if its inputs and pictures have not changed."""
+        reads = _REGISTRY[name].reads
         tables = [table_path(self._result, each) for each in reads if each != "scenario"]
-        described = [self._result / "scenario.json"] if "scenario" in reads else []
-        inputs = _digest([*tables, *described]) + self._pictured
-        self._now[name] = {"code": _code(name), "reads": reads, "inputs": inputs}
-        known, pictures = self._last(name), _pictures(self._result, name)
+        scenario = [self._result / "scenario.json"] if "scenario" in reads else []
+        inputs = _digest([*tables, *scenario]) + self._common_inputs
+        self._now[name] = {"code": _code(name), "inputs": inputs}
+        known, pictures = self._known.get(name), _pictures(self._result, name)
+        if not isinstance(known, dict) or known.get("code") != _code(name):
+            return None
         if known.get("inputs") != inputs or known.get("pictures") != _digest(pictures):
             return None
         skipped, elapsed_s = known.get("skipped"), known.get("elapsed_s")
@@ -102,7 +186,7 @@ class _Record:
         return Drawn(shown, [skipped] if skipped else [], {name: elapsed_s})
 
     def write(self, outcomes: Mapping[str, Drawn]) -> None:
-        """Record the figures as they are now."""
+        """Record the present state of the figures."""
         figures = {
             name: self._now[name]
             | {
@@ -116,7 +200,7 @@ class _Record:
 
 
 def _digest(files: Iterable[Path]) -> str:
-    """Return the SHA-256 of files' names and contents; a file that is missing counts, too."""
+    """Return the SHA-256 digest of names and contents of files; missing files are included."""
     digest = hashlib.sha256()
     for file in files:
         content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "missing"
@@ -125,8 +209,8 @@ def _digest(files: Iterable[Path]) -> str:
 
 
 def _code(name: str) -> str:
-    """Return the digest of a figure's source and of the versions of the libraries behind it."""
-    sources = source_hash(imported_sources(_module_name(name), __name__))
+    """Return the digest of the source of a figure and of the versions of its libraries."""
+    sources = source_hash(imported_sources(f"{__package__}.{_REGISTRY[name].module}", __name__))
     return hashlib.sha256("\n".join([sources, *_versions()]).encode()).hexdigest()
 
 
@@ -141,11 +225,11 @@ def _pictures(result: Path, name: str) -> list[Path]:
 
 
 class Drawing:
-    """The figures of one result, each drawn by a pool as soon as all that it reads is written.
+    """Drawing of the figures of one result, each as soon as its inputs are written.
 
     Args:
-        pool: draws them.
-        again: draw those too whose inputs have not changed since they were drawn.
+        pool: workers that draw the figures.
+        again: also draw figures whose inputs have not changed.
     """
 
     def __init__(self, pool: Workers, again: bool = False) -> None:
@@ -156,11 +240,11 @@ class Drawing:
         self._record: _Record | None = None
 
     def written(self, result: Path, part: str) -> None:
-        """A part of a result is there: a table, or `scenario`."""
+        """Start the figures whose inputs are complete now that a table or `scenario` is written."""
         self._written.add(part)
         self._record = self._record or _Record(result)
         for name in FIGURES:
-            if name not in self._begun and self._written.issuperset(self._record.reads(name)):
+            if name not in self._begun and self._written.issuperset(_REGISTRY[name].reads):
                 self._begin(name, self._record, result)
 
     def _begin(self, name: str, record: _Record, result: Path) -> None:
@@ -171,14 +255,18 @@ class Drawing:
             return
         from experiments.reports.figures.result_tables import ResultTables
 
-        data = ResultTables(result, written=record.reads(name))
+        data = ResultTables(result, written=_REGISTRY[name].reads)
         self._pool.submit(name, draw_figure, data, name)
 
     def finish(self, result: Path, on_progress: Callable[[int, int], None] | None = None) -> Drawn:
-        """Draw those too of which nobody said that what they read is written.
+        """Draw the remaining figures, and return all in order.
 
-        `on_progress` is told (figures done, figures in all) after each. Returns what was drawn in
-        the order of the figures; raises InputError where a table is missing or damaged.
+        Args:
+            result: folder of the result.
+            on_progress: called after each figure with the numbers of figures done and in total.
+
+        Raises:
+            InputError: a table is missing or damaged.
         """
         self._record = self._record or _Record(result)
         for name in FIGURES:
@@ -204,23 +292,25 @@ def draw_all(
 ) -> Drawn:
     """Draw all figures of a result folder into `RESULT/figures/`, in `jobs` processes.
 
-    Else as `Drawing.finish`.
+    Progress, result and errors are those of `Drawing.finish`.
     """
     with workers(jobs) as pool:
         return Drawing(pool, again=True).finish(result, on_progress)
 
 
 def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Drawn:
-    """Draw one of `FIGURES` into a folder, by default `figures` in the result's.
+    """Draw one of `FIGURES` into a folder, by default `figures` in the folder of the result.
 
-    Old pictures of it are removed where there is nothing to draw.
+    Old pictures are removed if there is nothing to draw.
     """
     from experiments.reports.figures.result_tables import NothingToDraw
 
     folder, started_s = folder or data.folder / "figures", time.perf_counter()
     files, skipped = list[Path](), list[str]()
     try:
-        files = save_figure(folder, name, _module(name).draw, data)
+        entry = _REGISTRY[name]
+        draw = pkgutil.resolve_name(f"{__package__}.{entry.module}:{entry.function}")
+        files = save_figure(folder, name, draw, data)
     except NothingToDraw as reason:
         for kind in _DPI:
             (folder / f"{name}.{kind}").unlink(missing_ok=True)
@@ -228,43 +318,35 @@ def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Dr
     return Drawn(files, skipped, {name: time.perf_counter() - started_s})
 
 
-def _module(name: str) -> Any:
-    return importlib.import_module(_module_name(name))
-
-
-def _module_name(name: str) -> str:
-    return f"experiments.reports.figures.{name}"
+def caption(name: str) -> str:
+    """Return the caption of one of `FIGURES`."""
+    return _REGISTRY[name].caption
 
 
 def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any) -> list[Path]:
-    """Write the figure `draw(*data)`, in the house style, in all formats; returns the pictures."""
+    """Write the figure `draw(*data)` in the common style and all formats; return the files."""
     import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from experiments.reports.figures.style import house_style
 
     files = [folder / f"{name}.{kind}" for kind in _DPI]
     with house_style():
         figure = draw(*data)
-        _lay_out(figure)
-        # Neither before nor after a format would Matplotlib draw it all once more, to lay it out.
+        # Lay out the figure once for all formats, at the resolution of the first one.
+        engine = figure.get_layout_engine()
+        if engine is not None:
+            FigureCanvasAgg(figure)
+            own, figure.dpi = figure.dpi, next(iter(_DPI.values()))
+            engine.execute(figure)
+            figure.dpi = own
+        # Without a layout engine Matplotlib does not lay out the figure again for each format.
         with matplotlib.rc_context({"figure.constrained_layout.use": False}):
             figure.set_layout_engine(None)
             for file, kind in zip(files, _DPI, strict=True):
                 picture = _picture(figure, kind)
                 write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
     return files
-
-
-def _lay_out(figure: Figure) -> None:
-    """Place what a figure holds as for the first format, at its resolution, for all of them."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        FigureCanvasAgg(figure)
-        own, figure.dpi = figure.dpi, next(iter(_DPI.values()))
-        engine.execute(figure)
-        figure.dpi = own
 
 
 def _picture(figure: Figure, kind: str) -> bytes:

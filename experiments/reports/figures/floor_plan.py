@@ -1,4 +1,4 @@
-"""What maps seen from above share: equal scales, walls, error ellipses, a view without strays."""
+"""Floor plans: equal scales, walls, error ellipses, and a view without outliers."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,16 +18,16 @@ LEVEL_TEXT = "95 %"
 _LEVEL, _PLANE_DIMENSIONS = 0.95, 2
 ELLIPSE_BOUND = chi_square_bound(_LEVEL, _PLANE_DIMENSIONS)  # squared Mahalanobis distance
 _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
-_WIDEST_SHARE = 1 / 10  # of the map's extent that the widest drawn particle set may take
-_STRAY_SHARE = 0.005  # a stray landmark tens of metres off, on each side, must not shrink the map
-_SURROUNDINGS = 1.0  # walls are shown so far around a map, as a multiple of its extent
+_WIDEST_SHARE = 1 / 10  # of the map's extent, for the widest particle set drawn
+_OUTLIER_SHARE = 0.005  # on each side: a distant outlier must not shrink the map
+_SURROUNDINGS = 1.0  # walls are shown up to this distance, as a multiple of the map's extent
 _MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
-_LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # what labels and titles take beside each panel
+_LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # labels and titles of each panel
 _LEGEND_ROW_IN, _LEGEND_FRAME_IN = 0.16, 0.2
 
 
 def start_plan(axes: Axes, data: ResultTables, robot: str) -> list[Float]:
-    """Label a plan in a robot's map frame and draw the walls' faces faintly; returns the lines."""
+    """Label a plan in a robot's map frame, draw the faces of the walls and return their lines."""
     label_plan(axes, robot)
     walls = data.walls_in_frame_of(robot)
     for wall in walls:
@@ -36,17 +36,17 @@ def start_plan(axes: Axes, data: ResultTables, robot: str) -> list[Float]:
 
 
 def label_plan(axes: Axes, frame: str) -> None:
-    """Label both axes with their unit and the frame they belong to."""
+    """Label both axes with unit and frame."""
     axes.set(xlabel=f"x in {frame}'s frame (m)", ylabel=f"y in {frame}'s frame (m)")
 
 
 def add_points(axes: Axes, points: Float, **style: Any) -> None:
-    """Draw points (N, 2 or more) as pixels: as outlines they would make an SVG of megabytes."""
+    """Draw points, shape (N, 2 or more), as pixels; outlines would make an SVG of megabytes."""
     axes.plot(*points[:, :2].T, linestyle="none", rasterized=True, **style)
 
 
 def add_frame(axes: Axes, length_m: float = 1.0) -> None:
-    """Draw the frame's x and y axis at its origin, the robot's start pose."""
+    """Draw the x and y axis of the frame at its origin, the robot's start pose."""
     arrow = {"arrowstyle": "-|>", "color": BLACK, "linewidth": 1.2, "shrinkA": 0}
     for tip, name in (((length_m, 0.0), "x"), ((0.0, length_m), "y")):
         axes.annotate("", xy=tip, xytext=(0.0, 0.0), arrowprops=arrow, zorder=6)
@@ -54,17 +54,24 @@ def add_frame(axes: Axes, length_m: float = 1.0) -> None:
 
 
 def magnification(extent_m: float, widest_m: float) -> int:
-    """The largest round factor at which particle sets still look like spots in a map."""
+    """Return the largest round factor at which particle sets stay small in a map."""
     share = _WIDEST_SHARE * extent_m
     return max((m for m in _MAGNIFICATIONS if m * widest_m <= share), default=1)
 
 
 def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float, Float]:
-    """Ellipses of covariances (N, 2+, 2+) that hold `level` of a plane normal distribution.
+    """Compute the error ellipses that contain a share `level` of a normal distribution.
 
     The squared Mahalanobis distance of a normal point is chi-square with two degrees of freedom, so
-    the semi-axes are sqrt(eigenvalue * quantile), along the eigenvectors. Returns semi-major and
-    semi-minor axes (N,) in metres and the major axis' direction (N,) in rad.
+    the semi-axes are sqrt(eigenvalue * quantile), along the eigenvectors.
+
+    Args:
+        covariance_m2: covariances, shape (N, 2 or more, 2 or more).
+        level: probability of the ellipses.
+
+    Returns:
+        Semi-major axes (N,) and semi-minor axes (N,) in metres; direction of the major axis (N,)
+        in rad.
     """
     values, vectors = np.linalg.eigh(covariance_m2[:, :2, :2])
     lengths = np.sqrt(np.maximum(values, 0.0) * chi_square_bound(level, _PLANE_DIMENSIONS))
@@ -73,7 +80,7 @@ def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float
 
 
 def add_ellipses(axes: Axes, position_m: Float, covariance_m2: Float, **style: Any) -> None:
-    """Draw 95 % ellipses to scale, from positions (N, 2+) and covariances (N, 2+, 2+)."""
+    """Draw 95 % ellipses to scale, from positions (N, 2 or 3) and covariances."""
     major, minor, direction = semi_axes(covariance_m2)
     place = {"units": "xy", "offsets": position_m[:, :2], "offset_transform": axes.transData}
     sizes = (2 * major, 2 * minor, np.degrees(direction))
@@ -82,21 +89,21 @@ def add_ellipses(axes: Axes, position_m: Float, covariance_m2: Float, **style: A
 
 
 def ellipse_handle(colour: str) -> Line2D:
-    """What stands for the ellipses in a legend, and says their level."""
+    """Return the legend entry of the ellipses, with their level."""
     style = {"marker": "o", "markerfacecolor": "none", "markersize": 7, "linestyle": "none"}
     return Line2D([], [], color=colour, label=f"{LEVEL_TEXT} ellipses, to scale", **style)
 
 
 def set_view(axes: Axes, landmarks_m: Float, path_m: Float, walls_m: Sequence[Float] = ()) -> str:
-    """Show a path, the landmarks but for strays, and the walls around both, at equal scales.
+    """Show a path, the landmarks without outliers, and the walls around both, at equal scales.
 
-    A house is shown whole unless it is much larger than what was mapped of it. Returns in words how
-    many landmarks there are, and how many of them are out of view.
+    All walls are shown unless the building is much larger than the map. Return a text with the
+    number of landmarks, and of those that are out of view.
     """
     plan = landmarks_m[:, :2]
     core = [path_m[:, :2]] if len(path_m) else []
     if len(plan):
-        core.append(np.quantile(plan, [_STRAY_SHARE, 1 - _STRAY_SHARE], axis=0))
+        core.append(np.quantile(plan, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=0))
     low, high = _bounds(core or walls_m)
     if core and len(walls_m):
         reach = _SURROUNDINGS * float((high - low).max())
@@ -111,13 +118,13 @@ def set_view(axes: Axes, landmarks_m: Float, path_m: Float, walls_m: Sequence[Fl
 
 
 def _bounds(lines: Sequence[Float]) -> tuple[Float, Float]:
-    """Lowest and highest coordinates (2,) of lines (n, 2); the origin where there is none."""
+    """Return lowest and highest coordinates (2,) of lines (n, 2); the origin without lines."""
     points = np.concatenate(lines) if len(lines) else np.zeros((1, 2))
     return np.nanmin(points, axis=0), np.nanmax(points, axis=0)
 
 
 def set_one_scale(panels: Sequence[Axes]) -> None:
-    """Widen the views of panels of one size to the largest of them: one scale for all."""
+    """Give panels of one size the same scale: that of the largest view."""
     views = np.array([[axes.get_xlim(), axes.get_ylim()] for axes in panels])
     half = np.ptp(views, axis=2).max(axis=0) / 2
     for axes, middle in zip(panels, views.mean(axis=2), strict=True):
@@ -126,13 +133,13 @@ def set_one_scale(panels: Sequence[Axes]) -> None:
 
 
 def set_square(axes: Axes, centre: Float, reach_m: float) -> None:
-    """Show so far around a point, at equal scales."""
+    """Show a square around a point, at equal scales; `reach_m` is half a side."""
     (x0, y0), (x1, y1) = centre - reach_m, centre + reach_m
     axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
 
 
 def height_of_row(panels: Sequence[Axes], width_in: float) -> float:
-    """Inches that a row of plans needs, their views set, when each is given so much width."""
+    """Return the height of a row of plans in inches, for the width of each; views must be set."""
     ratio = max(np.ptp(axes.get_ylim()) / np.ptp(axes.get_xlim()) for axes in panels)
     return (width_in - _LABELS_WIDTH_IN) * float(ratio) + _LABELS_HEIGHT_IN
 
@@ -140,7 +147,7 @@ def height_of_row(panels: Sequence[Axes], width_in: float) -> float:
 def finish_plans(
     figure: Figure, panels: Sequence[Axes], handles: Sequence[Artist], columns: int, **legend: Any
 ) -> None:
-    """Put a legend below one row of plans and make the figure as high as both need."""
+    """Put a legend below one row of plans and set the height of the figure."""
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, **legend)
     rows = -(-len(handles) // columns) + ("title" in legend)
     plans_in = height_of_row(panels, PAGE_WIDTH_IN / len(panels))

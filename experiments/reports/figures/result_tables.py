@@ -1,4 +1,4 @@
-"""What a result folder holds, read when a figure asks for it."""
+"""Tables and files of a result folder, read on demand."""
 
 import io
 import json
@@ -26,12 +26,12 @@ from mapfusion.geometry.se2 import between, inverse, transform_covariances, tran
 Pair = tuple[str, str]
 
 
-class NothingToDraw(Exception):  # noqa: N818  # no error: the result simply holds no such data
-    """A figure has nothing to show; the text says why, in one line."""
+class NothingToDraw(Exception):  # noqa: N818  # no error: the result has no such data
+    """Signal that a figure has no data; the text gives the reason in one line."""
 
 
 def read_png(path: Path) -> bytes:
-    """Return the bytes of a PNG picture, each part of which has a checksum.
+    """Return the bytes of a PNG picture; the checksums of its parts are verified.
 
     Raises:
         DamagedFileError: the file is missing or damaged.
@@ -41,30 +41,37 @@ def read_png(path: Path) -> bytes:
     try:
         with Image.open(io.BytesIO(data), formats=["PNG"]) as picture:
             picture.verify()
-    except (OSError, SyntaxError, ValueError) as error:  # as Pillow tells damage
+    except (OSError, SyntaxError, ValueError) as error:  # Pillow's errors for damaged files
         raise DamagedFileError(path, "damaged or not a PNG picture") from error
     return data
 
 
 class FusedPairs(NamedTuple):
-    """N landmarks that two robots know: both parents', then the fused one's values.
+    """N landmarks in the maps of two robots, and the landmarks fused from them.
 
-    The parents' covariances are as the merge weighed them, so with what it added for drift. Further
-    robots may have known a landmark, too; the fused one is then of all its parents.
+    The first axis is parent a, parent b, fused. Maps of further robots may contain a landmark too;
+    the fused landmark then has more parents.
+
+    Attributes:
+        robots: both robots.
+        position_m: positions, shape (3, N, 3).
+        covariance_m2: covariances as the merge used them, with drift added, shape (3, N, 3, 3).
+        own_covariance_m2: covariances of the parents without drift, shape (2, N, 3, 3).
+        n_parents: number of parents, at least 2, shape (N,).
     """
 
     robots: Pair
-    position_m: Float  # (3, N, 3)
-    covariance_m2: Float  # (3, N, 3, 3)
-    own_covariance_m2: Float  # (2, N, 3, 3) of the parents, without the drift
-    n_parents: np.ndarray  # (N,) 2 or more
+    position_m: Float
+    covariance_m2: Float
+    own_covariance_m2: Float
+    n_parents: np.ndarray
 
 
 class ResultTables:
-    """The tables, key frames and descriptions of one result folder, or what several runs share.
+    """Tables, key frames and descriptions of one result folder, or tables of several runs.
 
-    Every access raises InputError that names the file when it is missing or damaged; only
-    `world.json` (the walls, known in simulation alone) and the key frames may be absent.
+    Every access raises InputError that names a missing or damaged file. Only `world.json` (the
+    walls, known in simulations) and the key frames may be absent.
     """
 
     def __init__(
@@ -73,11 +80,13 @@ class ResultTables:
         of_runs: Mapping[str, pd.DataFrame] | None = None,
         written: Collection[str] | None = None,
     ) -> None:
-        """Read from a result folder, or show rows `of_runs`, tables by name with a `run_id`.
+        """Take a result folder, or the tables of several runs.
 
-        Of runs, `errors` has one row per run where a result has one per repetition. Of a folder
-        that is being written, only what is `written` yet may be asked for: tables by name, and
-        `scenario`.
+        Args:
+            folder: folder of the result.
+            of_runs: tables of runs by name, with a column `run_id`; `errors` has one row per run
+                instead of one per repetition.
+            written: tables (and `scenario`) that may be read while the folder is being written.
         """
         self.folder = folder
         self._written = written
@@ -85,30 +94,26 @@ class ResultTables:
         self._tables = dict(of_runs or {})
 
     def table(self, name: str) -> pd.DataFrame:
-        """The table of that name (see experiments.evaluation.tables)."""
+        """Return a table by name (see experiments.evaluation.tables)."""
         self._require_written(name)
         if name not in self._tables:
             rows = read(table_path(self.folder, name), name)
             self._tables[name] = rows
             if name != "robots" and self._written is None and self.has("robots"):
-                self._require_robots(name, rows)
+                for column in {"robot", "robot_a", "robot_b"} & set(rows.columns):
+                    named = {each for each in rows[column].dropna() if each}
+                    if others := sorted(named - set(self.robots)):
+                        known = f"which has {', '.join(self.robots)}"
+                        raise InputError(
+                            f"{table_path(self.folder, name)}: column {column}: robot {others[0]}"
+                            f" is not in robots.parquet, {known}; the tables are of different runs"
+                        )
         if self._tables[name].columns.empty:
             raise NothingToDraw(f"no run has a table {name}")
         return self._tables[name]
 
-    def _require_robots(self, name: str, rows: pd.DataFrame) -> None:
-        """Raise InputError for a robot that the table `robots` does not have."""
-        for column in {"robot", "robot_a", "robot_b"} & set(rows.columns):
-            others = sorted({each for each in rows[column].dropna() if each} - set(self.robots))
-            if others:
-                known = f"which has {', '.join(self.robots)}"
-                raise InputError(
-                    f"{table_path(self.folder, name)}: column {column}: robot {others[0]} is not in"
-                    f" robots.parquet, {known}; the tables are of different runs"
-                )
-
     def has(self, name: str) -> bool:
-        """Whether there is a table of that name; older results lack some."""
+        """Return True if there is a table of this name; older results lack some."""
         self._require_written(name)
         return name in self._tables or table_path(self.folder, name).is_file()
 
@@ -117,7 +122,7 @@ class ResultTables:
             raise LookupError(f"{name}: may be that of an earlier run")
 
     def rows(self, name: str) -> pd.DataFrame:
-        """The table of that name; without rows where there is none."""
+        """Return a table by name; without rows if there is none."""
         return self.table(name) if self.has(name) else ALL[name].empty_table().to_pandas()
 
     @cached_property
@@ -128,23 +133,23 @@ class ResultTables:
 
     @cached_property
     def robots(self) -> list[str]:
-        """Names in display order; the first one's frame is the fused map's."""
+        """Names of the robots in display order."""
         return self.table("robots")["robot"].drop_duplicates().tolist()
 
     @cached_property
     def colours(self) -> dict[str, str]:
-        """Each robot's colour, in display order."""
+        """Colours by robot, in display order."""
         return dict(zip(self.robots, cycle(ROBOT_COLOURS), strict=False))
 
     @cached_property
     def answers(self) -> pd.DataFrame:
-        """What the aligners answered: `errors`, or `estimates` where no truth is known."""
+        """Results of the aligners: `errors`, or `estimates` if no truth is known."""
         errors = self.table("errors")
         return errors if len(errors) or self.several_runs else self.rows("estimates")
 
     @property
     def no_truth(self) -> bool:
-        """Whether there are answers and nothing to judge them by."""
+        """True if there are answers but no truth."""
         return self.table("errors").empty and not self.answers.empty
 
     @cached_property
@@ -155,50 +160,50 @@ class ResultTables:
 
     @cached_property
     def aligners(self) -> list[str]:
-        """Aligners that were run, in the scenario's order as the table has it, the oracle last."""
+        """Aligners that were run, in the order of the scenario, the oracle last."""
         return methods_in(self.answers, oracle=True)
 
     @cached_property
     def styles(self) -> dict[str, dict[str, Any]]:
-        """Each aligner's line style."""
+        """Line styles by aligner."""
         return aligner_styles(self.aligners)
 
     @cached_property
     def labels(self) -> dict[str, str]:
-        """Each aligner's name in legends, with a word where its package is not installed."""
+        """Names in legends by aligner; they say if the package is not installed."""
         rows = self.answers
         absent = rows["aligner"][rows["status"] == Status.ABSENT] if "status" in rows else ()
         return {name: f"{name} (absent)" if name in set(absent) else name for name in self.aligners}
 
     def last_iteration(self, pair: Pair) -> int:
-        """The last iteration at which the pair's maps were aligned: that of the stored maps."""
+        """Return the last iteration at which a pair was aligned: that of the stored maps."""
         return int(of_pair(self.answers, pair)["iteration"].max())
 
     def last_correspondences(self, pair: Pair) -> pd.DataFrame:
-        """The pairs offered to the aligners at the end: rows of the two stored maps."""
+        """Return the correspondences given to the aligners at the last iteration."""
         rows = of_pair(self.table("correspondences"), pair)
         return rows[rows["iteration"] == self.last_iteration(pair)]
 
     def of_robot(self, name: str, robot: str, order: str = "iteration") -> pd.DataFrame:
-        """A robot's rows of the table of that name, in the order of a column."""
+        """Return the rows of one robot of a table, sorted by a column."""
         table = self.table(name)
         return table[table["robot"] == robot].sort_values(order, kind="stable")
 
     def landmarks_of(self, robot: str) -> tuple[Float, Float]:
-        """Positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
+        """Return positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
         return positions_and_covariances(self.of_robot("landmarks", robot, "landmark"))
 
     @property
     def sightings(self) -> str:
-        """In words, how often a landmark was seen before it counts for the maps."""
+        """Description of the number of observations that a landmark needs to enter a map."""
         return f"seen {self.scenario['slam']['min_count']} times or more"
 
     def path_of(self, robot: str) -> Float:
-        """Positions (T, 2) of the best particle's whole path at the end, in the robot's frame."""
+        """Return the final path of the best particle in the robot's frame, shape (T, 2)."""
         return self.of_robot("paths", robot)[["final_x_m", "final_y_m"]].to_numpy()
 
     def smoothed_path_of(self, robot: str) -> Float:
-        """Positions (T, 2) of the whole smoothed path in the robot's frame; (0, 2) where none."""
+        """Return the last smoothed path in the robot's frame, shape (T, 2), or (0, 2)."""
         rows = self.rows("smoothed_paths")
         own = rows[rows["robot"] == robot]
         last = own[own["iteration"] == own["iteration"].max()].sort_values("frame")
@@ -206,15 +211,16 @@ class ResultTables:
 
     @property
     def fused_frame(self) -> str:
-        """The robot in whose frame the fused map is: the first that is in it."""
+        """Robot whose frame is the frame of the fused map: the first robot in the map."""
         motions = self.rows("fused_motions")
         inside = motions.loc[motions["tx_m"].notna(), "robot"].tolist()
         return inside[0] if inside else self.robots[0]
 
     def moved_map(self, robot: str) -> tuple[Float, Float, Float]:
-        """A robot's last map as it went into the merge.
+        """Return a robot's last map as the merge used it, in the fused frame.
 
-        Positions (N, 3), covariances (N, 3, 3), and these before the drift widened them.
+        Returns:
+            Positions (N, 3), covariances with drift (N, 3, 3), covariances without drift.
         """
         if not self.has("fused_motions"):
             raise NothingToDraw("made before fused motions were stored: run it again")
@@ -222,15 +228,19 @@ class ResultTables:
         T_fused_robot = motions[["tx_m", "ty_m", "theta_rad"]].to_numpy(dtype=np.float64)
         position, covariance = self.landmarks_of(robot)
         turned = transform_covariances(T_fused_robot, covariance)
-        drift_m2 = motions["drift_sigma_m"] ** 2 * np.diag([1.0, 1.0, 0.0])  # heights do not drift
+        drift_m2 = motions["drift_sigma_m"] ** 2 * np.diag([1.0, 1.0, 0.0])  # no drift of heights
         return transform_points(T_fused_robot, position), turned + drift_m2, turned
 
     def fused_map(self) -> pd.DataFrame:
-        """The map of `merge.fuser`; of results made before fusers had names, the paper's."""
+        """Return the map of `merge.fuser`, or the map `fused` of an older result."""
         return self.table("fused_map" if self.has("fused_map") else "fused")
 
     def fused_pairs(self) -> FusedPairs:
-        """The fused landmarks of the robot pair that shares most; NothingToDraw where none."""
+        """Return the fused landmarks of the robot pair that shares most landmarks.
+
+        Raises:
+            NothingToDraw: no landmark was fused.
+        """
         fused = self.table("fused")
         rows = fused[fused["n_parents"] >= 2]
         if rows.empty:
@@ -248,15 +258,15 @@ class ResultTables:
         return FusedPairs(robots, three, covariances, own, rows["n_parents"].to_numpy())
 
     def parents_and_fused(self, robots: Pair) -> list[tuple[str, str, str]]:
-        """Robot name or "fused", marker and colour of two parents and the fused landmark."""
+        """Return label, marker and colour of two parents and of the fused landmark."""
         colours = [self.colours[robot] for robot in robots] + [FUSED_COLOUR]
         return list(zip([*robots, "fused"], "*^s", colours, strict=True))
 
     @cached_property
     def walls(self) -> list[Float]:
-        """Lines (n, 2) in the world along which the walls' faces stand; none where unknown.
+        """Lines of the faces of the walls in the world, each of shape (n, 2); empty if unknown.
 
-        Of results made before faces were stored, the walls' middle lines.
+        Older results without faces give the middle lines of the walls.
         """
         known = self._world.get("faces", self._world.get("walls", []))
         return [np.array(line) for line in known]
@@ -267,34 +277,34 @@ class ResultTables:
         return read_world(path) if path.is_file() else {}
 
     def walls_in_frame_of(self, robot: str) -> list[Float]:
-        """The same lines in a robot's map frame."""
+        """Return the `walls` in a robot's map frame."""
         start = self.start_pose(robot)
         return [transform_points(inverse(start), wall) for wall in self.walls if start is not None]
 
     def true_alignment(self, pair: Pair) -> Float | None:
-        """The true T_a_b (3,) of two map frames, or None where it is unknown."""
+        """Return the true T_a_b (3,) of two map frames, or None if it is unknown."""
         start_a, start_b = (self.start_pose(robot) for robot in pair)
         return None if start_a is None or start_b is None else between(start_a, start_b)
 
     def start_pose(self, robot: str) -> Float | None:
-        """The true T_world_map (3,) of a robot, or None where it is unknown."""
+        """Return the true T_world_map (3,) of a robot, or None if it is unknown."""
         pose = self._world.get("robots", {}).get(robot)
         return None if pose is None else np.array(pose, dtype=np.float64)
 
 
 def of_pair(rows: pd.DataFrame, pair: Pair) -> pd.DataFrame:
-    """The rows of one robot pair."""
+    """Return the rows of one robot pair."""
     return rows[(rows["robot_a"] == pair[0]) & (rows["robot_b"] == pair[1])]
 
 
 def positions_and_covariances(rows: pd.DataFrame) -> tuple[Float, Float]:
-    """Positions (N, 3) and covariances (N, 3, 3) of rows with the columns of a map."""
+    """Return positions (N, 3) and covariances (N, 3, 3) of rows with the columns of a map."""
     columns = rows[POSITION_FIELDS + COVARIANCE_FIELDS]
     return points_from(pa.table({name: columns[name].to_numpy() for name in columns}))
 
 
-def json_object(text: str, where: Path) -> dict[str, Any]:
-    """What a text holds; raises InputError, which says where it stands, if that is no object."""
+def parse_json_object(text: str, where: Path) -> dict[str, Any]:
+    """Parse a JSON object; raises InputError that names its origin if the text is no object."""
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:

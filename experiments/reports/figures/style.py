@@ -1,4 +1,4 @@
-"""One look for all figures: legible in print, safe for colour-blind readers, reproducible."""
+"""Common style of all figures: legible in print, colour-blind safe, reproducible."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -17,16 +17,16 @@ from experiments.evaluation.fused_map_errors import FILTERED, SMOOTHED
 from mapfusion.fusion.fusers import REFERENCE
 
 PAGE_WIDTH_IN = 7.2  # two columns of a journal page
-# Okabe and Ito (2008): told apart by readers with any common colour blindness. Their yellow is left
-# out: too pale for lines on white.
+# Okabe and Ito (2008): distinct for readers with any common colour blindness. Their yellow is left
+# out: it is too pale for lines on white.
 BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
 PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
-# Four of Tol's (2021) muted scheme, darker or duller than those, where more methods are compared.
+# Four colours of Tol's (2021) muted scheme, for comparisons of many methods.
 INDIGO, WINE, OLIVE, TEAL = "#332288", "#882255", "#999933", "#44AA99"
 BLACK, GRAY, WALL_GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#A8A8A8", "#C8C8C8"
 
 _RC: dict[str, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same on every machine
+    "font.family": "DejaVu Sans",  # part of Matplotlib: the same on every machine
     "font.size": 8.0,
     "axes.titlesize": 8.5,
     "axes.labelsize": 8.0,
@@ -39,14 +39,14 @@ _RC: dict[str, Any] = {
     "lines.markersize": 3.5,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.titley": 1.0,  # else each drawing looks for what may be in the way: nothing is up there
+    "axes.titley": 1.0,  # skips Matplotlib's search for a free position
     "grid.alpha": 0.35,
     "grid.linewidth": 0.4,
     "figure.constrained_layout.use": True,
     "svg.fonttype": "path",
-    "svg.hashsalt": "mapfusion",  # else every SVG gets element ids of its own
+    "svg.hashsalt": "mapfusion",  # constant element ids in SVG files
 }
-# Colour, dashes and marker: lines also differ in print in gray. A known method always looks alike.
+# Colour, dashes and marker: lines also differ in gray print. A known method has a fixed style.
 _KNOWN_ALIGNERS: dict[str, tuple[Any, ...]] = {
     "ransac": (BLUE, "-", "o"),
     "svd": (VERMILLION, (0, (6, 1, 1, 1)), "s"),
@@ -60,7 +60,7 @@ _KNOWN_ALIGNERS: dict[str, tuple[Any, ...]] = {
     "kiss_matcher": (TEAL, (0, (3, 1, 1, 1, 1, 1)), ">"),
     ORACLE: (BLACK, (0, (4, 2)), "x"),
 }
-# What fusers make of maps, solid and dark where it is to be read first, and what they are given.
+# Fusers, the most important ones with solid dark lines; below, the maps given to the fusers.
 _KNOWN_FUSERS: dict[str, tuple[Any, ...]] = {
     "kalman": (ORANGE, (0, (1, 1)), "D"),
     "kalman-drift": (VERMILLION, (0, (6, 1, 1, 1)), "s"),
@@ -72,8 +72,8 @@ GIVEN_STYLES: dict[str, dict[str, Any]] = {
     FILTERED: {"color": GRAY, "linestyle": (0, (3, 1, 1, 1)), "marker": "v"},
     SMOOTHED: {"color": GRAY, "linestyle": "-", "marker": "P"},
 }
-# All others (plug-ins, names of a scenario's own) by their place among themselves. The lengths have
-# no common factor, so 99 styles come before one repeats.
+# All others (plug-ins, names defined in a scenario) by their position. The lengths of the tuples
+# have no common factor, so 99 styles come before one repeats.
 _OTHER_COLOURS = (INDIGO, OLIVE, BLUE, WINE, TEAL, VERMILLION, SKY, ORANGE, PURPLE, GREEN, GRAY)
 _DASHES_AND_GAPS = [(2, 2), (9, 1, 2, 1), (), (4, 1, 1, 1), (1, 2), (7, 3)]
 _DASHES_AND_GAPS += [(5, 1, 1, 1, 1, 1, 1, 1), (3, 3), (10, 2, 4, 2)]
@@ -84,19 +84,19 @@ FUSED_COLOUR = BLACK
 
 
 class _Between(LogFormatter):
-    """Between powers of ten: numbers where Matplotlib writes some, on axes with few powers."""
+    """Formatter of minor ticks: plain numbers on axes with few powers of ten, else none."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         return _plain(x) if super().__call__(x, pos) else ""
 
 
 def plain_numbers() -> FuncFormatter:
-    """Ticks of logarithmic axes as people read them: 0.01, 0.1, 1, 10."""
+    """Return a formatter that writes plain numbers on logarithmic axes: 0.01, 0.1, 1, 10."""
     return FuncFormatter(lambda value, _: _plain(value))
 
 
 def write_plainly(axis: Axis) -> None:
-    """Give a logarithmic axis plain numbers, also between the powers of ten."""
+    """Write plain numbers on a logarithmic axis, also between the powers of ten."""
     axis.set_major_formatter(plain_numbers())
     axis.set_minor_formatter(_Between())
 
@@ -106,17 +106,17 @@ def _plain(value: float) -> str:
 
 
 def house_style() -> AbstractContextManager[None]:
-    """Matplotlib's defaults and ours, whatever the user's own settings; those come back after."""
+    """Return a context with the common style; the user's own settings are restored afterwards."""
     return matplotlib.style.context(["default", _RC])
 
 
 def aligner_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Line style of each aligner: its own if it has one, else by its place among those without."""
+    """Return line styles by aligner: fixed for known aligners, else by position in `names`."""
     return _styles(_KNOWN_ALIGNERS, names)
 
 
 def fuser_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Line style of each fuser, likewise."""
+    """Return line styles by fuser, as `aligner_styles` does."""
     return _styles(_KNOWN_FUSERS, names)
 
 
@@ -131,10 +131,13 @@ def _styles(
 
 
 def aligner_legend(
-    figure: Figure, looks: Mapping[str, dict[str, Any]], columns: int, others: Sequence[Artist] = ()
+    figure: Figure,
+    styles: Mapping[str, dict[str, Any]],
+    columns: int,
+    others: Sequence[Artist] = (),
 ) -> None:
-    """Put a legend of aligners, styles by label, and what else it explains above a figure."""
-    lines = [Line2D([], [], label=label, **look) for label, look in looks.items()]
+    """Put a legend above a figure: line styles by label, then other entries."""
+    lines = [Line2D([], [], label=label, **style) for label, style in styles.items()]
     handles = [*lines, *others]
     place = {"loc": "outside upper center", "ncols": min(len(handles), columns)}
     figure.legend(handles=handles, handlelength=3.2, **place)

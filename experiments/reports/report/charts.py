@@ -1,4 +1,4 @@
-"""Charts of errors, success rates and times: their values, and the Plotly figures of these."""
+"""Charts of errors, success rates and times: values and Plotly figures."""
 
 import html
 import math
@@ -41,7 +41,7 @@ Attributes = dict[str, Any]
 Styles = Mapping[str, dict[str, Any]]  # of each aligner, by `theme.chart_style`
 
 
-# Plotly takes a few tags and entities in texts for markup: names must not be able to use them
+# Plotly interprets a few tags and entities in texts, so names are escaped.
 escaped = partial(html.escape, quote=False)
 
 
@@ -70,7 +70,7 @@ def error_curves(rows: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
     iterations = thinned(np.unique(rows["iteration"]), _MAX_POINTS)
     rows = rows[rows["iteration"].isin(iterations)]
     offered = rows.drop_duplicates(MAP_PAIR).groupby("iteration")[_OFFERED].median()
-    # the sign of a rotation has no place on a logarithmic axis
+    # absolute: a logarithmic axis cannot show signs
     bands = error_bands(rows, by=(), absolute=True).set_index("iteration")
     of_aligner = {name: bands[bands["aligner"] == name].reindex(iterations) for name in aligners}
     return {
@@ -85,7 +85,7 @@ def error_curves(rows: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
 
 
 def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str, Any]]:
-    """Compute success rates with their intervals against each quantity that makes aligning hard.
+    """Compute success rates with intervals against each quantity that affects alignment.
 
     `maps` are rows of `maps_of` with the column overlap_share, which may be unknown. Bins without
     maps that have common ground are left out: no answer is right there.
@@ -148,7 +148,7 @@ def time_curves(timings: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any
 def error_figure(groups: Sequence[tuple[str, dict[str, Any]]], styles: Styles) -> go.Figure:
     """Draw the `error_curves` of labelled groups of maps; a menu selects the group.
 
-    Estimates stand on the left and refined estimates on the right.
+    Estimates are on the left, refined estimates on the right.
     """
     titles: Attributes = {"column_titles": ["as estimated", "refined"]}
     titles |= {"x_title": "FastSLAM iteration k"}
@@ -161,14 +161,14 @@ def error_figure(groups: Sequence[tuple[str, dict[str, Any]]], styles: Styles) -
             band = {"fill": "toself", "fillcolor": faint(style["hex"]), "hoverinfo": "skip"}
             trace = go.Scatter(mode="none", showlegend=False, meta="band", **own, **band)
             figure.add_trace(trace, row, col)
-            said = "%{y:.3g} (%{customdata[0]:.3g}–%{customdata[1]:.3g})"
+            hover = "%{y:.3g} (%{customdata[0]:.3g}–%{customdata[1]:.3g})"
             median = go.Scatter(
                 **own,
                 mode="lines+markers",
                 line_dash=style["dash"],
                 marker={"size": 5, "symbol": style["marker"]},
                 meta=curve,
-                hovertemplate=said,
+                hovertemplate=hover,
                 showlegend=(row, col) == (1, 1),
             )
             figure.add_trace(median, row, col)
@@ -180,7 +180,7 @@ def error_figure(groups: Sequence[tuple[str, dict[str, Any]]], styles: Styles) -
             shared = {"legendgroup": name, "showlegend": col == 1, "line_color": NEUTRAL}
             line = go.Scatter(mode="lines", name=text, meta=name, **shared, **look)
             figure.add_trace(line, 3, col)
-    contents = [_errors_shown(curves, styles) for _, curves in groups]
+    contents = [_error_attributes(curves, styles) for _, curves in groups]
     values, shading = contents[0]
     traces: Any = figure.data
     for place, trace in enumerate(traces):
@@ -206,19 +206,27 @@ def error_figure(groups: Sequence[tuple[str, dict[str, Any]]], styles: Styles) -
     return figure.update_layout(
         height=760,
         hovermode="x unified",
-        hoverdistance=-1,  # however far the pointer is
+        hoverdistance=-1,  # no limit
         shapes=shading,
     )
 
 
-def _errors_shown(curves: dict[str, Any], styles: Styles) -> tuple[Attributes, list[Any]]:
+def _error_attributes(curves: dict[str, Any], styles: Styles) -> tuple[Attributes, list[Any]]:
     """Return the values of all traces of the error chart for one group, and its shading."""
     x = curves["iteration"]
     traces: list[tuple[list[Any], list[Any], Any]] = []
     for name in styles:
         for curve in _PANELS:
             own = curves["aligners"][name][curve]
-            traces.append((*_outline(x, own), None))
+            # Outline of the band, one polygon for each interval with estimates
+            known = np.array([median is not None for median in own["median"]], dtype=int)
+            edges = np.flatnonzero(np.diff(known, prepend=0, append=0))
+            outline_x: list[Any] = []
+            outline_y: list[Any] = []
+            for first, last in edges.reshape(-1, 2):
+                outline_x += [*x[first:last], *x[first:last][::-1], None]
+                outline_y += [*own["low"][first:last], *own["high"][first:last][::-1], None]
+            traces.append((outline_x, outline_y, None))
             traces.append((x, own["median"], list(zip(own["low"], own["high"], strict=True))))
     traces += [(x, curves[name], None) for name in ("n_correspondences", "n_true")] * 2
     attributes = zip(*traces, strict=True)
@@ -231,18 +239,6 @@ def _errors_shown(curves: dict[str, Any], styles: Styles) -> tuple[Attributes, l
     ]
     names = ("x", "y", "customdata")
     return {n: list(each) for n, each in zip(names, attributes, strict=True)}, shapes
-
-
-def _outline(x: Sequence[float], band: dict[str, Any]) -> tuple[list[Any], list[Any]]:
-    """Return the outline of a band, one polygon for each stretch with estimates."""
-    there = np.array([median is not None for median in band["median"]], dtype=int)
-    edges = np.flatnonzero(np.diff(there, prepend=0, append=0))
-    outline_x: list[Any] = []
-    outline_y: list[Any] = []
-    for first, last in edges.reshape(-1, 2):
-        outline_x += [*x[first:last], *x[first:last][::-1], None]
-        outline_y += [*band["low"][first:last], *band["high"][first:last][::-1], None]
-    return outline_x, outline_y
 
 
 def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figure | None:
@@ -265,7 +261,7 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
                 100 * np.array(own[end], dtype=float) for end in ("rate", "low", "high")
             )
             shown = escaped(name)
-            said = "%{y:.0f} % (%{customdata[0]:.0f} to %{customdata[1]:.0f} %), "
+            hover = "%{y:.0f} % (%{customdata[0]:.0f} to %{customdata[1]:.0f} %), "
             interval = {"type": "data", "array": rounded(high - rate), "width": 0}
             interval |= {"arrayminus": rounded(rate - low), "thickness": 1.5}
             trace = go.Scatter(
@@ -279,7 +275,7 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
                 line={"color": style["hex"], "dash": style["dash"], "width": 1.5},
                 marker={"size": 6, "symbol": style["marker"]},
                 error_y=interval | {"color": faint(style["hex"], 0.45)},
-                hovertemplate=f"{shown}: {said}%{{customdata[2]}} maps<extra></extra>",
+                hovertemplate=f"{shown}: {hover}%{{customdata[2]}} maps<extra></extra>",
             )
             figure.add_trace(trace, row, col)
         ticks = {"tickvals": bins.tolist(), "ticktext": each["bins"], "showgrid": False}

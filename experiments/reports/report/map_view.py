@@ -36,9 +36,9 @@ _MAX_PATH_POINTS = 200
 # Outline in metres of a robot that drives along x
 _ROBOT_M = 0.4 * np.array([[1, 0], [-0.7, 0.65], [-0.35, 0], [-0.7, -0.65], [1, 0]])
 _CARPET_SHARE = 10  # half the side of a carpet over the largest coordinate, for wide ellipses
-_STRAY_SHARE = 0.005  # landmarks on each side that the first view may leave out
+_OUTLIER_SHARE = 0.005  # landmarks on each side that the first view may leave out
 _MARGIN = 0.06  # of the view
-_MS_A_FRAME = 125  # when the iterations are played
+_MS_PER_FRAME = 125  # of the animation
 _COVARIANCE = ["cov_xx_m2", "cov_xy_m2", "cov_xy_m2", "cov_yy_m2"]
 _MOTION = ("tx_m", "ty_m", "theta_rad")
 _ANSWER = ["aligner", "iteration", "repetition"]
@@ -46,15 +46,15 @@ _STAGES = {"refined": "refined_", "as estimated": ""}
 _NO_POINTS = np.zeros((0, 2))
 
 Placement = tuple[str, str]  # aligner and stage
-_View = tuple[Attributes, list[int]]  # values of each attribute, and the traces that get them
+_View = tuple[Attributes, list[int]]  # values of each attribute, and indices of the traces
 TRUTH: Placement = ("the truth", "")
 
 
 class _Layer(NamedTuple):
-    """A trace with its attributes at each iteration, and the choices that it is shown for."""
+    """Trace with its attributes at each iteration, and the selections that show it."""
 
     trace: Attributes
-    at: Callable[[int], Attributes] | None = None  # None: they never change
+    at: Callable[[int], Attributes] | None = None  # None: constant attributes
     robot: str = ""  # shown with the pairs of this robot, on the robot's carpet
     pair: Pair | None = None  # shown with this pair
     placement: Placement | None = None  # shown with this placement
@@ -93,6 +93,24 @@ def map_figure(data: ResultTables, styles: Styles) -> go.Figure | None:
         for k in iterations
     ]
     figure = go.Figure(data=traces, frames=frames)
+    # A slider shows the frame of each iteration, two buttons play and stop them, and a menu selects
+    # the pair and the alignment.
+    show = {"mode": "immediate", "transition": {"duration": 0}}
+    at_once = show | {"frame": {"duration": 0, "redraw": True}}
+    steps = [
+        {"label": str(k), "method": "animate", "args": [[str(k)], at_once]} for k in iterations
+    ]
+    slider = {"steps": steps, "active": len(steps) - 1, "x": 0.12, "len": 0.88, "pad": {"t": 40}}
+    slider |= {"currentvalue": {"prefix": "iteration ", "xanchor": "left"}}
+    run = show | {"frame": {"duration": _MS_PER_FRAME, "redraw": True}, "fromcurrent": True}
+    play = {"label": "▶", "method": "animate", "args": [None, run]}
+    stop = {"label": "❚❚", "method": "animate", "args": [[None], run | {"fromcurrent": False}]}
+    buttons = {"type": "buttons", "direction": "left", "showactive": False, "buttons": [play, stop]}
+    buttons |= {"x": 0, "xanchor": "left", "y": 0, "yanchor": "top", "pad": {"t": 50}}
+    choices = [
+        {"label": escaped(label), "method": "restyle", "args": list(view)} for label, view in views
+    ]
+    menu = {"buttons": choices, "x": 0, "xanchor": "left", "y": 1.01, "yanchor": "bottom"}
     (left, low), (right, high) = maps.bounds()
     axes = {"zeroline": False, "ticksuffix": " m"}
     of_text = {"visible": False, "range": [0, 1], "fixedrange": True}
@@ -106,8 +124,8 @@ def map_figure(data: ResultTables, styles: Styles) -> go.Figure | None:
         xaxis2=of_text | {"overlaying": "x"},
         yaxis2=of_text | {"overlaying": "y"},
         legend={"tracegroupgap": 0},
-        sliders=[_slider(iterations)],
-        updatemenus=_menus(views),
+        sliders=[slider],
+        updatemenus=[menu, buttons],
         margin={"t": 70, "b": 90},
     )
 
@@ -134,35 +152,8 @@ def _view(layers: list[_Layer], maps: "_Maps", pair: Pair, placement: Placement)
     return attributes, drawn
 
 
-def _slider(iterations: list[int]) -> Attributes:
-    """Return a slider that shows the frame of each iteration."""
-    at_once = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}}
-    at_once |= {"transition": {"duration": 0}}
-    steps = [
-        {"label": str(k), "method": "animate", "args": [[str(k)], at_once]} for k in iterations
-    ]
-    prefix = {"prefix": "iteration ", "xanchor": "left"}
-    place = {"active": len(steps) - 1, "x": 0.12, "len": 0.88, "pad": {"t": 40}}
-    return {"steps": steps, "currentvalue": prefix, **place}
-
-
-def _menus(views: list[tuple[str, _View]]) -> list[Attributes]:
-    """Return the menu of pairs and placements, and the buttons that play all iterations."""
-    choices = [
-        {"label": escaped(label), "method": "restyle", "args": list(view)} for label, view in views
-    ]
-    run = {"frame": {"duration": _MS_A_FRAME, "redraw": True}, "transition": {"duration": 0}}
-    run |= {"mode": "immediate", "fromcurrent": True}
-    play = {"label": "▶", "method": "animate", "args": [None, run]}
-    stop = {"label": "❚❚", "method": "animate", "args": [[None], run | {"fromcurrent": False}]}
-    above = {"x": 0, "xanchor": "left", "y": 1.01, "yanchor": "bottom"}
-    below = {"x": 0, "xanchor": "left", "y": 0, "yanchor": "top", "pad": {"t": 50}}
-    buttons = {"type": "buttons", "direction": "left", "showactive": False}
-    return [{"buttons": choices, **above}, {"buttons": [play, stop], **buttons, **below}]
-
-
 class _Maps:
-    """Layers of the plan, from the tables of a result."""
+    """Layers of the plan, made from the tables of a result."""
 
     def __init__(self, data: ResultTables, styles: Styles) -> None:
         self._data = data
@@ -185,7 +176,15 @@ class _Maps:
             for name in ("correspondences", "fused_history", "true_pairs")
             for pair in data.pairs
         }
-        self._answers = {pair: self._answers_of(pair) for pair in data.pairs}
+        # Answers of the first repetition with their errors, by aligner and iteration
+        self._answers = dict[Pair, dict[tuple[str, int], dict[Any, Any]]]()
+        for pair in data.pairs:
+            estimates = of_pair(data.rows("estimates"), pair)
+            errors = of_pair(data.table("errors"), pair)
+            first = estimates[estimates["repetition"] == 0]
+            rows = first.merge(errors, "left", _ANSWER, suffixes=("", "_of_error"))
+            answers = rows.to_dict("records")
+            self._answers[pair] = {(row["aligner"], row["iteration"]): row for row in answers}
         used = data.scenario.get("merge", {}).get("aligner", "")
         names = sorted(data.aligners, key=lambda name: name != used)
         self.placements: dict[Pair, list[Placement]] = {}
@@ -195,14 +194,6 @@ class _Maps:
             truth = [TRUTH] if data.true_alignment(pair) is not None else []
             self.placements[pair] = known + truth
 
-    def _answers_of(self, pair: Pair) -> dict[tuple[str, int], dict[Any, Any]]:
-        """Return the first repetition's answers with their errors, by aligner and iteration."""
-        estimates = of_pair(self._data.rows("estimates"), pair)
-        errors = of_pair(self._data.table("errors"), pair)
-        first = estimates[estimates["repetition"] == 0]
-        rows = first.merge(errors, "left", _ANSWER, suffixes=("", "_of_error")).to_dict("records")
-        return {(row["aligner"], row["iteration"]): row for row in rows}
-
     def carpet_of(self, frame: str | Pair, placement: Placement | None = None) -> str:
         """Name the carpet of a robot at its true start, or of a pair's second robot as placed."""
         if isinstance(frame, str):
@@ -211,7 +202,7 @@ class _Maps:
         return f"{self._data.pairs.index(frame)}/{number}"
 
     def _start(self, robot: str) -> Float:
-        """Return the robot's true start; maps without truth are drawn in the first robot's."""
+        """Return the robot's true start pose, shape (3,); the identity without truth."""
         start = self._data.start_pose(robot)
         return np.zeros(3) if start is None else start
 
@@ -228,7 +219,7 @@ class _Maps:
         return compose(self._start(pair[0]), motion)
 
     def bounds(self) -> Float:
-        """Return the corners (2, 2) of the first view: all walls, or both maps without strays."""
+        """Return the corners of the first view, shape (2, 2): all walls, or both maps."""
         points = list(self._data.walls)
         if not points:
             pair, k = self._data.pairs[0], int(self.shown[-1])
@@ -236,7 +227,7 @@ class _Maps:
             for robot, frame in zip(pair, frames, strict=True):
                 plan = _points(self._latest(robot, k))
                 if frame is not None and len(plan):
-                    middle = np.quantile(plan, [_STRAY_SHARE, 1 - _STRAY_SHARE], axis=0)
+                    middle = np.quantile(plan, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=0)
                     inside = ((plan >= middle[0]) & (plan <= middle[1])).all(axis=1)
                     points.append(transform_points(frame, plan[inside]))
         every = np.concatenate(points) if points else np.array([[-1.0, -1.0], [1.0, 1.0]])
@@ -248,7 +239,13 @@ class _Maps:
         yield from self._carpets()
         yield _Layer(_line("walls", self._data.walls, width=1.2))
         for robot in self._data.robots:
-            yield from self._true_path(robot)
+            start = self._data.start_pose(robot)
+            path = _points(self._rows_of("paths", robot), "truth_")
+            if start is not None and len(path) and np.isfinite(path).all():
+                drawn = [transform_points(start, thinned(path, _MAX_PATH_POINTS))]
+                line = _line("true paths", drawn, width=1.2, dash="dash")
+                first = robot == self._data.robots[0]
+                yield _Layer(line | {"legendgroup": "true", "showlegend": first}, robot=robot)
         for pair in self._data.pairs:
             yield from self._pairs_of_landmarks(pair)
         for robot in self._data.robots:
@@ -257,6 +254,7 @@ class _Maps:
             yield from self._layers_of_pair(pair)
 
     def _carpets(self) -> Iterator[_Layer]:
+        """Yield the carpets of all robots at their true starts and of all alignments."""
         tables = [self._data.rows(name) for name in ("map_history", "clouds", "paths")]
         drawn = [rows.filter(regex=r"^(online_)?[xy]_m$").to_numpy(float) for rows in tables]
         largest = max(np.nanmax(np.abs(points), initial=1.0) for points in drawn)
@@ -286,15 +284,6 @@ class _Maps:
                     ),
                 )
 
-    def _true_path(self, robot: str) -> Iterator[_Layer]:
-        start = self._data.start_pose(robot)
-        path = _points(self._rows_of("paths", robot), "truth_")
-        if start is not None and len(path) and np.isfinite(path).all():
-            drawn = [transform_points(start, thinned(path, _MAX_PATH_POINTS))]
-            look = _line("true paths", drawn, width=1.2, dash="dash")
-            first = robot == self._data.robots[0]
-            yield _Layer(look | {"legendgroup": "true", "showlegend": first}, robot=robot)
-
     def _pairs_of_landmarks(self, pair: Pair) -> Iterator[_Layer]:
         """Yield lines of correspondences, for the first placement and the truth.
 
@@ -317,7 +306,7 @@ class _Maps:
                 )
 
     def _ends(self, pair: Pair, placement: Placement, k: int, wanted: bool) -> Float:
-        """Return both ends of true or false pairs in the world and a gap, (3 N, 2)."""
+        """Return both ends of true or false pairs in the world and a gap, shape (3 N, 2)."""
         rows, is_true = self._of_pair["correspondences", pair].get(k), self._is_true(pair, k)
         frame = self._placed(pair, placement, k)
         if rows is None or is_true is None or frame is None:
@@ -366,7 +355,7 @@ class _Maps:
         if clouds:
             known = np.array(list(clouds))
 
-            def cloud(k: int) -> Attributes:  # a few frames off where none is stored for k
+            def cloud(k: int) -> Attributes:  # the nearest iteration with stored particles
                 return _ab(_points(clouds[known[np.abs(known - k).argmin()]]))
 
             first = robot == self._data.robots[0]
@@ -489,7 +478,7 @@ class _Maps:
 
 
 def ellipse_ends(rows: pd.DataFrame) -> Float:
-    """Return the ends of the axes of N landmarks' ellipses, (6 N, 2): closed, then a gap."""
+    """Return closed polygons of the ellipses of N landmarks with gaps, shape (6 N, 2)."""
     covariance_m2 = rows[_COVARIANCE].to_numpy(dtype=np.float64).reshape(-1, 2, 2)
     major, minor, direction = semi_axes(covariance_m2)
     ends = _ELLIPSE_ENDS * np.stack([major, minor], -1)[:, None]

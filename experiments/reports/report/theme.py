@@ -19,7 +19,7 @@ _SURFACES = {
     "good": ("#00704f", "#3ecf9f"),
     "bad": ("#b3261e", "#ff8a7a"),
 }
-NEUTRAL = "#767676"  # charts draw black in it: it stands out from both backgrounds
+NEUTRAL = "#767676"  # replaces black in charts; visible on both backgrounds
 MIN_CONTRAST = 4.5  # WCAG 2.2, level AA, for text; lines need 3
 _LIGHTENING_STEP = 0.04  # share of white added at a time
 
@@ -49,7 +49,7 @@ _MARKERS = {
 
 
 def palette(colours: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return all colours of a page by name, `light` and `dark`, for these colours of figures."""
+    """Return the colours of the light and of the dark page by name, for colours of figures."""
     light, dark = ({name: pair[k] for name, pair in _SURFACES.items()} for k in (0, 1))
     used = {"accent": BLUE, "warm": ORANGE} | {css_name(c): c for c in colours if c != BLACK}
     light |= {name: colour.lower() for name, colour in used.items()}
@@ -59,7 +59,7 @@ def palette(colours: Iterable[str]) -> dict[str, dict[str, str]]:
 
 
 def css_name(colour: str) -> str:
-    """Return the page's name of a colour of the figures; black is the ink, white on dark."""
+    """Return the page's name of a colour of the figures; black is the colour of text."""
     return "ink" if colour == BLACK else f"c{colour[1:].lower()}"
 
 
@@ -103,7 +103,7 @@ def chart_template(theme: str) -> dict[str, Any]:
 
 
 def lightened(colour: str, background: str) -> str:
-    """Add as much white to a colour as it needs to stand out from a dark background."""
+    """Lighten a colour until its contrast with a dark background is `MIN_CONTRAST`."""
     white, found = 0.0, colour.lower()
     while contrast(found, background) < MIN_CONTRAST:
         white += _LIGHTENING_STEP

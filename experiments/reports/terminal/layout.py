@@ -1,6 +1,6 @@
-"""How tables look, and what commands show while they work and when they are done.
+"""Tables, lines, progress displays and listings on the terminal.
 
-All that is printed goes through `_console`: it takes nothing for markup, whoever a text is from.
+All output goes through `_console`, which interprets no markup: texts may come from users.
 """
 
 from __future__ import annotations
@@ -26,33 +26,43 @@ from rich.text import Text
 
 from experiments.reports.formatting import UNKNOWN, interval, number, plain
 
-if TYPE_CHECKING:  # listings have no frames, and do not wait for it
+if TYPE_CHECKING:  # listings without data frames skip this slow import
     import pandas as pd
 
 Column = tuple[str, str]  # heading and format
-_LEAST_TEXT = 8  # characters: a name that is folded can still be read
+_LEAST_TEXT = 8  # characters of a column of text: folded names stay legible
 NO_ESTIMATE = "given: share with an estimate; without one the error is infinite"
 _GAP = 2  # characters between columns
 
 
 OnProgress = Callable[[str, int, int], None]
-_LINE_EVERY_S = 30.0  # of progress in a log file: an hour's run stays below some hundred lines
+_LINE_EVERY_S = 30.0  # between lines of progress in a log file
 
 
 def _console(stderr: bool = False) -> Console:
-    """Nothing in a text is a style, a link or a picture's name, and no line is cut."""
+    """Return a console that interprets no styles, links or emoji, and cuts no line."""
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager
 def progress() -> Iterator[OnProgress]:
-    """A progress display on stderr; yields the function to tell (label, done, total).
+    """Show progress on stderr; yield the function to call with (label, done, total).
 
-    Bars on a terminal, lines elsewhere.
+    A terminal gets bars. Other outputs get a line at the start and at the end of each task, and
+    every `_LINE_EVERY_S` seconds between.
     """
     console = _console(stderr=True)
     if not console.is_terminal:
-        yield _progress_lines(console)
+        printed: dict[str, tuple[int, float]] = {}  # number done and time of the last line
+
+        def print_line(label: str, done: int, total: int) -> None:
+            now_s = time.monotonic()
+            last, at_s = printed.get(label, (-1, -_LINE_EVERY_S))
+            if done != last and (done in (0, total) or now_s - at_s >= _LINE_EVERY_S):
+                console.print(Text(plain(f"{label}: {done}/{total}")))
+                printed[label] = done, now_s
+
+        yield print_line
         return
     bars: dict[str, TaskID] = {}
     with Progress(
@@ -72,28 +82,14 @@ def progress() -> Iterator[OnProgress]:
         yield show
 
 
-def _progress_lines(console: Console) -> OnProgress:
-    """A line when something begins, when it is done, and now and then between."""
-    told: dict[str, tuple[int, float]] = {}
-
-    def show(label: str, done: int, total: int) -> None:
-        now_s = time.monotonic()
-        last, at_s = told.get(label, (-1, -_LINE_EVERY_S))
-        if done != last and (done in (0, total) or now_s - at_s >= _LINE_EVERY_S):
-            console.print(Text(plain(f"{label}: {done}/{total}")))
-            told[label] = done, now_s
-
-    return show
-
-
 def print_table(
     columns: Collection[Column], rows: Iterable[Sequence[Any]], title: str = "", note: str = ""
 ) -> None:
     """Print a table, if it has any rows, with a title above and a note below.
 
-    A heading may have two lines; without a format its column is text. A cell is None or NaN where
-    nothing is known, (value, low, high) with an interval, or styled text. Where the screen is
-    narrow text gives way, and never a number: what is too wide even then goes beyond the edge.
+    A heading may have two lines. A column without a format is text. A cell is a value, None or NaN
+    if it is unknown, (value, low, high) with an interval, or styled text. On a narrow screen text
+    is folded and numbers are not; a table that is still too wide exceeds the screen.
     """
     layouts = [layout for _, layout in columns]
     cells = [[*map(_cell, row, layouts)] for row in rows]
@@ -124,15 +120,15 @@ def print_table(
 
 
 def columns(layout: str, **headings: str) -> dict[str, Column]:
-    """Columns of one format, by their names in a frame."""
+    """Return columns of one format, by their names in a data frame."""
     return {name: (heading, layout) for name, heading in headings.items()}
 
 
 def print_frame(
     frame: pd.DataFrame, shown: Mapping[str, Column], title: str = "", note: str = ""
 ) -> None:
-    """Print columns of a frame by name, with the intervals in their NAME_low and NAME_high."""
-    if frame.empty:  # a table that could not be made has no columns either
+    """Print columns of a data frame by name, with intervals from NAME_low and NAME_high."""
+    if frame.empty:  # without rows there may be no columns
         return
     cells = [
         frame[[name, f"{name}_low", f"{name}_high"]].itertuples(index=False, name=None)
@@ -144,6 +140,7 @@ def print_frame(
 
 
 def _cell(value: Any, layout: str) -> Text:
+    """Return the text of a cell."""
     if isinstance(value, Text):
         return value
     if value is None:
@@ -155,18 +152,51 @@ def _cell(value: Any, layout: str) -> Text:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print lines as they are, however long."""
+    """Print lines without folding them."""
     console = _console()
     for line in lines:
         console.print(Text(plain(line)))
 
 
 def print_paths(folder: Path, paths: Sequence[Path], skipped: Sequence[str] = ()) -> None:
-    """Where files were written."""
+    """Print the number of files, their folder, and figures that were not drawn."""
     print_lines([f"{len(paths)} written to {folder}"])
     print_skipped(skipped)
 
 
 def print_skipped(skipped: Sequence[str]) -> None:
-    """A line for each figure that could not be drawn."""
+    """Print a line for each figure that could not be drawn."""
     print_lines(f"  not drawn: {line}" for line in skipped)
+
+
+def print_methods() -> None:
+    """Print every alignment method with kind, package and version, and reasons of absence."""
+    from experiments.plugins.discovery import known_methods, name_clashes
+
+    methods = known_methods().values()
+    rows = [
+        (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
+        for each in methods
+    ]
+    headings = ("method", "kind", "package", "version")
+    print_table([(heading, "") for heading in headings], rows, "Alignment methods")
+    absent = [f"{each.name}: {each.absence}" for each in methods if each.absence]
+    print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
+
+
+def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:
+    """Print the scenarios of a folder."""
+    shown = [("scenario", ""), ("tags", ""), ("robots", "g"), ("iterations", ">")]
+    shown += [("overlap", ".2f"), ("description", "")]
+    rows = [
+        (
+            each["name"],
+            " ".join(each["tags"]),
+            each["robots"],
+            "recorded" if each["recorded"] else each["iterations"],
+            each["overlap"],
+            each["description"],
+        )
+        for each in entries
+    ]
+    print_table(shown, rows)

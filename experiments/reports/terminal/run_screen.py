@@ -38,7 +38,6 @@ from experiments.reports.terminal.layout import (
 from experiments.studies.error_bands import ROBOT_PAIR, error_bands
 from experiments.studies.method_comparison import aligner_summary
 from mapfusion.align.alignment import NOT_RUN, Status
-from mapfusion.datasets.stereo_import import Imported
 from mapfusion.fusion.fused_map import FusedMap
 from mapfusion.geometry.se2 import motion_sigma
 
@@ -46,19 +45,29 @@ _SEEDS_SHOWN = 3  # one by one, in a table of checks
 
 
 def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
-    """The table of all aligners, and where everything is."""
+    """Print the tables of a run, and the folders of tables and figures."""
 
     def table(name: str) -> pd.DataFrame:
         return tables.read(tables.table_path(result, name), name)
 
     errors = table("errors")
     aligners = methods_in(errors, oracle=True)
-    if aligners:  # else a robot that was alone
+    if aligners:
         _print_aligners(errors, aligner_summary(errors, table("aligner_timings"), aligners))
         print_lines(f"  {line}" for line in not_run_lines(errors))
         _print_pairs(errors, aligners[0])
     elif len(estimates := table("estimates")):
-        _print_answers(estimates)
+        # Without truth: shares of maps and repetitions
+        by_aligner = estimates.groupby("aligner", sort=False)
+        shares = {
+            name: by_aligner[column].agg(lambda status: (status == Status.ACCEPTED).mean())
+            for name, column in (("estimated", "status"), ("refined", "refined_status"))
+        }
+        rows = pd.DataFrame(shares | {"accepted": by_aligner["accepted"].mean()}).reset_index()
+        shown = columns("", aligner="aligner")
+        shown |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
+        note = "share of all maps and repetitions; accepted: more than chance, not contradicted"
+        print_frame(rows, shown, "Answers (no truth: errors are unknown)", note)
         print_lines(f"  {line}" for line in not_run_lines(estimates))
     shown = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
     shown |= columns(".3f", odometry_m="odometry, m") | columns(".2f", over_odometry="ratio")
@@ -66,63 +75,10 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     paths = path_rms(table("robots"))
     known = paths["path_m"].notna().any()
     print_frame(paths, shown, "Position errors (RMS)" if known else "Robots (no truth: no errors)")
-    print_lines(
-        ["  Maps and figures hold the landmarks that were seen often enough (slam.min_count)."]
-    )
+    print_lines(["  Maps and figures contain landmarks with slam.min_count or more observations."])
     _print_smoother(table("smoother"))
     _print_fusers(table("fusers"))
     pairs = table("team_pairs")
-    _print_team_pairs(pairs)
-    _print_times(table("timings"))
-    told = team_lines(table("fused_motions"), table("team"), pairs)
-    print_lines(f"  {line}" for line in (*told, *edge_lines(table("team_edges"))))
-    print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
-    print_skipped(skipped_figures)
-
-
-def _print_smoother(rows: pd.DataFrame) -> None:
-    smoothed = rows[rows["not_smoothed"] == ""]
-    if smoothed["path_rmse_m"].notna().any() or smoothed["landmark_rmse_m"].notna().any():
-        shown = columns("", robot="robot") | columns(".3f", path_rmse_m="path, m")
-        shown |= columns(".1f", filter_over_smoother="FastSLAM's\nover it")
-        shown |= columns(".3f", landmark_rmse_m="landmarks\nm")
-        shown |= columns(".3f", filter_landmark_rmse_m="FastSLAM's\nm")
-        shown |= columns(".1%", gross_share="gross\n") | columns(".2f", nees_per_dof="NEES\n/ dof")
-        shown |= columns(".0%", coverage_95="in\n95 %")
-        note = f"paths from the start; landmarks fitted, without gross ones (over {GROSS_M} m)"
-        print_frame(smoothed, shown, "Batch smoother: what the filter loses against it", note)
-    reasons = rows[["robot", "not_smoothed"]].itertuples(index=False)
-    print_lines(f"  {robot} is not smoothed: {why}" for robot, why in reasons if why)
-
-
-def _print_times(timings: pd.DataFrame) -> None:
-    """Print the work of each stage, and of what a run does beside its stages."""
-    rows = tables.work_by_stage(timings)
-    rows["share"] = rows["seconds"] / rows["seconds"].sum()
-    shown = columns("", stage="stage") | columns(".1f", seconds="work, s")
-    shown |= columns(".0%", share="share") | columns("d", tasks="tasks")
-    note = "of one process at a time, also where it was done in an earlier run\n"
-    note += "start: imports and the scenario, of this command's own process"
-    print_frame(rows, shown, "Work by stage", note)
-
-
-def _print_fusers(rows: pd.DataFrame) -> None:
-    shown = columns("", fuser="fuser") | columns(".3f", landmark_rmse_m="frame\nm")
-    shown |= columns(".3f", fitted_rmse_m="fitted\nm") | columns(".1%", gross_share="gross\n")
-    shown |= columns(".2f", over_better_parent="over\nparent", over_better_filter="over\nfilter")
-    shown |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
-    shown |= columns(".3f", alignment_error_m="T_a_b\nm", alignment_sigma_m="sigma\nm")
-    note = f"RMS errors in the map's frame and fitted, without gross ones (over {GROSS_M} m)\n"
-    note += "over: fitted error over the better of the maps given, and of FastSLAM's\n"
-    note += "T_a_b: error of the other robots' places, median, with the sigma that is stated"
-    last = last_fused(rows)
-    print_frame(last, shown, "Fusers: maps of all robots together, at the end", note)
-    reasons = last[["fuser", "fallback"]].itertuples(index=False)
-    print_lines(f"  {fuser}: {why}" for fuser, why in reasons if why)
-
-
-def _print_team_pairs(pairs: pd.DataFrame) -> None:
-    """Of three robots or more: T_a_b by the pair's own alignment, and by all of the team."""
     if len(pairs) > 1:
         names = pairs["robot_a"] + " - " + pairs["robot_b"]
         shown = columns("", pair="pair", place="its alignment")
@@ -130,26 +86,57 @@ def _print_team_pairs(pairs: pd.DataFrame) -> None:
         shown |= columns("+.4f", refined_rotation_error_rad="\nrad")
         shown |= columns(".3f", team_translation_error_m="in the team\nm")
         shown |= columns("+.4f", team_rotation_error_rad="\nrad") | columns("d", n_common="common")
-        note = "its alignment: what loops of the others say of it; common: landmarks of both maps"
-        print_frame(pairs.assign(pair=names), shown, "Pairs as the team places them", note)
+        note = "errors of T_a_b, from the pair's own alignment and from all of the team\n"
+        note += "its alignment: agreement with loops of the others; common: landmarks of both maps"
+        print_frame(pairs.assign(pair=names), shown, "Pairs in the team", note)
+    # Work of each stage, and of a run beside its stages
+    times = tables.work_by_stage(table("timings"))
+    times["share"] = times["seconds"] / times["seconds"].sum()
+    shown = columns("", stage="stage") | columns(".1f", seconds="work, s")
+    shown |= columns(".0%", share="share") | columns("d", tasks="tasks")
+    note = "time of one process at a time, including work of earlier runs\n"
+    note += "start: imports and the scenario, in this command's own process"
+    print_frame(times, shown, "Work by stage", note)
+    told = team_lines(table("fused_motions"), table("team"), pairs)
+    print_lines(f"  {line}" for line in (*told, *edge_lines(table("team_edges"))))
+    print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
+    print_skipped(skipped_figures)
 
 
-def _print_answers(estimates: pd.DataFrame) -> None:
-    """Without truth: how often each aligner answered, was refined and was accepted."""
-    by_aligner = estimates.groupby("aligner", sort=False)
-    shares = {
-        name: by_aligner[column].agg(lambda told: (told == Status.ACCEPTED).mean())
-        for name, column in (("estimated", "status"), ("refined", "refined_status"))
-    }
-    rows = pd.DataFrame(shares | {"accepted": by_aligner["accepted"].mean()}).reset_index()
-    shown = columns("", aligner="aligner")
-    shown |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
-    note = "share of all maps and repetitions; accepted: more than chance, and not contradicted"
-    print_frame(rows, shown, "Answers (no truth: errors are unknown)", note)
+def _print_smoother(rows: pd.DataFrame) -> None:
+    """Print the errors of the batch smoother beside those of the filter."""
+    smoothed = rows[rows["not_smoothed"] == ""]
+    if smoothed["path_rmse_m"].notna().any() or smoothed["landmark_rmse_m"].notna().any():
+        shown = columns("", robot="robot") | columns(".3f", path_rmse_m="path, m")
+        shown |= columns(".1f", filter_over_smoother="FastSLAM\n/ smoother")
+        shown |= columns(".3f", landmark_rmse_m="landmarks\nm")
+        shown |= columns(".3f", filter_landmark_rmse_m="FastSLAM's\nm")
+        shown |= columns(".1%", gross_share="gross\n") | columns(".2f", nees_per_dof="NEES\n/ dof")
+        shown |= columns(".0%", coverage_95="in\n95 %")
+        note = f"paths from the start; landmarks fitted, without gross ones (over {GROSS_M} m)"
+        print_frame(smoothed, shown, "Batch smoother beside the filter", note)
+    reasons = rows[["robot", "not_smoothed"]].itertuples(index=False)
+    print_lines(f"  {robot} is not smoothed: {why}" for robot, why in reasons if why)
+
+
+def _print_fusers(rows: pd.DataFrame) -> None:
+    """Print the errors of the fused maps, by fuser."""
+    shown = columns("", fuser="fuser") | columns(".3f", landmark_rmse_m="frame\nm")
+    shown |= columns(".3f", fitted_rmse_m="fitted\nm") | columns(".1%", gross_share="gross\n")
+    shown |= columns(".2f", over_better_parent="over\nparent", over_better_filter="over\nfilter")
+    shown |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
+    shown |= columns(".3f", alignment_error_m="T_a_b\nm", alignment_sigma_m="sigma\nm")
+    note = f"RMS errors in the map's frame and fitted, without gross ones (over {GROSS_M} m)\n"
+    note += "over: fitted error over that of the better given map, and FastSLAM map\n"
+    note += "T_a_b: median error of the other robots' poses, with the stated sigma"
+    last = last_fused(rows)
+    print_frame(last, shown, "Fusers: maps of all robots together, at the end", note)
+    reasons = last[["fuser", "fallback"]].itertuples(index=False)
+    print_lines(f"  {fuser}: {why}" for fuser, why in reasons if why)
 
 
 def not_run_lines(errors: pd.DataFrame) -> list[str]:
-    """One line for each aligner, and each reason, that did not run."""
+    """Return one line for each aligner that did not run and each reason."""
     not_run = errors[errors["status"].isin(NOT_RUN)]
     n_rows = errors.groupby("aligner").size().to_dict()
     lines, causes = [], ["aligner", "status", "reason"]
@@ -160,6 +147,7 @@ def not_run_lines(errors: pd.DataFrame) -> list[str]:
 
 
 def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
+    """Print medians of the errors and times, by aligner."""
     shown = columns("", aligner="aligner")
     shown |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
     shown |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
@@ -175,7 +163,7 @@ def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
 
 
 def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
-    """Each pair at its last iteration: the first aligner, refined, beside the oracle."""
+    """Print each pair at its last iteration: one aligner, refined, beside the oracle."""
     shown = [("pair", "")]
     for whose in ("error", "oracle"):
         shown += [(f"{whose}, m", ".3f"), (f"{whose}, rad", "+.4f")]
@@ -192,13 +180,16 @@ def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
 
 
 def print_checks(checks: Sequence[CheckedScenario]) -> None:
-    """The table of a check."""
+    """Print the table of a check."""
     outcomes = [outcome for check in checks for outcome in check.outcomes]
     shown = columns("", scenario="scenario", metric="metric") | columns(".4g", value="measured")
     shown |= columns("", bound_text="expected", seeds="by seed", verdict="")
     rows = []
     for outcome in outcomes:
-        seeds = _by_seed(list(outcome.per_seed.values()))
+        values = list(outcome.per_seed.values())
+        seeds = f"{min(values):.3g} to {max(values):.3g}"
+        if len(values) <= _SEEDS_SHOWN:
+            seeds = "  ".join(f"{value:.3g}" for value in values)
         verdict = Text("pass", "green") if outcome.passed else Text("FAIL", "bold red")
         what = (outcome.scenario, outcome.metric, outcome.value, outcome.bound_text)
         rows.append((*what, seeds, verdict))
@@ -214,13 +205,6 @@ def print_checks(checks: Sequence[CheckedScenario]) -> None:
     of_all = f"{not_run} of {len(checks)} scenarios"
     errors = f"; {of_all} could not be checked" if not_run else ""
     print_lines([f"{n_passed} passed, {n_failed} failed{errors}"])
-
-
-def _by_seed(values: Sequence[float]) -> str:
-    """Each seed's value; of more than a line holds the smallest and the largest."""
-    if len(values) <= _SEEDS_SHOWN:
-        return "  ".join(f"{value:.3g}" for value in values)
-    return f"{min(values):.3g} to {max(values):.3g}"
 
 
 _MOTIONS = columns("", aligner="aligner")
@@ -247,7 +231,7 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     found = pd.DataFrame(rows)
     sigma_m, sigma_rad = motion_sigma(covariances_of(found))
     stated = found.assign(sigma_m=sigma_m, sigma_rad=sigma_rad)
-    note = "sigma: as stated for the refined one, of the distance and of the angle"
+    note = "sigma: stated for the refined estimate, of distance and angle"
     print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
     inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
     verdicts = [str(final_status(row)[0]) for row in rows]
@@ -255,20 +239,20 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     print_frame(
         found.assign(inliers=inliers, time=times, verdict=verdicts),
         _VERDICTS,
-        "Verdicts on the refined ones",
-        "NFA: expected number of alignments that chance alone supports as well; evidence:\n"
-        "how much likelier what both robots saw is if it is right; time: of the estimate",
+        "Verdicts on the refined estimates",
+        "NFA: expected number of alignments with as much support by chance; evidence: ratio\n"
+        "of the likelihoods of both robots' observations if it is right; time: of the estimate",
     )
 
 
 def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
-    """What a fused map was made of."""
+    """Print the landmarks and the motions of a fused map."""
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
     n_maps = len(fused.members)
     lines = [
         f"{len(fused.landmarks)} landmarks in {path}: fused from {n_maps} maps; {several} "
-        f"landmarks are of several maps, {fused.duplicate_share:.1%} look like duplicates that "
-        "remain"
+        f"landmarks are of several maps, {fused.duplicate_share:.1%} look like remaining "
+        "duplicates"
     ]
     sigmas = zip(*motion_sigma(fused.motion_covariance), strict=True)
     for name, (x_m, y_m, theta_rad), sigma in zip(maps, fused.T_first_map, sigmas, strict=True):
@@ -281,19 +265,19 @@ def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
 
 
 def print_unmerged(merged: MergeResult, maps: Sequence[Path]) -> None:
-    """Why each two maps were not merged."""
+    """Print the reason for each pair of maps that was not merged."""
     print_lines(
         f"  {maps[a]} and {maps[b]}: not merged: {reason}"
         for (a, b), reason in merged.reasons().items()
     )
 
 
-_MOST_DROPPED = 5  # pictures that are named one by one
+_MOST_DROPPED = 5  # pictures that are listed
 _COLUMNS = [
     ("robot", ""),
     ("frames", "d"),
     ("seconds", ".1f"),
-    ("way, m", ".1f"),
+    ("path, m", ".1f"),
     ("observations\na frame", ".0f"),
     ("\nat least", "d"),
     ("linked\n%", ".0f"),
@@ -303,13 +287,32 @@ _COLUMNS = [
 
 
 def print_imported(recordings: Sequence[ImportedRecording], folders: Sequence[Path]) -> None:
-    """The cameras, a line a robot, what was dropped, and where the logs are."""
+    """Print cameras, a line for each robot, dropped pictures, and the folders of the logs."""
     print_lines(one.about for one in recordings)
     note = "median over the frames; linked: share of the features of the frame before"
-    print_table(_COLUMNS, [_row(log) for one in recordings for log in one.robots], "", note)
+    rows = []
+    for one in (robot for each in recordings for robot in each.robots):
+        log, seen = one.log, one.observations
+        known = 0 if one.truth is None else int(np.isfinite(one.truth).all(axis=1).sum())
+        odometry = "recorded"
+        if one.odometry_covariance is not None:
+            odometry = f"pictures, {one.guessed} guessed" if one.guessed else "pictures"
+        row = (
+            log.robot,
+            len(log),
+            float(log.time_s[-1] - log.time_s[0]),
+            float(np.hypot(*log.odometry[:, :2].T).sum()),
+            float(np.median(seen)),
+            int(seen[np.argmax(seen > 0) :].min()),  # tracks must last before any is observed
+            100 * float(np.nanmedian(one.linked)),
+            odometry,
+            f"{known} frames" if known else "none",
+        )
+        rows.append(row)
+    print_table(_COLUMNS, rows, "", note)
     print_lines(
         f"  {log.log.robot}: guessed motions: {log.guessed}, its map may break there; "
-        "odometry of the wheels would tell them"
+        "wheel odometry would bridge them"
         for one in recordings
         for log in one.robots
         if log.guessed
@@ -319,25 +322,3 @@ def print_imported(recordings: Sequence[ImportedRecording], folders: Sequence[Pa
     if len(dropped) > _MOST_DROPPED:
         print_lines([f"  dropped: {len(dropped) - _MOST_DROPPED} more"])
     print_lines(map(str, folders))
-
-
-def _row(one: Imported) -> tuple[object, ...]:
-    log, seen = one.log, one.observations
-    known = 0 if one.truth is None else int(np.isfinite(one.truth).all(axis=1).sum())
-    return (
-        log.robot,
-        len(log),
-        float(log.time_s[-1] - log.time_s[0]),
-        float(np.hypot(*log.odometry[:, :2].T).sum()),
-        float(np.median(seen)),
-        int(seen[np.argmax(seen > 0) :].min()),  # tracks must last before any is observed
-        100 * float(np.nanmedian(one.linked)),
-        _odometry(one),
-        f"{known} frames" if known else "none",
-    )
-
-
-def _odometry(one: Imported) -> str:
-    if one.odometry_covariance is None:
-        return "recorded"
-    return f"pictures, {one.guessed} guessed" if one.guessed else "pictures"

@@ -1,10 +1,9 @@
-"""What `mapfusion statistics` and `mapfusion compare` show."""
+"""Screens of `statistics` and `compare`."""
 
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,9 +23,9 @@ from experiments.studies import comparison
 from experiments.studies.intervals import FEW_RUNS, MAPS_OF_ONE_RUN
 from experiments.studies.statistics import ALL_SCENARIOS, Summary
 
-_MAX_CONFIGURATIONS = 6  # more would fill screens; the files hold all
-_TEXT_WIDTH = 80  # columns of a terminal that nobody has widened
-# In the order of a comparison's rows: what the table calls it, in which colour.
+_MAX_CONFIGURATIONS = 6  # on the screen; the files have all
+_TEXT_WIDTH = 80  # default width of terminals
+# Text and style of each verdict, in the order of a comparison's rows
 _VERDICTS = {
     comparison.WORSE: ("worse", "bold red"),
     comparison.BETTER: ("better", "green"),
@@ -36,7 +35,7 @@ _VERDICTS = {
 }
 _PATH_NAMES = {"ate_m": "ATE, m", "rpe_m": "RPE, m", "rpe_rad": "RPE, rad"}
 
-# Columns of tables; intervals, where there are any, stand beside the numbers.
+# Columns of tables; intervals are shown beside the numbers.
 _METHOD = columns("", aligner="method")
 _SUCCESS = _METHOD | columns(".0%", estimated_success="as estimated", refined_success="refined")
 _STAGES = {"estimated": "as estimated", "refined": "refined"}
@@ -65,7 +64,7 @@ _NEES |= columns(".0%", share_in_gate="in gate")
 
 
 def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]) -> None:
-    """The main tables, and where all of them are."""
+    """Print the main tables, and the folder of all tables."""
     _print_success(_rows(summary, "success_at_the_end"), summary.n_runs)
     _print_by_true_pairs(_rows(summary, "success_by_true_pairs"))
     ratios = _rows(summary, "error_over_oracle")
@@ -78,11 +77,38 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
             ratios, shown, f"Median translation error {kind}, and its ratio to the oracle's", note
         )
     _print_best_against_others(_rows(summary, "methods_compared"), ratios)
-    _print_paths(_rows(summary, "paths"))
-    _print_smoother(_rows(summary, "smoother"))
-    _print_fusers(_rows(summary, "fusers"))
-    _print_team(_rows(summary, "team"), _rows(summary, "team_pairs"))
-    _print_nees(_rows(summary, "nees"))
+    paths = _rows(summary, "paths")
+    if len(paths):
+        paths = paths.assign(error=paths["quantity"].map(_PATH_NAMES))
+        paths = paths[paths["error"].notna() & (paths["delta_unit"] != "frames")]
+        note = "ATE: after the best rigid fit; RPE: relative, along a metre; (95 %, bootstrap)"
+        _print(paths, _PATHS, "Path errors, median over robots and runs", note)
+    smoothed = _rows(summary, "smoother")
+    if len(smoothed):
+        note = "ratio: FastSLAM's final path over the smoothed one; landmarks: fitted; "
+        note += "(95 %, bootstrap)"
+        _print(smoothed, _SMOOTHER, "Batch smoother, median over robots and runs", note)
+    fused = _rows(summary, "fusers")
+    if len(fused):
+        note = "landmarks: RMS in the frame of the first robot, without gross ones; over filter:\n"
+        note += "fitted error over that of the better FastSLAM map; (95 %, bootstrap)"
+        _print(fused, _FUSERS, "Fused maps by fuser at the end, median over runs", note)
+    team, pairs = _rows(summary, "team"), _rows(summary, "team_pairs")
+    if len(team):
+        robots = team["n_robots"].map(str) + "/" + team["n_team"].map(str)
+        note = "all merged robots under one rigid fit, median over runs; (95 %, bootstrap)"
+        _print(team.assign(robots=robots), _TEAM, "Path errors of teams (ATE)", note)
+    if len(pairs):
+        note = "precision: right ones of those used; recall: found ones of those that met;\n"
+        note += "errors of T_a_b, medians over pairs in one map; (95 %, Wilson, bootstrap)"
+        _print(pairs, _TEAM_PAIRS, "Alignments between robots at the end", note)
+    nees = _rows(summary, "nees")
+    if len(nees):
+        low, high = (nees[name].map("{:.2f}".format) for name in ("band_low", "band_high"))
+        nees = nees.drop(columns=["band_low", "band_high"]).assign(band=low + "–" + high)
+        title = "Landmark NEES per degree of freedom: 1 is consistent, more is overconfident"
+        note = "chi-square: 95 % band of a consistent mean; in gate: of 95 %; (95 %, bootstrap)"
+        _print(nees, _NEES, title, note)
     layout.print_lines(_caveats(summary))
     layout.print_skipped(skipped)
     if written is not None:
@@ -91,7 +117,7 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
 
 
 def _rows(summary: Summary, name: str) -> pd.DataFrame:
-    """The rows for the screen: of several scenarios only all together, of few configurations."""
+    """Return the rows for the screen: pooled scenarios only, and few configurations."""
     table = summary.tables.get(name, pd.DataFrame({"scenario": []}))
     if (table["scenario"] == ALL_SCENARIOS).any():
         table = table[table["scenario"] == ALL_SCENARIOS]
@@ -100,123 +126,78 @@ def _rows(summary: Summary, name: str) -> pd.DataFrame:
 
 
 def _labels(rows: pd.DataFrame) -> list[str]:
+    """Return the names of the columns of scenario and settings."""
     return ["scenario", *setting_columns(rows)]
 
 
 def _print(rows: pd.DataFrame, shown: Mapping[str, layout.Column], title: str, note: str) -> None:
-    """A table of these rows, with the columns in front that tell configurations apart."""
+    """Print a table, with the columns in front in which configurations differ."""
     apart = columns("", **{name: name for name in _labels(rows) if len(rows[name].unique()) > 1})
     layout.print_frame(rows, {**apart, **shown}, title, note)
 
 
 def _print_success(rows: pd.DataFrame, n_runs: int) -> None:
+    """Print success rates and verdicts at the last iteration."""
     if rows.empty:
         return
     within = f"within {RIGHT_WITHIN_M:g} m and {RIGHT_WITHIN_RAD:g} rad"
     caption = f"{within}, the reach of the refinement"
-    n_apart, n_maps = rows[["n_apart", "n_maps"]].max()  # all methods see the same maps
+    n_apart, n_maps = rows[["n_apart", "n_maps"]].max()  # equal for all methods
     if n_apart:
         caption += f"; without the {n_apart} of {n_maps} pairs of maps that have no common ground"
     title = f"Right at the end of {_runs(n_runs)}"
     _print(rows, _SUCCESS, title, f"{caption}; (95 %, Wilson)")
     if "accepted" not in rows:
         return
-    ground = "accepted where\nthere is common ground" if n_apart else "accepted"
+    ground = "accepted with\ncommon ground" if n_apart else "accepted"
     shown = _METHOD | columns(".0%", accepted=ground, false_accepted="accepted\nthough wrong")
     if n_apart:
-        shown |= columns(".0%", refused_apart="refused where\nthere is none")
-    caption = "though wrong: of all, whatever ground; (95 %, Wilson)"
+        shown |= columns(".0%", refused_apart="refused without\ncommon ground")
+    caption = "though wrong: share of all pairs of maps; (95 %, Wilson)"
     _print(rows, shown, "Verdicts at the end", caption)
 
 
 def _print_by_true_pairs(rows: pd.DataFrame) -> None:
-    """Success as estimated by the number of true pairs: methods down, bins across."""
+    """Print success as estimated by the number of true pairs, one column per bin."""
     if rows.empty:
         return
     last = np.where(rows["to"] == math.inf, "+", "")
     rows = rows.assign(bin=rows["from"].map("{:.0f}".format) + last)
     shares = rows.pivot_table("estimated_success", [*_labels(rows), "aligner"], "bin", sort=False)
     bins = {name: name for name in rows.sort_values("from")["bin"] if name in shares}
-    caption = "by the number of true pairs, from the one given up; intervals are in the files"
+    caption = (
+        "by the number of true pairs, from the lower edge of each bin; intervals: see the files"
+    )
     title = "Share of the maps right as estimated"
     _print(shares.reset_index(), _METHOD | columns(".0%", **bins), title, caption)
 
 
 def _print_best_against_others(rows: pd.DataFrame, ratios: pd.DataFrame) -> None:
-    """The method with the smallest error as estimated, beside each other on the same maps."""
+    """Compare the method with the smallest estimated error to each other method on equal maps."""
     if rows.empty:
         return
     methods = ratios[ratios["aligner"] != ORACLE]
     best = str(methods.groupby("aligner")["estimated_m"].median().idxmin())
-    others = _the_other_way_round(rows[rows["second"] == best])
-    beside = pd.concat([rows[rows["first"] == best], others]).sort_index()
+    # Exchange first and second where the best method is the second one.
+    others = rows[rows["second"] == best]
+    turned = others.assign(first=others["second"], second=others["first"])
+    for end, other in (("", ""), ("_low", "_high"), ("_high", "_low")):
+        turned[f"ratio{end}"] = 1 / others[f"ratio{other}"]
+        turned[f"first_wins{end}"] = 1 - others[f"first_wins{other}"]
+    beside = pd.concat([rows[rows["first"] == best], turned]).sort_index()
     title = f"{best} against each other method on the same maps, as estimated"
     caption = "median ratio, and share of the maps; (95 %, bootstrap)"
     _print(beside, _AGAINST, title, caption)
 
 
-def _the_other_way_round(rows: pd.DataFrame) -> pd.DataFrame:
-    """The same comparisons with the methods in the other order."""
-    turned = rows.assign(first=rows["second"], second=rows["first"])
-    for end, other in (("", ""), ("_low", "_high"), ("_high", "_low")):
-        turned[f"ratio{end}"] = 1 / rows[f"ratio{other}"]
-        turned[f"first_wins{end}"] = 1 - rows[f"first_wins{other}"]
-    return turned
-
-
-def _print_paths(rows: pd.DataFrame) -> None:
-    if len(rows):
-        rows = rows.assign(error=rows["quantity"].map(_PATH_NAMES))
-        rows = rows[rows["error"].notna() & (rows["delta_unit"] != "frames")]
-        title = "Path errors, median over robots and runs"
-        note = "ATE: after the best rigid fit; RPE: relative, along a metre; (95 %, bootstrap)"
-        _print(rows, _PATHS, title, note)
-
-
-def _print_smoother(rows: pd.DataFrame) -> None:
-    title = "Batch smoother, median over robots and runs"
-    note = (
-        "ratio: FastSLAM's final path over the smoothed one; landmarks: fitted; (95 %, bootstrap)"
-    )
-    if len(rows):
-        _print(rows, _SMOOTHER, title, note)
-
-
-def _print_fusers(rows: pd.DataFrame) -> None:
-    if len(rows):
-        title = "Fused maps by fuser at the end, median over runs"
-        note = "landmarks: RMS in the frame of the first robot, without gross ones; over filter:\n"
-        note += "fitted error over that of the better FastSLAM map; (95 %, bootstrap)"
-        _print(rows, _FUSERS, title, note)
-
-
-def _print_team(rows: pd.DataFrame, pairs: pd.DataFrame) -> None:
-    if len(rows):
-        robots = rows["n_robots"].map(str) + "/" + rows["n_team"].map(str)
-        note = "all merged robots under one rigid fit, median over runs; (95 %, bootstrap)"
-        _print(rows.assign(robots=robots), _TEAM, "Path errors of teams (ATE)", note)
-    if len(pairs):
-        note = "precision: right of those believed; recall: found of those that met;\n"
-        note += "errors of T_a_b, medians over pairs in one map; (95 %, Wilson, bootstrap)"
-        _print(pairs, _TEAM_PAIRS, "Alignments between robots at the end", note)
-
-
-def _print_nees(rows: pd.DataFrame) -> None:
-    if len(rows):
-        low, high = (rows[name].map("{:.2f}".format) for name in ("band_low", "band_high"))
-        rows = rows.drop(columns=["band_low", "band_high"]).assign(band=low + "–" + high)
-        title = "Landmark NEES per degree of freedom: 1 is consistent, more is too sure"
-        note = "chi-square: 95 % band of a consistent mean; in gate: of 95 %; (95 %, bootstrap)"
-        _print(rows, _NEES, title, note)
-
-
 def _caveats(summary: Summary) -> list[str]:
+    """Return warnings about few runs, and notes on what is not shown."""
     lines, n_runs, n_settings = [], summary.n_runs, summary.n_configurations
     if n_runs == 1:
-        depend = "which depend on each other, and nothing of other seeds"
-        lines.append(f"One run: the brackets tell of the {MAPS_OF_ONE_RUN}, {depend}.")
+        depend = "which depend on each other; they say nothing about other seeds"
+        lines.append(f"One run: the intervals are over the {MAPS_OF_ONE_RUN}, {depend}.")
     elif summary.n_worlds < FEW_RUNS:
-        too_narrow = f"bootstrap intervals of so few are too narrow; take {FEW_RUNS} seeds or more"
+        too_narrow = f"bootstrap intervals of so few are too narrow; use {FEW_RUNS} seeds or more"
         worlds = f"{summary.n_worlds} world{'s' * (summary.n_worlds > 1)}"
         lines.append(f"{n_runs} runs in {worlds} (scenario and seed): {too_narrow}.")
     if n_settings > _MAX_CONFIGURATIONS:
@@ -232,14 +213,22 @@ def _caveats(summary: Summary) -> list[str]:
 def print_comparison(
     found: comparison.VersionComparison, show_all: bool, written: Path | None
 ) -> None:
-    """What got better or worse, how sure that is, and what must be known beside it."""
+    """Print changes between two versions with intervals, verdicts and notes."""
     table, order = found.table, list(_VERDICTS)
     changed = table["verdict"].isin([comparison.BETTER, comparison.WORSE])
     rows = (table if show_all else table[changed]).sort_values(
         "verdict", key=lambda names: names.map(order.index), kind="stable"
     )
     shown = [("method", ""), ("metric", ""), ("first", ">"), ("second", ">"), ("change", ">")]
-    cells, title = map(_compared, rows.to_dict("records")), "Second version against the first"
+    cells: list[list[str | Text]] = []
+    for row in rows.to_dict("records"):
+        value = {"share": ".0%"}.get(row["scale"], ".3g")
+        change = {"share": "+.0%", "ratio": ".2f"}.get(row["scale"], "+.2f")
+        is_same = row["verdict"] == comparison.SAME
+        changed_by = interval(row["change"], row["low"], row["high"], change)
+        texts = [row["method"], row["metric"], number(row["a"], value), number(row["b"], value)]
+        cells.append([*texts, "" if is_same else changed_by, Text(*_VERDICTS[row["verdict"]])])
+    title = "Second version against the first"
     note = "change: factor, or difference; (95 %, Student's t); verdict: 5 % over "
     note += f"{table['p'].notna().sum()} tests"
     layout.print_table([*shown, ("verdict", "")], cells, title, note)
@@ -253,18 +242,6 @@ def print_comparison(
         layout.print_lines([f"All rows (CSV, Markdown, LaTeX): {written}"])
 
 
-def _compared(row: dict[Any, Any]) -> list[str | Text]:
-    value = {"share": ".0%"}.get(row["scale"], ".3g")
-    change = {"share": "+.0%", "ratio": ".2f"}.get(row["scale"], "+.2f")
-    same = row["verdict"] == comparison.SAME
-    return [
-        row["method"],
-        row["metric"],
-        *(number(row[version], value) for version in ("a", "b")),
-        "" if same else interval(row["change"], row["low"], row["high"], change),
-        Text(*_VERDICTS[row["verdict"]]),
-    ]
-
-
 def _runs(n: int) -> str:
+    """Return "1 run" or "N runs"."""
     return "1 run" if n == 1 else f"{n} runs"

@@ -1,13 +1,11 @@
-"""Screens of `study`, `sweep`, `calibrate` and `scenarios`."""
-
-from __future__ import annotations
+"""Screens of `study`, `sweep` and `calibrate`."""
 
 import itertools
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 from ruamel.yaml import YAML
@@ -20,6 +18,7 @@ from experiments.evaluation.criteria import (
 )
 from experiments.evaluation.odometry_calibration import filter_settings
 from experiments.reports.formatting import interval, two_digits
+from experiments.reports.study_files import SHOWN, shown_numbers
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
     Column,
@@ -29,28 +28,29 @@ from experiments.reports.terminal.layout import (
     print_skipped,
     print_table,
 )
+from experiments.studies.independence.independence_trial import STRATEGIES
 from experiments.studies.refusal.rates import VERDICTS, Rate, Reliability, pooled, worst
-from experiments.studies.sweep import SweepProgress
+from experiments.studies.sweep import Survey, SweepProgress
 from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_plan import Survey
 from experiments.studies.sweep_tables import ERRORS, GIVEN, SweepDataset, medians_over_runs
-from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
+from mapfusion.align.alignment import Status
+from mapfusion.smoother.noise_estimation import LEVELS
 from mapfusion.smoother.odometry_calibration import Calibration
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-
-# A listing of scenarios needs neither methods nor studies: they are imported where they are shown.
 
 
 def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
-    """Successes and times for each number of pairs, and where the rest is."""
+    """Print successes and times for each number of pairs, and the folder of the results."""
+
+    def text(row: dict[Any, Any]) -> str:
+        if row["status"] == Status.ABSENT:
+            return "absent"
+        return f"{100 * row['success']:.0f}, {two_digits(1e3 * row['elapsed_s'])}"
+
     for n_pairs, rows in summary.groupby("n_pairs", sort=False):
         shares = rows["outlier_share"].drop_duplicates()
         shown = [("outliers", ""), *((f"{100 * share:g} %", ">") for share in shares)]
         cells = [
-            [method, *(_benchmark_cell(row) for row in own.to_dict("records"))]
+            [method, *(text(row) for row in own.to_dict("records"))]
             for method, own in rows.groupby("method", sort=False)
         ]
         print_table(shown, cells, f"{n_pairs} pairs: success in %, time in ms")
@@ -62,19 +62,8 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
     print_lines([f"Table and figure: {folder}"])
 
 
-def _benchmark_cell(row: dict[Any, Any]) -> str:
-    from mapfusion.align.alignment import Status
-
-    if row["status"] == Status.ABSENT:
-        return "absent"
-    return f"{100 * row['success']:.0f}, {two_digits(1e3 * row['elapsed_s'])}"
-
-
 def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[str]) -> None:
-    """Costs and errors of each way to one map (rows of `at_the_end`), and where the rest is."""
-    from experiments.reports.study_files import SHOWN, shown_numbers
-    from experiments.studies.independence.independence_trial import STRATEGIES
-
+    """Print costs and errors of each strategy (rows of `at_the_end`), and the folder."""
     headings = [("way", ""), *((heading, ">") for _, heading in SHOWN.values())]
     note = "; ".join(f"{strategy.name}: {strategy.label}" for strategy in STRATEGIES)
     for n_robots, rows in summary.groupby("n_robots"):
@@ -87,45 +76,12 @@ def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[st
     print_skipped(skipped)
 
 
-def print_methods() -> None:
-    """Every alignment method by name, whose it is, and what is wrong where something is."""
-    from experiments.plugins.discovery import known_methods, name_clashes
-
-    methods = known_methods().values()
-    rows = [
-        (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
-        for each in methods
-    ]
-    headings = ("method", "whose", "package", "version")
-    print_table([(heading, "") for heading in headings], rows, "Alignment methods")
-    absent = [f"{each.name}: {each.absence}" for each in methods if each.absence]
-    print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
-
-
-def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:
-    """The scenarios of a folder."""
-    shown = [("scenario", ""), ("tags", ""), ("robots", "g"), ("iterations", ">")]
-    shown += [("overlap", ".2f"), ("what it is", "")]
-    rows = [
-        (
-            each["name"],
-            " ".join(each["tags"]),
-            each["robots"],
-            "recorded" if each["recorded"] else each["iterations"],
-            each["overlap"],
-            each["description"],
-        )
-        for each in entries
-    ]
-    print_table(shown, rows)
-
-
 MAX_ROWS_SHOWN = 60
 MAX_FAILURES_SHOWN = 10
 
 
 def shown_by(show: Callable[[str, int, int], None]) -> Callable[[SweepProgress], None]:
-    """One progress bar of runs, one of each stage."""
+    """Return a function that shows one progress bar of runs and one of each stage."""
 
     def show_sweep(now: SweepProgress) -> None:
         show("runs", now.done, now.runs)
@@ -138,7 +94,7 @@ def shown_by(show: Callable[[str, int, int], None]) -> Callable[[SweepProgress],
 
 
 def print_survey(found: Survey) -> None:
-    """How many tasks there are, by stage."""
+    """Print the numbers of runs, and of tasks by stage."""
     refused = f", {found.runs_refused} that cannot be run" if found.runs_refused else ""
     print_lines([f"{found.runs} runs, {found.runs_finished} of them finished{refused}"])
     headings = [("stage", ""), *((name, "d") for name in ("wanted", "shared", "finished", "to do"))]
@@ -150,7 +106,7 @@ def print_survey(found: Survey) -> None:
 
 
 def print_sweep(dataset: SweepDataset, runs: Sequence[SweepRun], failed: Mapping[str, str]) -> None:
-    """Medians over the runs, and the failures."""
+    """Print medians over the runs, and the failures."""
     finished = [run for run in runs if run.run_id not in failed]
     lines = []
     if finished:
@@ -179,7 +135,7 @@ _SHOWN = columns("", robot="robot") | columns(">", **dict(zip(_CONSTANTS, _TITLE
 
 
 def calibration_rows(calibration: Calibration) -> list[dict[str, Any]]:
-    """Each robot's constants with their standard errors."""
+    """Return the constants of each robot with their standard errors."""
     return [
         {"robot": each.robot}
         | dict(zip(_CONSTANTS, each.error.constants.tolist(), strict=True))
@@ -192,8 +148,8 @@ def calibration_rows(calibration: Calibration) -> list[dict[str, Any]]:
 
 
 def document(calibration: Calibration, written: Sequence[Path]) -> dict[str, Any]:
-    """What `--json` prints."""
-    errors = zip(NOISE_PARAMETERS, calibration.relative_errors, strict=True)
+    """Return the content of `--json`."""
+    errors = zip(LEVELS, calibration.relative_errors, strict=True)
     return {
         "robots": calibration_rows(calibration),
         "settings": filter_settings(calibration),
@@ -205,7 +161,7 @@ def document(calibration: Calibration, written: Sequence[Path]) -> dict[str, Any
 
 
 def print_calibration(calibration: Calibration, written: Sequence[Path]) -> None:
-    """Constants, levels, and the section for a scenario."""
+    """Print the constants, and the section for a scenario."""
     rows = []
     for each in calibration.robots:
         values = zip(each.error.constants, each.standard_errors, _UNITS, strict=True)
@@ -214,9 +170,9 @@ def print_calibration(calibration: Calibration, written: Sequence[Path]) -> None
     print_frame(
         pd.DataFrame(rows),
         _SHOWN,
-        "What the odometry has to be corrected by",
-        "late turn: share of the turn before that is only made now; in place: turns on the spot,\n"
-        "beside those while driving",
+        "Corrections of the odometry",
+        "late turn: share of the previous turn that is made now; in place: of turns on the spot,\n"
+        "relative to turns while driving",
     )
     if not calibration.settled:
         n_rounds = calibration.n_rounds
@@ -239,8 +195,8 @@ _RATES = columns(
 
 
 def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
-    """False and missed merges of each aligner in ordinary worlds (rows of `refusal_rates`)."""
-    if not rows:  # all worlds repeat themselves
+    """Print false and missed merges of each aligner in ordinary worlds (rows of `summary`)."""
+    if not rows:  # all worlds contain repetitions
         return
     _print_rates(
         rows,
@@ -263,7 +219,7 @@ def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
 
 
 def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
-    """What verdicts make of each kind of world (rows of `kind_rates.by_kind`)."""
+    """Print false merges and verdicts for each kind of world (rows of `by_kind`)."""
     grouped = itertools.groupby(rows, key=lambda row: row["kind"])
     kinds = {kind: list(own) for kind, own in grouped}
     false = []
@@ -277,7 +233,12 @@ def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
         "Accepted though wrong, by kind of world",
         "of the method that is worst; runs: any of their maps",
     )
-    found = [[kind, *_right(own)] for kind, own in kinds.items()]
+    found = []
+    for kind, own in kinds.items():
+        shares = [_hits(pooled(own, f"right_{verdict}")) for verdict in VERDICTS]
+        first = [own[0][name] for name in ("first_iteration", "first_iteration_by_chance")]
+        times = ["–" if math.isnan(value) else f"{value:.0f}" for value in first]
+        found.append([kind, *shares, *times])
     shown = columns(">", kept="accepted", ambiguous="ambi-\nguous", uncertain="too un-\ncertain")
     shown |= columns(">", refused="refused", first="first at\niteration", chance="by\nchance")
     print_table(
@@ -290,19 +251,13 @@ def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
     )
 
 
-def _right(own: list[dict[str, Any]]) -> list[str]:
-    """What becomes of the right answers of one kind, and when the first is accepted."""
-    shares = [_hits(pooled(own, f"right_{verdict}")) for verdict in VERDICTS]
-    first = [own[0][name] for name in ("first_iteration", "first_iteration_by_chance")]
-    return [*shares, *("–" if math.isnan(value) else f"{value:.0f}" for value in first)]
-
-
 def _hits(rate: Rate) -> str:
+    """Return hits/n; a dash without cases."""
     return f"{rate.hits}/{rate.n}" if rate.n else "–"
 
 
 def print_reliability(found: Reliability) -> None:
-    """How the probability that verdicts state compares with what is right."""
+    """Print the stated probabilities beside the shares of right answers."""
     support, wrong = found.brier_of_support, f"{found.n_wrong} of {found.n} wrong"
     print_frame(
         found.bins,
@@ -317,6 +272,7 @@ def print_reliability(found: Reliability) -> None:
 def _print_rates(
     rows: Sequence[dict[str, Any]], shown: Mapping[str, Column], title: str, note: str
 ) -> None:
+    """Print rates by aligner."""
     cells = [
         [row["aligner"], *(f"{row[name].hits}/{row[name].n}" for name in shown)] for row in rows
     ]

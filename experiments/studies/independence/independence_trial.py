@@ -1,4 +1,4 @@
-"""Study of what independence costs: maps made alone and fused, beside one smoother of all logs.
+"""Study of the cost of independence: separate maps that are fused, beside one joint smoother.
 
 Costs are measured in this process, one piece after the other, when all other work is done. Each
 piece is kept under a key of everything it depends on, so an interrupted study continues.
@@ -15,9 +15,9 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot, first_shared_iteration
+from experiments.evaluation.alignment_errors import first_shared_iteration
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
+from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
 from experiments.evaluation.map_consistency import rmse
 from experiments.evaluation.path_errors import STATISTICS
 from experiments.evaluation.smoothed_robots import SmoothedRobot
@@ -136,7 +136,7 @@ FUSERS = tuple(dict.fromkeys(strategy.fuser for strategy in STRATEGIES))
 
 
 def team_sizes(text: str | None, scenario: AnyScenario) -> list[int]:
-    """Parse numbers of robots such as `3,5`; None stands for all robots of the scenario.
+    """Parse numbers of robots such as `3,5`; None means all robots of the scenario.
 
     Raises:
         InputError: the text is no list of numbers, or asks for more robots than there are.
@@ -296,8 +296,13 @@ def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     fusers = {name: costs_of(stage) for name, stage in team.by_fuser.items()}
     for strategy in STRATEGIES:
         for k in team.iterations:
-            own = [_robot_costs(costs, strategy, team.iterations, k) for costs in robots]
             asked = strategy.asked(team.iterations, k)
+            smoothed_at = asked if strategy.smooths else []
+            own = []  # rows of the filter, and of the smoothing that was asked for, by robot
+            for costs in robots:
+                filtered = _of(costs, FILTER, _own_iterations(costs["iteration"], [k]))
+                at = _own_iterations(costs["iteration"], smoothed_at)
+                own.append((filtered, _of(costs, SMOOTHING, at)))
             aligned = pd.concat([_of(costs, ALIGNMENT, asked) for costs in pairs])
             fused = _of(fusers[strategy.fuser], FUSION, asked)
             filtered, smoothed = (pd.concat(parts) for parts in zip(*own, strict=True))
@@ -330,15 +335,6 @@ def sent_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
             yield about | {"sent_mb": sum(own_mb), "most_sent_mb": max(own_mb)}
 
 
-def _robot_costs(
-    costs: pd.DataFrame, strategy: Strategy, iterations: tuple[int, ...], k: int
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the rows of the filter at an iteration and of the smoothing that was asked for."""
-    filtered = _of(costs, FILTER, _own_iterations(costs["iteration"], [k]))
-    asked = strategy.asked(iterations, k) if strategy.smooths else []
-    return filtered, _of(costs, SMOOTHING, _own_iterations(costs["iteration"], asked))
-
-
 def _own_iterations(known: pd.Series, asked: list[int]) -> list[int]:
     """Limit iterations to a robot's own: its log may end before those of others."""
     last = int(known.max())
@@ -346,16 +342,8 @@ def _own_iterations(known: pd.Series, asked: list[int]) -> list[int]:
 
 
 def _of(costs: pd.DataFrame, work: str, iterations: list[int]) -> pd.DataFrame:
+    """Return the rows of one kind of work at some iterations."""
     return costs[(costs["work"] == work) & costs["iteration"].isin(iterations)]
-
-
-@dataclass(frozen=True)
-class _Known:
-    """Robots and paths of a team whose maps are evaluated."""
-
-    robots: list[EvaluatedRobot]
-    smoothed: list[SmoothedRobot]
-    filter_paths: _Paths
 
 
 def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
@@ -365,7 +353,7 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     filter_paths = dict[str, Mapping[int, Float]]()
     for stage in team.by_robot.values():
         filter_paths |= read_paths(team.folder(stage))
-    known = _Known(robots, run.load_smoothed(robots), filter_paths)
+    smoothed = run.load_smoothed(robots)
     first = first_shared_iteration(robots, run.scenario.evaluate.true_pair_radius_m)
     about = {"first_shared": UNKNOWN if first is None else first}
     judged: dict[tuple[str, int], dict[str, Any]] = {}
@@ -373,49 +361,46 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
         folder = team.folder(stage)
         anew = read_paths(folder)
         for k, fusion in read_fusions(folder, names).items():
-            beside = known.smoothed if make_fuser(fuser).smoothed else [None] * len(robots)
+            beside = smoothed if make_fuser(fuser).smoothed else [None] * len(robots)
             given = [GivenMap.at(*both, k) for both in zip(robots, beside, strict=True)]
-            judged[fuser, k] = _errors(EvaluatedFusion(fuser, k, fusion, given), known, anew)
+            judgement = JudgedFusion(fuser, k, fusion, given)
+            fused = judgement.fusion
+            row = {"n_merged": len(fused.members), "fallback": judgement.fallback}
+            if len(fused.members) >= 2:
+                paths = []
+                for place in map(int, fused.members):
+                    truth, T_first_map = robots[place].path, fused.T_first_map[place]
+                    poses = anew.get(robots[place].name, {}).get(k)
+                    if poses is not None:  # estimated by the fuser, in the fused frame
+                        T_first_map = IDENTITY
+                    else:
+                        poses = _given_path(given[place], smoothed[place], filter_paths, k)
+                    true_poses = truth.T_map_robot[: len(poses)]
+                    paths.append(PlacedPath(poses, true_poses, T_first_map, truth.T_world_map))
+                fit = judgement.fit
+                row |= {
+                    "n_landmarks": len(fused.landmarks),
+                    "landmark_rmse_m": rmse(fit.frame_error_m[~fit.gross]),
+                    "fitted_rmse_m": fit.rmse_m,
+                    "gross_share": fit.gross_share,
+                    "path_rmse_m": STATISTICS["rmse"](team_ate_m(paths)),
+                }
+            judged[fuser, k] = row
     for strategy in STRATEGIES:
         for k in team.iterations:
             row = {"strategy": strategy.name, "iteration": k} | about
             yield row | judged[strategy.fuser, k]
 
 
-def _errors(fusion: EvaluatedFusion, known: _Known, anew: _Paths) -> dict[str, Any]:
-    """Return the errors of one fused map; paths that its fuser estimated anew take precedence."""
-    fused = fusion.fusion
-    row = {"n_merged": len(fused.members), "fallback": fusion.fallback}
-    if len(fused.members) < 2:
-        return row
-    fit, paths = fusion.fit, []
-    for k in fused.members:
-        robot, T_first_map = known.robots[k], fused.T_first_map[k]
-        poses = anew.get(robot.name, {}).get(fusion.iteration)
-        if poses is None:
-            poses = _own_path(known, fusion, int(k))
-        else:
-            T_first_map = IDENTITY
-        truth = robot.path
-        placed = PlacedPath(poses, truth.T_map_robot[: len(poses)], T_first_map, truth.T_world_map)
-        paths.append(placed)
-    return row | {
-        "n_landmarks": len(fused.landmarks),
-        "landmark_rmse_m": rmse(fit.frame_error_m[~fit.gross]),
-        "fitted_rmse_m": fit.rmse_m,
-        "gross_share": fit.gross_share,
-        "path_rmse_m": STATISTICS["rmse"](team_ate_m(paths)),
-    }
-
-
-def _own_path(known: _Known, fusion: EvaluatedFusion, place: int) -> Float:
-    """Return the path (T, 3) of the map that a robot gave: of the smoother or of the filter."""
-    given, smoothed = fusion.given[place], known.smoothed[place]
+def _given_path(
+    given: GivenMap, smoothed: SmoothedRobot, filter_paths: _Paths, iteration: int
+) -> Float:
+    """Return the path of a map given to the fuser, shape (T, 3): of the smoother or the filter."""
     for k, landmarks in smoothed.maps.items():
         if given.landmarks is landmarks:
             return smoothed.paths[k]
-    own = known.filter_paths[given.robot.name]
-    return own[max(k for k in own if k <= fusion.iteration)]
+    own = filter_paths[given.robot.name]
+    return own[max(k for k in own if k <= iteration)]
 
 
 @dataclass(frozen=True)

@@ -134,10 +134,10 @@ def measure_robot(settings: RobotCostSettings, job: Job) -> None:
     single_threaded()
     log, iterations = read_log(job.inputs["log"]), settings.smooth.iterations
     folder = job.inputs["log"]
-    told = read_odometry_covariance(folder, len(log)), read_attitude(folder, len(log))
-    _filter(settings.slam, log, told, iterations[:1])  # compiles and fills caches
+    extras = read_odometry_covariance(folder, len(log)), read_attitude(folder, len(log))
+    _filter(settings.slam, log, extras, iterations[:1])  # compiles and fills caches
     _smooth_at(settings.smooth, job, log, iterations[0])
-    filtered = _filter(settings.slam, log, told, iterations)
+    filtered = _filter(settings.slam, log, extras, iterations)
     costs = [cost_row(each.iteration, FILTER, each.cost) for each in filtered]
     for k in iterations:
         costs.append(cost_row(k, SMOOTHING, _smooth_at(settings.smooth, job, log, k)))
@@ -160,12 +160,12 @@ class _Filtered(NamedTuple):
 def _filter(
     settings: SlamSettings,
     log: RobotLog,
-    told: tuple[Float | None, Attitude | None],
+    extras: tuple[Float | None, Attitude | None],
     iterations: Sequence[int],
 ) -> list[_Filtered]:
     """Run the filter over the log, as the stage `slam` does, up to the last iteration."""
     rng, found, meter = generator(settings.seed, "slam", log.robot), [], Meter()
-    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, *told):
+    for frame in run_log(log, settings.filter, rng, iterations, settings.min_count, *extras):
         if frame.landmarks is not None:
             cost = meter.read()
             path = frame.slam.best_path()

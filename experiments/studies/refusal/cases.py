@@ -1,15 +1,15 @@
 """Cases of the refusal study: pairs of maps with and without common ground.
 
-APART: of two worlds; no landmark is common, whatever the walls' geometry.
-COMMON: of one world, at every evaluated iteration.
-FEW: a COMMON pair of which only the 20 true correspondences around one landmark are left: the
-    first corner of common ground, as hard as the bar for missed merges allows.
-REPEATED: an APART pair, but a poster of world a hangs in world b too: the landmarks of a disc of
-    common ground, as the partner robot saw them, put at a random place of map b.
+APART: maps of two worlds; they have no common landmark.
+COMMON: maps of one world, at every evaluated iteration.
+FEW: a COMMON pair with only the 20 true correspondences around one landmark: the hardest case that
+    still counts as a missed merge.
+REPEATED: an APART pair with a poster of world a in world b: the landmarks in a disc of common
+    ground, as the partner robot saw them, at a random place in map b.
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -41,13 +41,17 @@ POSTER_RADII_M = (0.5, 1.0, 2.0)  # of a poster, a mural, and half a wall
 
 @dataclass(frozen=True)
 class Case:
-    """Two maps with their correspondences, and what is true of them.
+    """Two maps with their correspondences and the truth.
 
     Attributes:
         ground: APART, COMMON, FEW or REPEATED.
-        n_common: landmarks of both maps that are one point of the world.
-        T_true: (3,) NaN without a common world.
-        poster_radius_m: NaN without a poster.
+        map_a: first map.
+        map_b: second map.
+        pairs: N correspondences.
+        is_true: True for true correspondences, shape (N,).
+        n_common: number of common landmarks.
+        T_true: true T_a_b, shape (3,); NaN without a common world.
+        poster_radius_m: radius of the poster; NaN without a poster.
     """
 
     ground: str
@@ -61,7 +65,7 @@ class Case:
 
 
 def apart(map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters) -> Case:
-    """Maps of two worlds."""
+    """Return the case of maps of two worlds."""
     pairs = match(map_a, map_b, matching)
     return Case(APART, map_a, map_b, pairs, np.zeros(len(pairs), bool), 0, np.full(3, np.nan))
 
@@ -69,7 +73,7 @@ def apart(map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters) -> 
 def common(
     a: EvaluatedRobot, b: EvaluatedRobot, iteration: int, matching: MatchParameters, radius_m: float
 ) -> Case:
-    """Maps of one world (which may have nothing in common yet)."""
+    """Return the case of maps of one world; they may have no common landmark yet."""
     (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
     pairs = match(map_a, map_b, matching)
     is_true = true_pairs(points_a, points_b, pairs.index_a, pairs.index_b, radius_m)
@@ -79,7 +83,7 @@ def common(
 
 
 def few(case: Case, rng: np.random.Generator) -> Case | None:
-    """A common case with 20 true correspondences left, about one of them; None with fewer."""
+    """Reduce a common case to 20 true correspondences around one of them; None with fewer."""
     true = np.flatnonzero(case.is_true)
     if len(true) <= MERGEABLE_PAIRS:
         return None
@@ -97,9 +101,9 @@ def repeated(
     matching: MatchParameters,
     rng: np.random.Generator,
 ) -> Case | None:
-    """Map a of a common case against another world's map in which a poster of map b hangs.
+    """Return map a of a common case with another world's map that contains a poster of map b.
 
-    None where the common case has no true correspondence to take the poster from.
+    None if the common case has no true correspondence for the centre of the poster.
     """
     true = np.flatnonzero(source.is_true)
     if not len(true) or not len(other):
@@ -126,14 +130,14 @@ def repeated(
 
 @dataclass(frozen=True)
 class MappedWorld:
-    """One world and the robots that mapped it.
+    """World and the robots that mapped it.
 
     Attributes:
-        label: how messages call it.
-        name: SCENARIO-SEED, or that of the result folder.
-        scenario: what it was made from; worlds of one seed have some of their pictures in common.
-        textures: key of the painted walls: equal ones mean the same world.
-        folders: where each robot's log and maps lie, by name.
+        label: name in messages.
+        name: SCENARIO-SEED, or the name of the result folder.
+        scenario: its scenario; worlds of one seed have some pictures in common.
+        textures: key of the textured walls; equal keys mean the same world.
+        folders: folders of the log and maps of each robot, by name.
     """
 
     label: str
@@ -144,44 +148,57 @@ class MappedWorld:
 
     @property
     def kind(self) -> str:
-        """The scenario's name: worlds of one kind differ in their seeds."""
+        """Name of the scenario; worlds of one kind differ in their seeds."""
         return self.scenario.name
 
     @property
     def repeats(self) -> bool:
-        """Whether some of its pictures are found in several places."""
+        """True if some pictures occur in several places."""
         world = self.scenario.world
         return world.texture.posters > 0 or any(wall.look for wall in world.walls)
 
     @property
     def iterations(self) -> list[int]:
-        """At which its maps were kept."""
+        """Iterations with stored maps."""
         return evaluated_iterations(self.scenario.drive.frames, self.scenario.evaluate.every)
 
     def maps(self, robot: str) -> Mapping[int, LandmarkMap]:
-        """One robot's maps by iteration, without the truth."""
+        """Return the maps of one robot by iteration, without the truth."""
         return stored_maps(self.folders[robot])
 
     def robots(self) -> list[EvaluatedRobot]:
-        """All robots' maps joined with the truth."""
+        """Return the maps of all robots with the truth."""
         return [load_robot(each) for each in self.folders.values()]
 
 
 def worlds_of(words: Sequence[str], seeds: Sequence[int], results: Path) -> list[MappedWorld]:
-    """The worlds that the words of a command stand for, all different.
+    """Return the different worlds that the words of a command name.
 
-    A word is a result folder of `run`; or a scenario file, name or tag, for each of the seeds (or
-    of its own, as in full@0..9), whose maps a sweep or a run left in the store of `results`.
+    A word is a result folder of `run`, or a scenario (file, name or tag) with maps in the store of
+    `results`. Scenarios use all seeds, or their own as in full@0..9.
 
     Raises:
-        InputError: a word that is none of these, fewer than two seeds, not simulated, two of one
-            world, or maps that are not in the store.
+        InputError: a word is unknown, there are fewer than two seeds, a world is not simulated or
+            occurs twice, or maps are not in the store.
     """
-    worlds = [world for word in words for world in _worlds(word, seeds, results)]
+    worlds: list[MappedWorld] = []
+    for word in words:
+        path = Path(word)
+        if path.is_dir():
+            require_result(path)
+            scenario, folder = load_checked(path / "scenario.json"), path.resolve()
+            worlds.append(_world(str(path), folder.name, scenario, Store.of(folder.parent)))
+            continue
+        name, _, own_seeds = word.partition("@")
+        of_word = parse_seeds(own_seeds) if own_seeds else seeds
+        for file, seed in itertools.product(scenarios_of([name]), of_word):
+            scenario = load_checked(file, (), seed)
+            run_name = f"{scenario.name}-{seed}"
+            worlds.append(_world(run_name, run_name, scenario, Store.of(results)))
     if len(worlds) < 2:
         raise InputError("refusal: give two worlds or more: results, or scenarios with --seeds")
     for first, world in itertools.combinations(worlds, 2):
-        # two scenarios may drive through one world of a seed; worlds of one seed are never crossed
+        # Two scenarios may share the world of a seed; worlds of one seed are never combined.
         if world.textures == first.textures and world.kind == first.kind:
             raise InputError(f"{world.label}: the same world as {first.name}; give another seed's")
         if world.name == first.name:
@@ -192,22 +209,8 @@ def worlds_of(words: Sequence[str], seeds: Sequence[int], results: Path) -> list
     return worlds
 
 
-def _worlds(word: str, seeds: Sequence[int], results: Path) -> Iterator[MappedWorld]:
-    path = Path(word)
-    if path.is_dir():
-        require_result(path)
-        scenario, folder = load_checked(path / "scenario.json"), path.resolve()
-        yield _world(str(path), folder.name, scenario, Store.of(folder.parent))
-        return
-    name, _, own_seeds = word.partition("@")
-    of_word = parse_seeds(own_seeds) if own_seeds else seeds
-    for file, seed in itertools.product(scenarios_of([name]), of_word):
-        scenario = load_checked(file, (), seed)
-        name = f"{scenario.name}-{seed}"
-        yield _world(name, name, scenario, Store.of(results))
-
-
 def _world(label: str, name: str, scenario: AnyScenario, store: Store) -> MappedWorld:
+    """Return the world of a scenario, whose maps must be in the store."""
     if not isinstance(scenario, Simulation):
         raise InputError(f"{label}: made from recorded logs; only simulated worlds surely differ")
     judged = EvaluatedRun.of(scenario, store)

@@ -1,7 +1,7 @@
 """Refusal study: every aligner on maps with and without common ground.
 
-All correspondences are false and independent: what the bound promises can be counted. Every motion
-that two correspondences determine is judged, which is more than any estimator tries.
+The calibration counts false alarms of the test against chance: all correspondences of its maps are
+false and independent, and every motion that two correspondences determine is tested.
 """
 
 import functools
@@ -38,13 +38,13 @@ from mapfusion.verification.false_alarms import (
 
 N_PAIRS_OF_MAPS = 5000
 N_CORRESPONDENCES = 40
-SIZE_M = (13.0, 7.0)  # as quick.yaml's hall
+SIZE_M = (13.0, 7.0)  # size of the hall in quick.yaml
 N_WALLS = 8
 STATED = (1e-3, 1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 
 
 def points_on_walls(rng: np.random.Generator, n: int) -> Float:
-    """Points (n, 2) on random walls parallel to the axes, wall against wall as rooms have them."""
+    """Draw points, shape (n, 2), on random walls parallel to the axes."""
     corners = rng.uniform(0, SIZE_M, (N_WALLS, 2))
     length_m = rng.uniform(1.0, 6.0, N_WALLS)
     along_x = rng.random(N_WALLS) < 0.5
@@ -54,7 +54,7 @@ def points_on_walls(rng: np.random.Generator, n: int) -> Float:
 
 
 def calibrate(acceptance: Acceptance, rng: np.random.Generator, n_pairs: int) -> pd.DataFrame:
-    """Rows of the table `calibration`, of so many pairs of maps."""
+    """Return the table `calibration` for a number of random pairs of maps."""
     gates = np.array(sorted(acceptance.gates_m))
     bounds = np.log10(STATED)
     counts = np.zeros((n_pairs, len(STATED)), np.int64)
@@ -69,7 +69,7 @@ def calibrate(acceptance: Acceptance, rng: np.random.Generator, n_pairs: int) ->
 
 @kernel
 def accepted_motions(pairs: IndependentPairs, gates_m: Float, bounds_log10: Float) -> np.ndarray:
-    """How many motions of two of the pairs have an NFA up to each bound (S,)."""
+    """Count the motions of two correspondences with an NFA up to each bound, shape (S,)."""
     p_a, p_b = pairs.p_a, pairs.p_b
     counts = np.zeros(len(bounds_log10), np.int64)
     T_a_b = np.empty(3)
@@ -84,11 +84,11 @@ def accepted_motions(pairs: IndependentPairs, gates_m: Float, bounds_log10: Floa
     return counts
 
 
-REPEATED_PER_WORLDS = 9  # posters hung in each pair of worlds
-REPEATED_WORLDS = 35  # pairs of worlds that posters are hung in
-# Two worlds that are crossed give so many pairs of maps: few, as those of two worlds are alike.
+REPEATED_PER_WORLDS = 9  # posters in each pair of worlds
+REPEATED_WORLDS = 35  # pairs of worlds with posters
+# Pairs of maps from two worlds of different seeds; few, because they are similar.
 MEETINGS_PER_WORLDS = 10
-# The kind of maps of two kinds of worlds: of ordinary ones, and where either repeats itself.
+# Kind of a pair of maps from worlds of two kinds, without and with repetition.
 CROSSED, CROSSED_REPEATING = "crossed", "crossed_repeating"
 
 # In `FOLDER/tables/`.
@@ -99,24 +99,24 @@ TABLES = {
         2,
         fields(
             kind=TEXT,  # scenario of both worlds; crossed or crossed_repeating, of two
-            repeats=BOOL,  # pictures of either world are found in several places
+            repeats=BOOL,  # pictures of either world occur in several places
             ground=TEXT,  # apart, common, few or repeated (see cases.py)
             poster_radius_m=FLOAT,  # NaN without a poster
             **dict.fromkeys(("world_a", "robot_a", "world_b", "robot_b"), TEXT),
             iteration=INT,
             aligner=TEXT,
             **dict.fromkeys(("n_correspondences", "n_true", "n_common"), INT),
-            n_inliers=INT,  # of the refined alignment: what a threshold on support would go by
+            n_inliers=INT,  # of the refined alignment
             status=TEXT,  # the verdict on the refined alignment
             accepted=BOOL,
-            beats_chance=BOOL,  # passes the test against chance, whatever else is said
+            beats_chance=BOOL,  # passes the test against chance
             log10_false_alarms=FLOAT,
-            probability=FLOAT,  # that it is right, as the verdict states it; NaN where it does not
+            probability=FLOAT,  # stated probability that it is right; NaN if unknown
             refined_translation_error_m=FLOAT,
             refined_rotation_error_rad=FLOAT,
         ),
     ),
-    # The test itself on made-up maps of walls with random pairs, over every motion of two pairs.
+    # Test against chance on random maps of walls, over every motion of two correspondences
     "calibration": schema(
         "refusal.calibration",
         1,
@@ -134,13 +134,13 @@ Meeting = tuple[str, str, int]  # a robot of each of two worlds, at one iteratio
 
 
 class Crossing(NamedTuple):
-    """Two worlds of different seeds, and what is done with their maps.
+    """Two worlds of different seeds and the pairs of their maps.
 
     Attributes:
-        a: whose maps are the first of each pair.
-        b: whose are the second.
+        a: world of the first map of each pair.
+        b: world of the second map.
         meetings: pairs of maps.
-        hung: whether posters of a are hung in b.
+        hung: True if posters of a are placed in b.
     """
 
     a: MappedWorld
@@ -150,13 +150,13 @@ class Crossing(NamedTuple):
 
 
 class PairsDrawn(NamedTuple):
-    """How many pairs of maps are judged.
+    """Numbers of pairs of maps to judge.
 
     Attributes:
-        n_apart: of those that worlds of different seeds have, for each kind of world, and as many
-            of worlds of two kinds.
-        every: of each run the maps at its last iteration and at each so many before it: those of
-            neighbouring iterations say the same.
+        n_apart: pairs from worlds of different seeds, for each kind of world, and as many from
+            worlds of two kinds.
+        every: step between evaluated iterations of a run, counted back from the last one; maps of
+            neighbouring iterations are similar.
     """
 
     n_apart: int
@@ -164,7 +164,7 @@ class PairsDrawn(NamedTuple):
 
 
 def read(folder: Path, name: str) -> pd.DataFrame:
-    """Read the table of that name; raises InputError that names the file."""
+    """Read a table by name; raises InputError that names the file."""
     return read_rows(table_path(folder, name), TABLES[name])
 
 
@@ -175,9 +175,9 @@ def run(
     jobs: int,
     on_progress: OnProgress,
 ) -> float:
-    """Write the tables into a folder; returns the number of false alarms that was accepted.
+    """Write the tables into a folder, and return the accepted number of false alarms.
 
-    The first world's scenario gives methods.
+    The scenario of the first world gives the aligners.
     """
     scenario = worlds[0].scenario
     crossings = crossings_of(worlds, drawn.n_apart, generator(scenario.seed, "refusal"))
@@ -201,10 +201,10 @@ def run(
 
 
 def crossings_of(worlds: Sequence[MappedWorld], n: int, rng: np.random.Generator) -> list[Crossing]:
-    """Pairs of worlds of different seeds, with the pairs of maps drawn from each.
+    """Draw pairs of worlds of different seeds, and pairs of maps from each.
 
-    Of each kind n pairs of maps, and n of different kinds, or all there are in the pairs of worlds
-    drawn. Posters hang in pairs of worlds that do not repeat themselves.
+    There are up to n pairs of maps of each kind, and n of different kinds. Posters are placed in
+    pairs of worlds without repetition.
     """
     strangers = [
         (a, b) for a, b in itertools.combinations(worlds, 2) if a.scenario.seed != b.scenario.seed
@@ -217,7 +217,11 @@ def crossings_of(worlds: Sequence[MappedWorld], n: int, rng: np.random.Generator
     for kind in sorted(set(kinds)):
         of_kind = [k for k, name in enumerate(kinds) if name == kind]
         met = _drawn(of_kind, -(-n // MEETINGS_PER_WORLDS), rng)
-        possible = [(k, meeting) for k in met for meeting in _possible(*strangers[k])]
+        possible: list[tuple[int, Meeting]] = []
+        for k in met:
+            a, b = strangers[k]
+            both = sorted({*a.iterations} & {*b.iterations})
+            possible += [(k, each) for each in itertools.product(a.folders, b.folders, both)]
         for place in _drawn(range(len(possible)), n, rng):
             k, meeting = possible[place]
             meetings.setdefault(k, []).append(meeting)
@@ -225,27 +229,24 @@ def crossings_of(worlds: Sequence[MappedWorld], n: int, rng: np.random.Generator
 
 
 def _drawn(items: Sequence[int], n: int, rng: np.random.Generator) -> list[int]:
-    """At most n of the items, in their order."""
+    """Draw at most n of the items, in their order."""
     return [items[k] for k in np.sort(rng.permutation(len(items))[:n])]
 
 
-def _possible(a: MappedWorld, b: MappedWorld) -> list[Meeting]:
-    both = sorted({*a.iterations} & {*b.iterations})
-    return list(itertools.product(a.folders, b.folders, both))
-
-
 def _kind(a: MappedWorld, b: MappedWorld) -> str:
+    """Return the kind of pairs of maps from two worlds."""
     if a.kind == b.kind:
         return a.kind
     return CROSSED_REPEATING if _repeats(a, b) else CROSSED
 
 
 def _repeats(a: MappedWorld, b: MappedWorld) -> bool:
+    """Return True if either world contains repetitions."""
     return a.repeats or b.repeats
 
 
 def common_rows(scenario: Simulation, world: MappedWorld, every: int) -> Rows:
-    """COMMON pairs of one world, and FEW ones unless it repeats itself."""
+    """Return rows of COMMON pairs of one world, and of FEW ones if it has no repetition."""
     matching, radius_m = scenario.align.match, scenario.evaluate.true_pair_radius_m
     rows: Rows = []
     for (a, b), iteration in itertools.product(
@@ -261,14 +262,14 @@ def common_rows(scenario: Simulation, world: MappedWorld, every: int) -> Rows:
 
 
 def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
-    """APART and REPEATED pairs of two worlds."""
+    """Return rows of APART and REPEATED pairs of two worlds."""
     worlds, matching = (crossing.a, crossing.b), scenario.align.match
     of_a, of_b = functools.cache(crossing.a.maps), functools.cache(crossing.b.maps)
     rows: Rows = []
     for robot_a, robot_b, iteration in crossing.meetings:
         maps = known_at(of_a(robot_a), iteration), known_at(of_b(robot_b), iteration)
         rows += _answers(scenario, cases.apart(*maps, matching), worlds, iteration)
-    if len(crossing.a.folders) < 2 or not crossing.hung:  # no partner has seen what robot a saw
+    if len(crossing.a.folders) < 2 or not crossing.hung:  # a poster needs a second robot in world a
         return rows
     in_a, in_b = ({robot.name: robot for robot in world.robots()} for world in worlds)
     last = min(world.iterations[-1] for world in worlds)
@@ -276,7 +277,7 @@ def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
     source = cases.common(first, partner, last, matching, scenario.evaluate.true_pair_radius_m)
     others = [known_at(robot.maps, last) for robot in in_b.values()]
     for number in range(REPEATED_PER_WORLDS):
-        each, size = divmod(number, len(cases.POSTER_RADII_M))  # each robot meets each size
+        each, size = divmod(number, len(cases.POSTER_RADII_M))  # every robot with every size
         rng = generator(scenario.seed, "poster", crossing.a.name, crossing.b.name, number)
         other, radius_m = others[each % len(others)], cases.POSTER_RADII_M[size]
         case = cases.repeated(source, other, radius_m, matching, rng)
@@ -288,7 +289,7 @@ def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
 def _answers(
     scenario: Simulation, case: Case, worlds: tuple[MappedWorld, MappedWorld], iteration: int
 ) -> Rows:
-    """One row an aligner: its refined alignment, judged."""
+    """Return one row per aligner: its refined alignment and the verdict."""
     settings = scenario.align
     names: dict[str, Any] = {"kind": _kind(*worlds), "repeats": _repeats(*worlds)}
     names |= {"ground": case.ground, "poster_radius_m": case.poster_radius_m}
@@ -296,7 +297,7 @@ def _answers(
     names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
     bound = np.log10(settings.acceptance.false_alarms)
     pairs = Pairs(case.map_a, case.map_b, case.pairs)
-    judged = settings.judge.on(pairs)  # evidence is sought once, where an answer beats chance
+    judged = settings.judge.on(pairs)  # evidence is computed once, for answers that beat chance
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)

@@ -12,7 +12,7 @@ from experiments.evaluation import tables
 from experiments.evaluation.result import require_result
 from experiments.evaluation.result_files import read_provenance, read_scenario, read_world
 from experiments.reports.figures.result_tables import ResultTables
-from experiments.reports.report.contents import contents_of
+from experiments.reports.report.document import contents_of
 from experiments.reports.result_export import export_result
 from experiments.studies.comparison import compare
 from experiments.studies.run_tables import find_runs

@@ -12,7 +12,8 @@ from scipy.stats import chi2, kstest
 from experiments.pipeline.stage import Job
 from experiments.pipeline.store import Store
 from experiments.plugins import discovery
-from experiments.reports.study_files import benchmark_markdown, cell_text, draw
+from experiments.reports.figures.study_figures import draw_benchmark
+from experiments.reports.study_files import benchmark_markdown, cell_text
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.studies import benchmark as benchmark
@@ -163,9 +164,9 @@ def test_an_absent_package_is_no_failure(tmp_path: Path, monkeypatch: pytest.Mon
     assert np.isnan(far["success"])
     assert cell_text(far) == "absent"
     assert "| far      | absent " in benchmark_markdown(plan, summary)
-    low, high = draw(summary).axes[1].get_ylim()  # although no ratio is drawn
+    low, high = draw_benchmark(summary).axes[1].get_ylim()  # although no ratio is drawn
     assert 0.1 < low < 1 < high < 100
-    labels = [text.get_text() for text in draw(summary).legends[0].get_texts()]
+    labels = [text.get_text() for text in draw_benchmark(summary).legends[0].get_texts()]
     assert labels == ["far (absent)", "ransac"]
 
 

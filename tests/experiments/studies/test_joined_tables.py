@@ -13,7 +13,7 @@ from experiments.studies import sweep_tables as dataset_module
 from experiments.studies import sweep_tables as joined_module
 from experiments.studies.run_tables import find_runs
 from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import JoinedTables, SweepDataset, written_by_nobody_else
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset, locked_folder
 from mapfusion.errors import InputError, StoreRepairWarning
 from mapfusion.files import write_json
 
@@ -270,10 +270,10 @@ def test_a_folder_of_other_things_is_refused(tmp_path: Path) -> None:
 
 def test_one_command_alone_writes(tmp_path: Path) -> None:
     with (
-        written_by_nobody_else(tmp_path),
+        locked_folder(tmp_path),
         pytest.raises(InputError, match="another sweep writes"),
-        written_by_nobody_else(tmp_path),
+        locked_folder(tmp_path),
     ):
         pass
-    with written_by_nobody_else(tmp_path):
+    with locked_folder(tmp_path):
         pass

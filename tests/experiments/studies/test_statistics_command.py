@@ -89,7 +89,7 @@ def test_a_single_run_is_weak_and_its_figures_are_elsewhere(
 ) -> None:
     folder = write_result(tmp_path, 0, tables_of(0))
     reply = command(capsys, "statistics", folder, "-o", tmp_path / "out")
-    assert "One run: the brackets tell of the maps of one run" in reply.out
+    assert "One run: the intervals are over the maps of one run" in reply.out
     assert "`mapfusion report --figures` draws it" in reply.out
     assert not (tmp_path / "out/figures").exists()
 
@@ -150,7 +150,7 @@ def test_exported_tables_can_be_read_back_and_names_are_escaped(tmp_path: Path) 
 
 
 def test_curves_over_runs_are_medians_of_run_medians(tmp_path: Path) -> None:
-    from experiments.reports.figures import fig04_translation_error, fig06_aligner_time
+    from experiments.reports.figures.error_figures import draw_aligner_time, draw_translation_error
 
     folders = [write_result(tmp_path, seed, tables_of(seed)) for seed in range(5)]
     errors = find_runs(folders).read("errors")
@@ -158,15 +158,15 @@ def test_curves_over_runs_are_medians_of_run_medians(tmp_path: Path) -> None:
     timings = find_runs(folders).read("aligner_timings")
     data = ResultTables(tmp_path, {"errors": medians, "aligner_timings": timings})
     assert data.aligners == [*METHODS, "oracle"]
-    axes = fig04_translation_error.draw(data).axes[0]
+    axes = draw_translation_error(data).axes[0]
     line = next(line for line in axes.get_lines() if line.get_label() == "icp")
     own = errors[(errors["aligner"] == "icp") & (errors["robot_b"] == "R2")]
     for iteration, drawn in zip(ITERATIONS, np.asarray(line.get_ydata()), strict=True):
         at = own[own["iteration"] == iteration].groupby("run_id")["translation_error_m"].median()
         assert drawn == pytest.approx(at.median())
-    legend = fig04_translation_error.draw(data).legends[0]
+    legend = draw_translation_error(data).legends[0]
     assert "10-90 % of 5 runs, as here ransac's" in [text.get_text() for text in legend.get_texts()]
-    assert len(fig06_aligner_time.draw(data).axes) == 2
+    assert len(draw_aligner_time(data).axes) == 2
 
 
 def test_quantiles_of_groups_along_the_count() -> None:

@@ -32,10 +32,18 @@ from experiments.pipeline.cluster import Terms, code_version, connected
 from experiments.pipeline.store import Store
 from experiments.pipeline.tasks import Task, unfinished
 from experiments.studies import sweep as driver_module
-from experiments.studies import sweep_plan as plan_module
-from experiments.studies.sweep import OnSweepProgress, SweepDriver, SweepProgress, execute
+from experiments.studies import sweep as plan_module
+from experiments.studies.sweep import (
+    OnSweepProgress,
+    PlannedRun,
+    Sweep,
+    SweepDriver,
+    SweepProgress,
+    execute,
+    plan_run,
+    prepare,
+)
 from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_plan import PlannedRun, Sweep, planned, prepare
 from experiments.studies.sweep_tables import RUN_TIMES, JoinedTables, SweepDataset
 from mapfusion.errors import InputError, StoreRepairWarning
 from tests.helpers import acting
@@ -198,7 +206,7 @@ def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
     assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason
     rows = pd.read_parquet(asked.dataset.folder / "runs")
     assert rows[["status", "reason"]].to_numpy().tolist() == [["failed", reason]]
-    assert planned(asked.runs[0], asked.store, JoinedTables(asked.dataset)).left
+    assert plan_run(asked.runs[0], asked.store, JoinedTables(asked.dataset)).left
 
 
 def test_killed_sweeps_go_on_and_readers_always_find_whole_runs(

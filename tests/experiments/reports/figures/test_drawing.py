@@ -16,10 +16,12 @@ from PIL import Image
 
 from experiments.evaluation import tables
 from experiments.pipeline.workers import workers
-from experiments.reports.figures import drawing, fig02_two_maps, fig11_fusers, fig12_coverage
+from experiments.reports.figures import drawing
 from experiments.reports.figures.drawing import FIGURES, Drawing, draw_all, draw_figure, save_figure
-from experiments.reports.figures.fig03_dispersion import choose_moments, spread_over_time
+from experiments.reports.figures.error_figures import draw_coverage, draw_fusers
+from experiments.reports.figures.map_figures import draw_two_maps
 from experiments.reports.figures.result_tables import ResultTables
+from experiments.reports.figures.slam_figures import choose_moments, spread_over_time
 from experiments.reports.figures.style import aligner_styles, house_style
 from mapfusion.errors import InputError
 
@@ -128,8 +130,8 @@ def test_each_fuser_has_a_line_of_its_own_a_plug_in_s_too(trio_copy: Path) -> No
     changed = {name: data.table(name) for name in ("fusers", "fuser_coverage")}
     for name, rows in changed.items():
         change(trio_copy, name, rows.assign(fuser=rows["fuser"].replace(names)))
-    for module in (fig11_fusers, fig12_coverage):
-        figure = module.draw(ResultTables(trio_copy))
+    for draw in (draw_fusers, draw_coverage):
+        figure = draw(ResultTables(trio_copy))
         fusers = list(dict.fromkeys(changed["fusers"]["fuser"].replace(names)))
         labels = [text.get_text() for text in figure.legends[0].get_texts()]
         assert [label for label in labels if label in fusers] == fusers
@@ -163,7 +165,7 @@ def test_nothing_is_drawn_of_what_failed(trio_copy: Path) -> None:
 
 
 def test_the_two_maps_are_drawn_in_one_scale(trio_result: Path) -> None:
-    figure = fig02_two_maps.draw(ResultTables(trio_result))
+    figure = draw_two_maps(ResultTables(trio_result))
     spans = [[np.ptp(a.get_xlim()), np.ptp(a.get_ylim())] for a in figure.axes]
     np.testing.assert_allclose(spans[0], spans[1])
     labels = [text.get_text() for text in figure.legends[0].get_texts()]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.evaluation import tables
-from experiments.reports.figures.fig07_correspondences import judge_correspondences
+from experiments.reports.figures.map_figures import judge_correspondences
 from experiments.reports.figures.result_tables import ResultTables
 from mapfusion.errors import InputError
 from mapfusion.files import DIGEST

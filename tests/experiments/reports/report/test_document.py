@@ -1,4 +1,4 @@
-"""The file as a whole: complete, escaped, and bound to fetch nothing."""
+"""Report as one HTML file: contents, safety of names, verdicts and rivals."""
 
 import base64
 import hashlib
@@ -13,7 +13,7 @@ import pytest
 from experiments.evaluation import tables
 from experiments.reports.figures.drawing import draw_figure
 from experiments.reports.figures.result_tables import ResultTables
-from experiments.reports.report.document import write_report
+from experiments.reports.report.document import verdicts_and_places, write_report
 from mapfusion.files import read_json, write_json
 from tests.helpers.report_page import HOSTILE, Page, hostile, page_of
 from tests.helpers.tiny_scenario import command, without_tables
@@ -88,7 +88,7 @@ def test_fusers_stand_with_their_figures_and_how_to_read_them(trio_copy: Path) -
     section = page.words.split("Maps of all robots together")[1]
     assert all(name in section for name in rows["fuser"])
     assert "Figure 11" in section
-    assert "Below it a map is too sure" in section
+    assert "Below the diagonal a map is overconfident" in section
     assert "fusers" in [attributes.get("id") for tag, attributes in page.tags if tag == "section"]
 
 
@@ -169,3 +169,25 @@ def test_absent_packages_are_no_failures(trio_copy: Path) -> None:
     page = page_of(trio_copy, trio_copy / "r.html")
     assert "Not installed, so not evaluated: impicp." in page.words
     assert "impicp" not in [trace["name"] for trace in page.charts["errors"]["data"]]
+
+
+def test_verdicts_and_places_are_of_the_last_maps(trio_result: Path) -> None:
+    rivals = tables.read(tables.table_path(trio_result, "rivals"), "rivals")
+    estimates = tables.read(tables.table_path(trio_result, "estimates"), "estimates")
+    found = list(verdicts_and_places(ResultTables(trio_result)))
+    assert [each["robots"] for each in found] == ["R1 – R2", "R1 – R3", "R2 – R3"]
+    last = estimates[estimates["iteration"] == estimates["iteration"].max()]
+    ransac = last[(last["aligner"] == "ransac") & (last["repetition"] == 0)]
+    assert [each["probability"] for each in found] == ransac["probability"].tolist()
+    for each in found:
+        a, b = each["robots"].split(" – ")
+        own = rivals[(rivals["robot_a"] == a) & (rivals["robot_b"] == b) & (rivals["of"] == "a b")]
+        own = own[own["iteration"] == rivals["iteration"].max()]
+        assert len(each["places"]) == len(own)
+        assert each["places"][0]["n_support"] == own["n_support"].iloc[0]
+
+
+def test_they_stand_in_the_page(trio_result: Path, tmp_path: Path) -> None:
+    words = re.sub(r"\s+", " ", page_of(trio_result, tmp_path / "r.html").words)
+    assert "Verdicts and rival alignments" in words
+    assert re.search("R2 – R3 ?accepted", words)

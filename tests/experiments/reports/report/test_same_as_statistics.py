@@ -10,7 +10,7 @@ import pytest
 
 from experiments.evaluation import tables
 from experiments.reports.report.charts import rounded
-from experiments.reports.report.contents import contents_of
+from experiments.reports.report.document import contents_of
 from experiments.studies.run_tables import find_runs
 from experiments.studies.statistics import Summary, summarise
 

@@ -57,7 +57,7 @@ def test_the_best_method_is_held_against_the_others(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize(
     ("n_runs", "beginning"),
-    [(1, "One run: the brackets tell"), (5, "5 runs in 5 worlds (scenario and seed): bootstrap")],
+    [(1, "One run: the intervals are"), (5, "5 runs in 5 worlds (scenario and seed): bootstrap")],
 )
 def test_few_runs_are_a_caveat_and_tables_may_be_missing(
     n_runs: int, beginning: str, capsys: pytest.CaptureFixture[str]

@@ -12,8 +12,8 @@ from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.pipeline.stages.fuse import read_fusions
 from experiments.pipeline.store import Store
 from experiments.pipeline.tables import read_rows
-from experiments.reports.figures.independence_figure import draw, since_shared_ground
 from experiments.reports.figures.result_tables import NothingToDraw
+from experiments.reports.figures.study_figures import draw_independence, since_shared_ground
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from experiments.studies.independence.independence_trial import (
@@ -178,11 +178,11 @@ def test_figure_counts_from_shared_ground_and_leaves_out_who_never_meets(
     own = found.costs.drop(columns=["robot_peak_mb", "team_peak_mb"])
     total = own.filter(["filter_s", "smoothing_s", "alignment_s", "fusion_s"]).sum(axis=1)
     assert drawn["cpu_s"].to_numpy() == pytest.approx(total.to_numpy())
-    figure = draw(found.teams, found.costs)
+    figure = draw_independence(found.teams, found.costs)
     assert len(figure.axes) == 6
     apart = found.teams.assign(first_shared=-1)
     with pytest.raises(NothingToDraw):
-        draw(apart, found.costs)
+        draw_independence(apart, found.costs)
 
 
 @pytest.mark.usefixtures("quick_save", "found")

@@ -13,13 +13,13 @@ import pytest
 from experiments.evaluation.result import run_scenario
 from experiments.pipeline.tables import read_rows
 from experiments.reports.figures.drawing import save_figure
-from experiments.reports.figures.refusal_figures import draw
+from experiments.reports.figures.study_figures import draw_refusal
 from experiments.reports.study_files import KINDS
 from experiments.scenario.settings import Simulation
 from experiments.scenario.world_settings import Render
 from experiments.studies.refusal import cases
 from experiments.studies.refusal import refusal_trial as results
-from experiments.studies.refusal.rates import Rate, summary, swept
+from experiments.studies.refusal.rates import Rate, share_up_to, summary
 from experiments.studies.refusal.refusal_trial import (
     STATED,
     accepted_motions,
@@ -146,7 +146,9 @@ def test_wilsons_interval() -> None:
 
 def test_sweeping_accepts_up_to_the_threshold_and_never_nan() -> None:
     score = pd.Series([-5.0, -3.0, 1.0, math.nan])
-    np.testing.assert_allclose(swept(score, np.array([-6, -5, -3.5, 99])), [0, 0.25, 0.25, 0.75])
+    np.testing.assert_allclose(
+        share_up_to(score, np.array([-6, -5, -3.5, 99])), [0, 0.25, 0.25, 0.75]
+    )
 
 
 def test_calibration_counts_every_motion_of_two_pairs() -> None:
@@ -310,7 +312,7 @@ def test_worlds_of_one_name_are_refused(
 def test_the_figure_is_the_same_bytes(tmp_path: Path) -> None:
     calibration = calibrate(Acceptance(), np.random.default_rng(0), n_pairs=20)
     data = (TABLE, calibration, 1e-3)
-    first = save_figure(tmp_path / "a", "refusal", draw, *data)
-    second = save_figure(tmp_path / "b", "refusal", draw, *data)
+    first = save_figure(tmp_path / "a", "refusal", draw_refusal, *data)
+    second = save_figure(tmp_path / "b", "refusal", draw_refusal, *data)
     for one, other in zip(first, second, strict=True):
         assert one.read_bytes() == other.read_bytes()

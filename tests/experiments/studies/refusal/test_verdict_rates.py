@@ -9,13 +9,17 @@ import pandas as pd
 import pytest
 
 from experiments.reports.figures.drawing import save_figure
-from experiments.reports.figures.verdict_figures import draw_kinds, draw_reliability, draw_roc
+from experiments.reports.figures.study_figures import (
+    draw_refusal_kinds,
+    draw_refusal_reliability,
+    draw_refusal_roc,
+)
 from experiments.reports.terminal.study_screen import print_kinds, print_reliability
 from experiments.studies.refusal.rates import (
     N_BINS,
     Rate,
     by_kind,
-    first_of_ordinary,
+    first_right_answers,
     judged_answers,
     of_any_method,
     pooled,
@@ -93,11 +97,11 @@ def test_first_answers_are_of_all_ordinary_worlds_with_common_ground() -> None:
     third["accepted"] = third["status"] == "accepted"
     apart = third.assign(kind="m", n_common=0)
     given = [ordinary, third, apart, table("posters")]
-    (row,) = first_of_ordinary(pd.concat(given, ignore_index=True))
+    (row,) = first_right_answers(pd.concat(given, ignore_index=True))
     assert (row["aligner"], row["n_runs"]) == ("ransac", 3)
     assert (row["first_iteration"], row["first_true_pairs"]) == (40, 40)
     assert (row["first_iteration_by_chance"], row["first_true_pairs_by_chance"]) == (20, 4)
-    assert not first_of_ordinary(table())
+    assert not first_right_answers(table())
 
 
 def test_a_run_that_never_comes_to_it_is_later_than_all_others() -> None:
@@ -204,9 +208,9 @@ def test_what_is_shown_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[s
     for word in ("first", "second", "1/2", "2/3", "calibration error", "Brier"):
         assert word in shown
     for name, draw, data in (
-        ("kinds", draw_kinds, rows),
-        ("roc", draw_roc, rows),
-        ("reliability", draw_reliability, found),
+        ("kinds", draw_refusal_kinds, rows),
+        ("roc", draw_refusal_roc, rows),
+        ("reliability", draw_refusal_reliability, found),
     ):
         one, other = (save_figure(tmp_path / part, name, draw, data)[0] for part in "ab")
         assert one.read_bytes() == other.read_bytes()

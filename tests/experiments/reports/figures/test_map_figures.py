@@ -1,4 +1,4 @@
-"""Parents of fused landmarks, moved as the merge moved them."""
+"""Figures of maps: fused pairs of landmarks, chosen landmark and enlarged part."""
 
 from pathlib import Path
 
@@ -8,8 +8,7 @@ from scipy.spatial.distance import pdist
 
 from experiments.evaluation import tables
 from experiments.reports.figures.drawing import draw_figure
-from experiments.reports.figures.fig08_fused_landmark import choose_landmark
-from experiments.reports.figures.fig09_aligned_maps import choose_zoom
+from experiments.reports.figures.map_figures import choose_landmark, choose_zoom
 from experiments.reports.figures.result_tables import (
     FusedPairs,
     NothingToDraw,

@@ -1,4 +1,4 @@
-"""The curves of figures 4 and 5, read back from what was drawn."""
+"""Figures of errors and times: bands, shaded iterations, and methods that are not installed."""
 
 import statistics
 from pathlib import Path
@@ -12,14 +12,18 @@ from matplotlib.patches import Rectangle
 
 from experiments.evaluation import tables
 from experiments.evaluation.criteria import ANSWERABLE_PAIRS
-from experiments.reports.figures import fig04_translation_error, fig05_rotation_error
+from experiments.reports.figures.error_figures import (
+    draw_aligner_time,
+    draw_rotation_error,
+    draw_translation_error,
+)
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.reports.figures.style import aligner_styles
 from experiments.studies.error_bands import error_bands
 
 COLUMNS = {
-    fig04_translation_error: ("translation_error_m", "refined_translation_error_m"),
-    fig05_rotation_error: ("rotation_error_rad", "refined_rotation_error_rad"),
+    draw_translation_error: ("translation_error_m", "refined_translation_error_m"),
+    draw_rotation_error: ("rotation_error_rad", "refined_rotation_error_rad"),
 }
 
 
@@ -36,15 +40,15 @@ def slow_medians(rows: list[dict], aligner: str, column: str) -> dict[int, float
     return {k: statistics.median(known[k]) if mostly[k] else np.nan for k in values}
 
 
-@pytest.mark.parametrize("module", COLUMNS)
-def test_drawn_lines_are_the_medians_of_the_repetitions(module, trio_result: Path) -> None:
+@pytest.mark.parametrize("draw", COLUMNS)
+def test_drawn_lines_are_the_medians_of_the_repetitions(draw, trio_result: Path) -> None:
     data = ResultTables(trio_result)
     errors = data.table("errors")
-    panels = iter(module.draw(data).axes)
+    panels = iter(draw(data).axes)
     for robot_a, robot_b in (("R1", "R2"), ("R1", "R3"), ("R2", "R3")):
         pair = errors[(errors["robot_a"] == robot_a) & (errors["robot_b"] == robot_b)]
         rows = pair.to_dict("records")
-        for column in COLUMNS[module]:
+        for column in COLUMNS[draw]:
             axes = next(panels)
             assert axes.get_title().startswith(f"{robot_a} - {robot_b}")
             drawn = {line.get_label(): line for line in axes.get_lines()}
@@ -69,10 +73,10 @@ def test_of_many_pairs_those_with_most_to_go_by_are_drawn_and_it_is_said(
     for name in ("scenario.json", "tables"):
         (tmp_path / name).symlink_to(trio_result / name)
     data = ResultTables(tmp_path)
-    assert "robot pairs" not in fig04_translation_error.draw(data).get_supxlabel()
+    assert "robot pairs" not in draw_translation_error(data).get_supxlabel()
     data = ResultTables(tmp_path)
     data._tables["errors"] = pd.concat(many)
-    figure = fig04_translation_error.draw(data)
+    figure = draw_translation_error(data)
     assert "10 of 190 robot pairs" in figure.get_supxlabel()
     titles = [axes.get_title() for axes in figure.axes]
     assert len(titles) == 20
@@ -98,7 +102,7 @@ def test_the_legend_shows_bands_and_shades_that_occur(trio_result: Path, tmp_pat
 
     def explained(rows: pd.DataFrame) -> dict[str, str]:
         tables.write(path, "errors", rows)
-        (legend,) = fig04_translation_error.draw(ResultTables(tmp_path)).legends
+        (legend,) = draw_translation_error(ResultTables(tmp_path)).legends
         patches = list(legend.get_patches())
         texts = [each.get_text() for each in legend.get_texts()][-len(patches) :]
         return {t: to_hex(p.get_facecolor()) for t, p in zip(texts, patches, strict=True)}
@@ -108,7 +112,7 @@ def test_the_legend_shows_bands_and_shades_that_occur(trio_result: Path, tmp_pat
     }
     alike = errors.assign(n_true=9)[errors["aligner"].isin(["ransac", "oracle"])]
     tables.write(path, "errors", alike[alike["repetition"] == 0].assign(n_true=0))
-    (legend,) = fig04_translation_error.draw(ResultTables(tmp_path)).legends
+    (legend,) = draw_translation_error(ResultTables(tmp_path)).legends
     assert [each.get_text() for each in legend.get_texts()][2:] == ["< 3 true pairs"]
 
 
@@ -137,5 +141,40 @@ def test_iterations_with_too_few_true_pairs_are_shaded(
     place = few["iteration"].map({k: i for i, k in enumerate(keep)})
     few = few.assign(iteration=10 * place, n_true=[n_true[i] for i in place])
     tables.write(tables.table_path(tmp_path, "errors"), "errors", few)
-    figure = fig04_translation_error.draw(ResultTables(tmp_path))
+    figure = draw_translation_error(ResultTables(tmp_path))
     assert np.ravel(shaded(figure, 0)) == pytest.approx(np.ravel(expected))
+
+
+MEASURED = {
+    "errors": [
+        "translation_error_m",
+        "rotation_error_rad",
+        "refined_translation_error_m",
+        "refined_rotation_error_rad",
+    ],
+    "aligner_timings": ["elapsed_s", "elapsed_low_s", "elapsed_high_s"],
+}
+
+
+@pytest.fixture
+def without_svd(trio_copy: Path) -> ResultTables:
+    for name, columns in MEASURED.items():
+        path = tables.table_path(trio_copy, name)
+        rows = tables.read(path, name)
+        own = rows["aligner"] == "svd"
+        assert own.any()
+        rows.loc[own, columns] = np.nan
+        if name == "errors":
+            rows.loc[own, ["status", "refined_status"]] = "absent"
+        tables.write(path, name, rows)
+    return ResultTables(trio_copy)
+
+
+@pytest.mark.parametrize("draw", [draw_translation_error, draw_rotation_error, draw_aligner_time])
+def test_legends_say_absent(draw, trio_result: Path, without_svd: ResultTables) -> None:
+    def labels(data: ResultTables) -> list[str]:
+        return [text.get_text() for text in draw(data).legends[0].get_texts()]
+
+    before, after = labels(ResultTables(trio_result)), labels(without_svd)
+    assert "svd" in before
+    assert after == ["svd (absent)" if label == "svd" else label for label in before]

@@ -1,0 +1,217 @@
+"""Figures of one robot's filter: tracked points (figure 1) and particle dispersion (figure 3)."""
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from experiments.reports.figures import floor_plan as plan
+from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, read_png
+from experiments.reports.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
+
+_MAX_FRAMES, _TRAIL_FRAMES = 4, 5
+_KEY_FRAME = re.compile(r"(?P<robot>.+)_(?P<iteration>\d+)\.png")
+
+_MAX_ROBOTS = 3
+_ZOOM_MARGIN = 1.25
+_RECENT_ITERATIONS = 50
+_GRID_COLUMNS = 6  # divisible into one, two or three panels of equal width
+_LOWER_ROW_IN = 2.6
+_HEADROOM = 0.5  # space for the legend above the spread, as a share of the spread
+_PLANE = ["x_m", "y_m"]
+Moments = tuple[str, int, int]  # robot, iteration of a wide and of a narrow particle set
+
+
+def draw_tracks(data: ResultTables) -> Figure:
+    """Draw the last consecutive key frames of one robot; colours give the age of each track."""
+    robot, frames = _consecutive_frames(data)
+    tracks = data.of_robot("tracks", robot)
+    shown = tracks[tracks["iteration"].isin(list(frames))]
+    if shown.empty:
+        raise NothingToDraw(f"no tracked points at {robot}'s key frames")
+    columns = min(2, len(frames))
+    rows = -(-len(frames) // columns)
+    figure = Figure(figsize=(PAGE_WIDTH_IN, 2.55 * rows * 2 / columns + 0.5))
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    colours = ScalarMappable(Normalize(1, max(2, shown["length"].max())), "viridis")
+    for axes, (iteration, path) in zip(panels, frames.items(), strict=False):
+        image = matplotlib.image.imread(io.BytesIO(read_png(path)))
+        axes.imshow(image, cmap="gray", vmin=0, vmax=1)
+        axes.autoscale(enable=False)  # points near the border must not widen the view
+        axes.grid(visible=False)
+        now = tracks[tracks["iteration"] == iteration]
+        if len(now):
+            # Trails of the points over the last frames, and the points
+            since = tracks["iteration"].between(iteration - _TRAIL_FRAMES, iteration)
+            recent = tracks[tracks["track"].isin(now["track"]) & since]
+            recent = recent.sort_values("track", kind="stable")
+            track = recent["track"].to_numpy()
+            ends = np.flatnonzero(np.append(track[1:] != track[:-1], True))
+            trails = np.split(recent[["u_px", "v_px"]].to_numpy(), ends[:-1] + 1)
+            ages = recent["length"].to_numpy(np.float64)[ends]
+            by_age: dict[str, Any] = {"cmap": colours.cmap, "norm": colours.norm, "zorder": 2}
+            lines = LineCollection(trails, array=ages, linewidths=1.2, **by_age)
+            axes.add_collection(lines, autolim=False)
+            rim = {"s": 14, "edgecolors": "white", "linewidths": 0.5}
+            axes.scatter(now["u_px"], now["v_px"], c=now["length"], **rim, **by_age | {"zorder": 3})
+        axes.set_title(f"{robot}, k = {iteration}")
+    for axes in panels[len(frames) :]:
+        axes.set_axis_off()
+    figure.supxlabel("u (pixels)", fontsize=8)
+    figure.supylabel("v (pixels)", fontsize=8)
+    scale = {"label": "age of the track (frames)", "ticks": MaxNLocator(integer=True)}
+    figure.colorbar(colours, ax=list(panels), shrink=0.8, aspect=30, **scale)
+    return figure
+
+
+def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
+    """Return the robot with the longest run of consecutive key frames, and the end of the run."""
+    robot, best = "", {}
+    named = [(_KEY_FRAME.fullmatch(p.name), p) for p in (data.folder / "keyframes").glob("*.png")]
+    for each in data.robots:
+        run: dict[int, Path] = {}
+        frames = {int(m["iteration"]): path for m, path in named if m and m["robot"] == each}
+        for iteration, path in sorted(frames.items()):
+            run = (run if iteration - 1 in run else {}) | {iteration: path}
+            if len(run) > len(best):
+                robot, best = each, run
+    if not best:
+        raise NothingToDraw("no key frames were kept: no images, or none from `keep.images_at` on")
+    return robot, dict(list(best.items())[-_MAX_FRAMES:])
+
+
+def draw_dispersion(data: ResultTables) -> Figure:
+    """Draw the particles along up to three paths, their spread, and a wide and a narrow set."""
+    clouds = data.table("clouds")
+    robots = [robot for robot in data.robots if (clouds["robot"] == robot).any()][:_MAX_ROBOTS]
+    if not robots:
+        raise NothingToDraw("no particles were kept")
+    spread = spread_over_time(clouds[clouds["robot"].isin(robots)])
+    figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
+    grid = figure.add_gridspec(2, _GRID_COLUMNS)
+    span = _GRID_COLUMNS // max(2, len(robots))
+    start = (_GRID_COLUMNS - span * len(robots)) // 2
+    # All particle sets are enlarged by one factor so that they are visible beside the paths.
+    extent_m = min(np.ptp(data.path_of(robot), axis=0).max() for robot in robots)
+    sets = clouds[clouds["robot"].isin(robots)].groupby(["robot", "iteration"])[_PLANE]
+    widest_m = (sets.max() - sets.min()).to_numpy().max()
+    magnification = plan.magnification(float(extent_m), float(widest_m))
+    panels: dict[str, Axes] = {}
+    for robot in robots:
+        panels[robot] = figure.add_subplot(grid[0, start : start + span])
+        _draw_path(panels[robot], data, robot, magnification)
+        start += span
+    timeline, *zooms = (figure.add_subplot(grid[1, start : start + 2]) for start in (0, 2, 4))
+    for robot, rows in spread.groupby("robot", sort=False):
+        style = {"color": data.colours[str(robot)], "linewidth": 0.8, "label": robot}
+        timeline.plot(rows["iteration"], rows["spread_m"], **style)
+    timeline.set(xlabel="FastSLAM iteration k", ylabel="spread of the particles (m)")
+    timeline.margins(y=_HEADROOM)
+    timeline.set_ylim(bottom=0)
+    timeline.legend(loc="upper right")
+    timeline.set_title("spread over time")
+    moments = choose_moments(spread)
+    if moments is None:
+        for axes in zooms:
+            axes.set_axis_off()
+    else:
+        robot = moments[0]
+        spread_m = spread[spread["robot"] == robot].set_index("iteration")["spread_m"]
+        _mark_moments(panels[robot], timeline, data.path_of(robot), spread_m, moments)
+        _draw_zooms(zooms, data, spread_m, moments)
+    upper = plan.height_of_row(list(panels.values()), PAGE_WIDTH_IN * span / _GRID_COLUMNS)
+    grid.set_height_ratios([upper, _LOWER_ROW_IN])
+    figure.set_figheight(upper + _LOWER_ROW_IN)
+    return figure
+
+
+def spread_over_time(clouds: pd.DataFrame) -> pd.DataFrame:
+    """Return the RMS distance of the particles from their mean: robot, iteration, spread_m.
+
+    Particles are not weighted, because the figure shows the particle set itself.
+    """
+    variance = clouds.groupby(["robot", "iteration"], sort=False)[_PLANE].var(ddof=0)
+    return variance.sum(axis="columns").pow(0.5).rename("spread_m").reset_index()
+
+
+def choose_moments(spread: pd.DataFrame) -> Moments | None:
+    """Return the two iterations between which one robot's spread fell by the largest factor.
+
+    The wide set comes before the narrow one, so the fall is the effect of revisiting known ground.
+    Return None if the spread of no robot ever fell.
+    """
+    best, best_ratio = None, 1.0
+    for robot, rows in spread[spread["spread_m"] > 0].groupby("robot", sort=False):
+        values, iteration = rows["spread_m"].to_numpy(), rows["iteration"].to_numpy()
+        ratio = np.maximum.accumulate(values) / values
+        tight = int(np.argmax(ratio))
+        if ratio[tight] > best_ratio:
+            best_ratio = ratio[tight]
+            wide = int(np.argmax(values[:tight]))
+            best = (str(robot), int(iteration[wide]), int(iteration[tight]))
+    return best
+
+
+def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -> None:
+    """Draw the path of one robot and its enlarged particle sets."""
+    path, walls = data.path_of(robot), plan.start_plan(axes, data, robot)
+    axes.plot(*path.T, color=GRAY, linewidth=0.7, zorder=2)
+    style = {"marker": ".", "markersize": 1.0, "color": data.colours[robot], "zorder": 3}
+    clouds = data.of_robot("clouds", robot)  # ordered by iteration
+    ends = np.flatnonzero(np.diff(clouds["iteration"])) + 1
+    sets = np.split(clouds[_PLANE].to_numpy(), ends)
+    enlarged = [own.mean(axis=0) + magnification * (own - own.mean(axis=0)) for own in sets]
+    plan.add_points(axes, np.concatenate(enlarged), **style)
+    plan.add_frame(axes, length_m=1.5)
+    plan.set_view(axes, path[:0], path, walls)
+    scale = f", spread x{magnification}" if magnification > 1 else ""
+    axes.set_title(f"{robot}: particles{scale}")
+
+
+def _mark_moments(
+    on_path: Axes, timeline: Axes, path: np.ndarray, spread_m: pd.Series, moments: Moments
+) -> None:
+    """Mark the wide set as A and the narrow set as B, on the path and on the time line."""
+    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
+    look: dict[str, Any] = {"textcoords": "offset points", "fontweight": "bold"}
+    boxed = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
+    for name, k, side in zip("AB", moments[1:], (9, -15), strict=True):
+        x, y = path[k]
+        on_path.annotate(name, xy=(x, y), xytext=(side, 9), **look, **boxed)
+        timeline.plot(k, spread_m[k], "o", color=BLACK, zorder=4)
+        timeline.annotate(name, xy=(k, spread_m[k]), xytext=(3, 3), **look)
+
+
+def _draw_zooms(
+    zooms: list[Axes], data: ResultTables, spread_m: pd.Series, moments: Moments
+) -> None:
+    """Draw the wide and the narrow particle set at the same scale."""
+    robot, *iterations = moments
+    clouds = data.of_robot("clouds", robot).set_index("iteration")[_PLANE]
+    n_landmarks = data.of_robot("robots", robot).set_index("iteration")["n_landmarks"]
+    sets = [clouds.loc[[k]].to_numpy() for k in iterations]
+    reach = _ZOOM_MARGIN * max(float(np.abs(p - p.mean(axis=0)).max()) for p in sets)
+    style = {"marker": ".", "markersize": 2.5, "alpha": 0.7, "color": data.colours[robot]}
+    names = ("A, wide", "B, tight")
+    for axes, name, k, particles in zip(zooms, names, iterations, sets, strict=True):
+        axes.plot(*data.path_of(robot).T, color=GRAY, zorder=1)
+        plan.add_points(axes, particles, **style)
+        plan.set_square(axes, particles.mean(axis=0), reach)
+        axes.locator_params(nbins=4)
+        plan.label_plan(axes, robot)
+        # The number is large on new ground and small on known ground.
+        grown = n_landmarks[k] - n_landmarks[max(0, k - _RECENT_ITERATIONS)]
+        title = f"{name}: k = {k}, spread {1e3 * spread_m[k]:.1f} mm\n"
+        # Two lines: the panels are narrow, and the last one ends at the edge of the page.
+        title += f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations"
+        axes.set_title(title, fontsize=6.5)
