@@ -6,19 +6,19 @@ import numpy as np
 
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.single_steps import require_simulation
-from experiments.pipeline.pipeline import SimulatedRobotStages
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.pipeline.stages.features import rendered
 from experiments.pipeline.stages.log import measured_odometry
 from experiments.pipeline.stages.observed import told_tilt
+from experiments.pipeline.stages.pipeline import SimulatedRobotStages
 from experiments.pipeline.store import Store, mending
 from experiments.pipeline.tasks import OnProgress
 from experiments.scenario.settings import AnyScenario
 from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import EXPORTERS, export_drive
 from mapfusion.errors import InputError
-from sim.recorder import FrameSource
+from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
 
 

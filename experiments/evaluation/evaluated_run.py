@@ -19,13 +19,12 @@ from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
 from experiments.evaluation.pair_evaluation import ALIGNED, JudgeSettings
 from experiments.evaluation.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.evaluation.truth import why_no_truth
-from experiments.pipeline.memory import require_memory
-from experiments.pipeline.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.fuse import read_fusions
 from experiments.pipeline.stages.match import known_at
-from experiments.pipeline.stages.slam import RobotFolders, read_findings
-from experiments.pipeline.stages.snapshots import stored_maps
+from experiments.pipeline.stages.memory import require_memory
+from experiments.pipeline.stages.pipeline import PairStages, Pipeline, RobotStages, lay_out
+from experiments.pipeline.stages.slam import RobotFolders, read_findings, stored_maps
 from experiments.pipeline.store import StageFolder, Store, require_sound
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers

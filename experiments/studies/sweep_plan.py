@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.result import all_tables, renderer
-from experiments.pipeline.memory import require_memory
+from experiments.pipeline.stages.memory import require_memory
 from experiments.pipeline.store import Store
 from experiments.pipeline.tasks import Task, task_names, unfinished
 from experiments.scenario.suite import scenarios_of

@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import cast
 from unittest.mock import patch
 
-from experiments.pipeline.pipeline import lay_out
 from experiments.pipeline.stages import drive
+from experiments.pipeline.stages.pipeline import lay_out
 from experiments.pipeline.workers import single_threaded
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.seeds import parse_seeds

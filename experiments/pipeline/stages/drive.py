@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.walls import Walls
+from experiments.pipeline.stages.faces import Walls
 from experiments.scenario.seeds import generator
 from sim.driver import DriverSettings, Route, drive
-from sim.sway import BodySway
-from sim.trajectory import Trajectory, write_trajectory
+from sim.trajectory import BodySway, Trajectory, write_trajectory
 
 LABEL = "drive the robots"
 TRAJECTORY_FILE = "trajectory.parquet"

@@ -1,12 +1,35 @@
-"""Stage: the world's walls, painted once for all robots and processes."""
+"""Stage: meshes and painted textures of the world's walls, once for all robots and processes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.walls import Look, Walls
 from experiments.scenario.seeds import generator
+from sim.floorplan import FloorPlan, Wall
 from sim.textures import Texture
 from sim.world import write_faces
+
+Look = tuple[str, bool]  # a wall's, and whether it is mirrored
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Polylines in world metres, all of one height and thickness."""
+
+    polylines_m: tuple[tuple[tuple[float, float], ...], ...]
+    height_m: float
+    thickness_m: float
+
+    def floor_plan(self, looks: Sequence[Look] | None = None) -> FloorPlan:
+        """As the simulator takes them, with a look each where they are to be seen."""
+        lines = [np.array(line) for line in self.polylines_m]
+        looks = [("", False)] * len(lines) if looks is None else looks
+        size = self.height_m, self.thickness_m
+        each = zip(lines, looks, strict=True)
+        return FloorPlan(tuple(Wall(line, *size, *look) for line, look in each))
+
 
 LABEL = "paint the walls"
 WRITES = ()

@@ -36,8 +36,8 @@ from mapfusion.robot_log import with_rows
 from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.features import PATCH_SIDE_PX, Features
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
-from sim.recorder import FrameSource, truth_behind
 from sim.renderer import Renderer
+from sim.rendering.frame_source import FrameSource, truth_behind
 from sim.stereo_head import RadiometricNoise, StereoFrame
 from sim.trajectory import read_trajectory
 

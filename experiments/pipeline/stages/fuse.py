@@ -15,14 +15,13 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import match
-from experiments.pipeline.stages.slam import RobotFolders, log_as_filtered
+from experiments.pipeline.stages.slam import RobotFolders, log_as_filtered, stored_maps
 from experiments.pipeline.stages.smooth import (
     log_until,
     read_smoothed,
     read_smoothed_path,
     smoothed_owners,
 )
-from experiments.pipeline.stages.snapshots import stored_maps
 from experiments.pipeline.tables import (
     CORRESPONDENCES,
     COVARIANCE,

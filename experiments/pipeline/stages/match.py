@@ -13,8 +13,13 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.slam import RobotFolders, folders_of_both
-from experiments.pipeline.stages.snapshots import ROBOTS_KEPT, Snapshots, stored_maps
+from experiments.pipeline.stages.slam import (
+    ROBOTS_KEPT,
+    RobotFolders,
+    Snapshots,
+    folders_of_both,
+    stored_maps,
+)
 from experiments.pipeline.tables import CORRESPONDENCES, RIVALS, read_rows, rival_rows, write_rows
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import MatchParameters, match

@@ -16,8 +16,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import write_observations, write_truth_points
 from mapfusion.vision.attitude_filter import Levelling, Measured
 from mapfusion.vision.front_end import FrontEndParameters, Observer, joined
-from sim.sway import AttitudeNoise
-from sim.trajectory import Trajectory, read_trajectory
+from sim.trajectory import AttitudeNoise, Trajectory, read_trajectory
 
 LABEL = "track features"
 WRITES = ("observations.parquet", "truth_points.parquet", "tracks.parquet")

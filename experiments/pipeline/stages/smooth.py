@@ -12,8 +12,12 @@ import numpy as np
 import pandas as pd
 
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.slam import evaluated_iterations, final_path, log_as_filtered
-from experiments.pipeline.stages.snapshots import Associations
+from experiments.pipeline.stages.slam import (
+    Associations,
+    evaluated_iterations,
+    final_path,
+    log_as_filtered,
+)
 from experiments.pipeline.tables import INT, fields
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.errors import DamagedFileError

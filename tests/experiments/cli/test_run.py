@@ -12,8 +12,8 @@ import pytest
 from experiments.evaluation import tables
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.result import run_scenario
-from experiments.pipeline.pipeline import lay_out
 from experiments.pipeline.stage import Job
+from experiments.pipeline.stages.pipeline import lay_out
 from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Recording, Simulation

@@ -7,8 +7,8 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from experiments.pipeline.pipeline import lay_out
 from experiments.pipeline.stages.drive import DriveSettings, driven
+from experiments.pipeline.stages.pipeline import lay_out
 from experiments.scenario.loading import load_scenario
 from sim.routes import hold_for
 from tests.helpers.wheels_alone import wheels_alone

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.pipeline.memory import memory_bytes, needs, require_memory
-from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stages.memory import memory_bytes, needs, require_memory
+from experiments.pipeline.stages.pipeline import lay_out
 from experiments.scenario.loading import load_scenario
 from mapfusion.errors import InputError
 from mapfusion.fastslam.landmarks import allocate

@@ -1,6 +1,6 @@
 """How the stages of a scenario are laid out; nothing is run."""
 
-from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stages.pipeline import lay_out
 from experiments.scenario.settings import Simulation
 
 

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.slam import ASSOCIATIONS, FINDINGS, POSES
+from experiments.pipeline.stages.slam import ASSOCIATIONS, FINDINGS, POSES, Associations
 from experiments.pipeline.stages.smooth import (
     WRITES,
     SmoothSettings,
@@ -22,7 +22,6 @@ from experiments.pipeline.stages.smooth import (
     read_smoothed_path,
     run,
 )
-from experiments.pipeline.stages.snapshots import Associations
 from experiments.pipeline.tables import write_rows
 from mapfusion.errors import DamagedFileError
 from mapfusion.files import POSE_FIELDS

@@ -14,8 +14,8 @@ from pydantic_core import to_jsonable_python
 from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.pipeline import stage as stage_module
 from experiments.pipeline.code_version import imported_sources
-from experiments.pipeline.pipeline import lay_out
 from experiments.pipeline.stage import Job, RecordedLog, Stage, with_those_before
+from experiments.pipeline.stages.pipeline import lay_out
 from experiments.pipeline.store import Store
 from experiments.plugins.discovery import find_method
 from experiments.scenario.loading import load_scenario, scenario_of

@@ -1,4 +1,4 @@
-"""A painted world as the ray caster keeps it: flat arrays of walls in plan, and of texels."""
+"""Painted world in memory: flat arrays of walls in plan, and of texels."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -11,8 +11,8 @@ from mapfusion.errors import InputError
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se3 import in_space
 from sim.floorplan import FloorPlan, Wall
-from sim.raycast.caster import RayCaster, TiltedView
-from sim.recorder import FrameSource
+from sim.rendering.frame_source import FrameSource
+from sim.rendering.ray_caster import RayCaster, TiltedView
 from sim.stereo_head import RadiometricNoise, StereoFrame, camera_pose, depth_at
 from sim.world import write_faces
 

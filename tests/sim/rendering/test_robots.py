@@ -1,4 +1,4 @@
-"""Tests of `sim.raycast.robots`."""
+"""Tests of `sim.rendering.robots`."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,16 @@ from scipy.spatial import ConvexHull
 
 from mapfusion.geometry.se2 import transform_points
 from sim.p3at import URDF
-from sim.raycast.robots import Body, cast, fill_coverage, fill_least, place, within_view
-from sim.raycast.solids import read_solids
-from sim.raycast.visible_walls import Pinhole
+from sim.rendering.robots import (
+    Body,
+    cast,
+    fill_coverage,
+    fill_least,
+    place,
+    read_solids,
+    within_view,
+)
+from sim.rendering.walls import Pinhole
 from sim.stereo_head import NEAR_M
 
 

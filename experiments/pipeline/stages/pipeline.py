@@ -1,4 +1,4 @@
-"""All stages of a scenario up to the aligners' estimates, laid out; nothing is computed here.
+"""Pipeline of a scenario: all stages up to the aligners' estimates; nothing is computed here.
 
 Each stage is handed its own settings, taken from the scenario here and nowhere else.
 """
@@ -26,7 +26,7 @@ from experiments.pipeline.stages import (
     slam,
     smooth,
 )
-from experiments.pipeline.stages.walls import Walls
+from experiments.pipeline.stages.faces import Walls
 from experiments.plugins.discovery import Kind, find_method, fingerprint
 from experiments.scenario.settings import AnyScenario, Recording, Scenario, Simulation
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section

@@ -1,4 +1,4 @@
-"""Recorder: render any frame of a recording, in any order and process.
+"""Frame source: render any frame of a simulation, in any order and process.
 
 Walls are upright and TinyRenderer samples each pixel column along one vertical plane, so in plan a
 column is one ray, and what lies behind the first wall that reaches the ceiling shows nowhere.
@@ -16,8 +16,8 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
 from mapfusion.parameters import require_shape
 from sim.p3at import P3at
-from sim.raycast.caster import RayCaster
 from sim.renderer import BulletRenderer, Renderer
+from sim.rendering.ray_caster import RayCaster
 from sim.stereo_head import SAME_SURFACE, RadiometricNoise, StereoFrame, depth_at, render_stereo
 from sim.world import OUT_OF_SIGHT_M, World
 

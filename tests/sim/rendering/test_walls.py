@@ -1,13 +1,13 @@
-"""What columns see in plan, against rays cast one by one."""
+"""Tests of `sim.rendering.walls`."""
 
 import numpy as np
 import pytest
 
 from mapfusion.geometry.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
-from sim.raycast.scene import Walls, make_scene
-from sim.raycast.visible_walls import NONE, Pinhole, look
-from tests.sim.raycast.scenes import pinhole
+from sim.rendering.scene import Walls, make_scene
+from sim.rendering.walls import NONE, Pinhole, look
+from tests.sim.rendering.scenes import pinhole
 
 CAMERA = StereoCamera(160, 120, 144.0)
 PLAN = FloorPlan(

@@ -1,4 +1,4 @@
-"""Tests of `sim.recorder`."""
+"""Tests of `sim.rendering.frame_source`."""
 
 import hashlib
 import subprocess
@@ -17,8 +17,8 @@ from mapfusion.geometry.se2 import transform_points
 from mapfusion.geometry.se3 import in_space
 from sim.floorplan import FloorPlan, Wall
 from sim.p3at import LENGTH_M
-from sim.recorder import FrameSource, Visibility, truth_behind
 from sim.renderer import Renderer
+from sim.rendering.frame_source import FrameSource, Visibility, truth_behind
 from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
 from sim.world import World, write_faces
 

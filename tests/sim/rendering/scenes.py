@@ -7,10 +7,10 @@ import numpy as np
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import compose
 from sim.p3at import URDF
-from sim.raycast.picture import filtered, sight
-from sim.raycast.scene import Scene, make_scene
-from sim.raycast.solids import read_solids
-from sim.raycast.visible_walls import Pinhole
+from sim.rendering.ray_caster import filtered, sight
+from sim.rendering.robots import read_solids
+from sim.rendering.scene import Scene, make_scene
+from sim.rendering.walls import Pinhole
 
 NOBODY = np.zeros((0, 3))
 SOLIDS = read_solids(URDF)

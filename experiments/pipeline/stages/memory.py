@@ -1,4 +1,4 @@
-"""The memory a run will need, estimated before it starts: it is refused where the machine has less.
+"""Memory that a run will need, estimated before the run starts.
 
 Estimates are upper bounds of what grows with the settings, good to a factor of two or so: they are
 to catch a slip of the keyboard, not to plan a cluster.
@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from experiments.pipeline.pipeline import Pipeline, RobotStages
 from experiments.pipeline.stage import RecordedLog
+from experiments.pipeline.stages.pipeline import Pipeline, RobotStages
 from experiments.scenario.settings import Scenario, SimulatedScenario, Simulation
 from mapfusion.errors import InputError
 from mapfusion.tables import is_csv, table_path

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapfusion.geometry.numerics import Float, kernel
-from sim.raycast.scene import Level
-from sim.raycast.visible_walls import Pinhole, anywhere
+from sim.rendering.scene import Level
+from sim.rendering.walls import Pinhole, anywhere
 
 BACKGROUND = 255.0  # grey level of what is nowhere, as PyBullet has it
 MOST_SAMPLES = 64  # along a footprint

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from mapfusion.geometry.camera import StereoCamera
-from sim.raycast.scene import make_scene
-from tests.sim.raycast.scenes import TEXELS_PER_M, along_m, look, one_wall, pinhole, slanted
+from sim.rendering.scene import make_scene
+from tests.sim.rendering.scenes import TEXELS_PER_M, along_m, look, one_wall, pinhole, slanted
 
 CAMERA = StereoCamera(640, 48, 577.0, mount_x_m=0.0)
 STRAIGHT = np.zeros(3)
