@@ -21,15 +21,15 @@ from sim.p3at import (
     Pose,
 )
 from sim.routes import (
-    Driven,
+    ActiveHold,
+    DriveRecord,
     Hold,
-    Holding,
     Progress,
     Route,
     check_routes,
-    circle_among,
-    hold_for,
-    place,
+    find_deadlock,
+    format_point,
+    resolve_deadlock,
 )
 from sim.trajectory import Trajectory
 from sim.world import PHYSICS_HZ, World
@@ -218,7 +218,7 @@ class _Other(NamedTuple):
     """
 
     T_world_robot: Pose
-    place: int
+    format_point: int
     goes_first: bool
     lets_by: bool
 
@@ -253,7 +253,7 @@ class _Driver:
         self._waypoints_m: list[list[float]] = route.waypoints_m.tolist()
         self._target = self._visited = 0
         self._done = False
-        self._holds = [Holding(each) for each in holds]
+        self._holds = [ActiveHold(each) for each in holds]
         self._holding_for: set[int] = set()
         self._speed_m_s = 0.0
         self._turn_rad_s = 0.0
@@ -341,9 +341,9 @@ class _Driver:
         if time_s - self._progress_s > self._settings.patience_s:
             why = "waits for another robot" if self.lets_by is not None else "is stuck"
             raise InputError(
-                f"robot {self._route.robot}: {why} at {place(pose)} since t = "
+                f"robot {self._route.robot}: {why} at {format_point(pose)} since t = "
                 f"{self._progress_s:.1f} s, on the way to waypoint {self._target + 1} "
-                f"{place(self._waypoints_m[self._target])}"
+                f"{format_point(self._waypoints_m[self._target])}"
             )
 
     def _distance_m(self, pose: Pose) -> float:
@@ -388,7 +388,7 @@ class _Driver:
             body = min(touched)
             what = f"robot {names[body]}" if body in names else "a wall"
             raise InputError(
-                f"robot {self._route.robot}: hits {what} at {place(self._robot.pose())}, "
+                f"robot {self._route.robot}: hits {what} at {format_point(self._robot.pose())}, "
                 f"t = {time_s:.1f} s"
             )
 
@@ -400,7 +400,7 @@ class _Circles:
         self, drivers: Sequence[_Driver], settings: DriverSettings, holds: Sequence[Hold]
     ) -> None:
         self._drivers, self._holds = drivers, holds
-        self._driven = [Driven() for _ in drivers]
+        self._driven = [DriveRecord() for _ in drivers]
         # from the middle of a leg, which a robot may be beside by the arrival tolerance
         self._clearance_m = _REACH_M + settings.arrival_m
         self._most_holds = _MOST_HOLDS * len(drivers)
@@ -429,7 +429,7 @@ class _Circles:
             for i, driver in enumerate(self._drivers)
             if driver.stands and driver.waits_for
         }
-        circle = circle_among(waits_for) if len(waits_for) > 1 else ()
+        circle = find_deadlock(waits_for) if len(waits_for) > 1 else ()
         self._n_steps = self._n_steps + 1 if circle and circle == self._circle else 0
         self._circle = circle
         for i in waits_for.keys() - set(circle):
@@ -439,7 +439,7 @@ class _Circles:
             return None
         self.record(now)
         ahead_m = [driver.ahead_m() for driver in self._drivers]
-        return hold_for(circle, self._driven, ahead_m, self._clearance_m, self._holds)
+        return resolve_deadlock(circle, self._driven, ahead_m, self._clearance_m, self._holds)
 
 
 def _towards(value: float, target: float, step: float) -> float:

@@ -71,7 +71,7 @@ def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
             if gap < 2 * OUTER_RADIUS_M:
                 raise InputError(
                     f"robots {first.robot} and {second.robot}: they start {gap:.2f} m apart, "
-                    f"at {place(first.T_world_start)}; {2 * OUTER_RADIUS_M:.2f} m are needed"
+                    f"at {format_point(first.T_world_start)}; {2 * OUTER_RADIUS_M:.2f} m are needed"
                 )
 
 
@@ -80,7 +80,7 @@ def _check_route(plan: FloorPlan, route: Route) -> None:
     labels = ["start", *(f"waypoint {i}" for i in range(1, len(points)))]
     on_floor, clearance = plan.contains(points), plan.clearance_m(points)
     for label, point, inside, room in zip(labels, points, on_floor, clearance, strict=True):
-        where = f"robot {route.robot}: {label} {place(point)}"
+        where = f"robot {route.robot}: {label} {format_point(point)}"
         if not inside:
             raise InputError(f"{where} lies outside the world")
         if room < 0:
@@ -94,8 +94,8 @@ def _check_route(plan: FloorPlan, route: Route) -> None:
     for start, end in zip(starts, ends, strict=True):
         room = plan.leg_clearance_m(points[start], points[end])
         where = (
-            f"robot {route.robot}: the way from {labels[start]} {place(points[start])} "
-            f"to {labels[end]} {place(points[end])}"
+            f"robot {route.robot}: the way from {labels[start]} {format_point(points[start])} "
+            f"to {labels[end]} {format_point(points[end])}"
         )
         if room < 0:
             raise InputError(f"{where} leads through a wall")
@@ -105,7 +105,7 @@ def _check_route(plan: FloorPlan, route: Route) -> None:
             )
 
 
-def place(point: ArrayLike) -> str:
+def format_point(point: ArrayLike) -> str:
     """A point (2,) or pose (3,) as people read it: `(x, y)` in metres."""
     x, y = np.asarray(point)[:2]
     return f"({x:.2f}, {y:.2f})"
@@ -154,7 +154,7 @@ class Hold(NamedTuple):
 
 
 @dataclass
-class Driven:
+class DriveRecord:
     """Record of one robot's drive so far, frame by frame.
 
     Attributes:
@@ -174,7 +174,7 @@ class Driven:
         self.stopping_m.append(stopping_m)
 
 
-class Holding:
+class ActiveHold:
     """A hold as one drive keeps it: once begun it lasts until all have passed, and only once."""
 
     def __init__(self, hold: Hold) -> None:
@@ -198,7 +198,7 @@ class Holding:
         return {each.robot for each in self._to_pass} if self._begun else set()
 
 
-def circle_among(waits_for: Mapping[int, Iterable[int]]) -> tuple[int, ...]:
+def find_deadlock(waits_for: Mapping[int, Iterable[int]]) -> tuple[int, ...]:
     """The robots of a circle in which each waits for the next, sorted; empty if there is none.
 
     Args:
@@ -229,9 +229,9 @@ def _circle_from(
     return ()
 
 
-def hold_for(
+def resolve_deadlock(
     circle: Sequence[int],
-    driven: Sequence[Driven],
+    driven: Sequence[DriveRecord],
     ahead_m: Sequence[Iterable[Float]],
     clearance_m: float,
     known: Iterable[Hold] = (),
@@ -270,7 +270,7 @@ def _is_of(hold: Hold, robot: int, passages: tuple[Passage, ...]) -> bool:
 def _way_past(
     robot: int,
     circle: Sequence[int],
-    driven: Sequence[Driven],
+    driven: Sequence[DriveRecord],
     ahead_m: Iterable[Float],
     clearance_m: float,
 ) -> Float:
@@ -285,7 +285,7 @@ def _way_past(
 
 
 def _place(
-    driven: Driven, legs_m: Float, clearance_m: float, tried: Sequence[Progress]
+    driven: DriveRecord, legs_m: Float, clearance_m: float, tried: Sequence[Progress]
 ) -> Progress | None:
     """The last place before `tried` that is clear of legs (L, 2, 2); else the one most so."""
     there = np.array(driven.position_m)[:, None]

@@ -71,7 +71,7 @@ class Texture:
             raise OutOfRangeError("poster_width_m", said)
 
 
-AS_PAINTED = Texture()
+DEFAULT_TEXTURE = Texture()
 
 # Smallest wall shapes: 4 px at 8 m, 30 px at 1 m. Floor and ceiling are seen at a grazing angle,
 # where a pixel covers centimetres to decimetres: coarse shapes only.
@@ -96,7 +96,7 @@ _MOST_CORNERS = 6  # of a shape
 def paint(
     face: Face,
     rng: np.random.Generator,
-    texture: Texture = AS_PAINTED,
+    texture: Texture = DEFAULT_TEXTURE,
     posters: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
     """An RGB picture (H, W, 3) uint8 of a face, its first row along the upper edge.
@@ -118,7 +118,7 @@ def paint_posters(texture: Texture, rng: np.random.Generator) -> list[np.ndarray
     size_m = texture.poster_m
     if texture.poster_width_m is not None:
         size_m = float(np.exp(rng.uniform(*np.log(texture.poster_width_m)))), size_m[1]
-    return [_paint_shapes("wall", size_m, rng, AS_PAINTED) for _ in range(texture.posters)]
+    return [_paint_shapes("wall", size_m, rng, DEFAULT_TEXTURE) for _ in range(texture.posters)]
 
 
 def _hang(

@@ -19,7 +19,7 @@ from mapfusion.files import name_in_text, require_file, write_whole
 from mapfusion.geometry.numerics import Float
 from sim.floorplan import Face, FloorPlan
 from sim.renderer import BulletRenderer, egl_driver, load_egl
-from sim.textures import AS_PAINTED, Texture, paint, paint_posters
+from sim.textures import DEFAULT_TEXTURE, Texture, paint, paint_posters
 
 GRAVITY_M_S2 = 9.81
 PHYSICS_HZ = 240  # PyBullet's own default; contacts and motors are tuned for it
@@ -206,7 +206,7 @@ class World:
 
 
 def write_faces(
-    folder: Path, plan: FloorPlan, rng: np.random.Generator, texture: Texture = AS_PAINTED
+    folder: Path, plan: FloorPlan, rng: np.random.Generator, texture: Texture = DEFAULT_TEXTURE
 ) -> None:
     """Write each face's mesh and texture into `folder`; each texture has a child generator.
 

@@ -56,7 +56,7 @@ def _options(
 def main() -> None:
     """Run the command; every failure a user can cause is one line and an exit code."""
     from experiments.pipeline.code_version import use_kernel_cache
-    from experiments.pipeline.workers import saved_defect
+    from experiments.pipeline.workers import save_defect
 
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # None without a terminal
@@ -90,7 +90,7 @@ def main() -> None:
         # Typer keeps its usage errors' classes private; all of them can tell their message.
         message = getattr(error, "format_message", None)
         if message is None:
-            complain(saved_defect(error))
+            complain(save_defect(error))
             code = EXIT_DEFECT
         else:
             if message():  # empty where the help was shown instead

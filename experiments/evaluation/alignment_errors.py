@@ -16,7 +16,7 @@ from experiments.evaluation.truth import (
     squared_mahalanobis,
     true_pairs,
 )
-from experiments.pipeline.stages.match import known_at
+from experiments.pipeline.stages.match import latest_at
 from experiments.pipeline.tables import (
     MOTION,
     alignment_of,
@@ -52,7 +52,7 @@ class EvaluatedRobot:
 
     def at(self, iteration: int) -> tuple[LandmarkMap, Float]:
         """Map and true points at an iteration (the last ones of a log that ended earlier)."""
-        return known_at(self.maps, iteration), known_at(self.points_world_m, iteration)
+        return latest_at(self.maps, iteration), latest_at(self.points_world_m, iteration)
 
     def in_map_frame(self, points_world_m: Float) -> Float:
         """Points (..., 3) of the world in the frame of this robot's maps."""

@@ -8,11 +8,11 @@ from experiments.evaluation.evaluated_run import JudgedRun
 from experiments.evaluation.single_steps import require_simulation
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
-from experiments.pipeline.stages.features import rendered
+from experiments.pipeline.stages.features import render_frame
 from experiments.pipeline.stages.log import measured_odometry
 from experiments.pipeline.stages.observed import told_tilt
 from experiments.pipeline.stages.pipeline import SimulatedRobotStages
-from experiments.pipeline.store import Store, mending
+from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress
 from experiments.scenario.settings import AnyScenario
 from mapfusion.datasets.export import StereoDrive
@@ -42,7 +42,7 @@ def write_drives(
     run = JudgedRun.of(scenario, Store.of(results))
     robots = run.pipeline.simulated
     driven, painted = (_before(robots[0], name) for name in ("drive", "faces"))
-    mending(run.store, lambda: run.execute(jobs, on_progress, [driven, painted]))
+    retry_damaged(run.store, lambda: run.execute(jobs, on_progress, [driven, painted]))
     trajectory = read_trajectory(run.store.path(driven) / TRAJECTORY_FILE)
     settings = robots[0].features.settings  # camera and renderer are all robots'
     world = (run.store.path(painted), settings.camera, trajectory.robots, settings.renderer)
@@ -67,7 +67,7 @@ def _drive_of(
     robot: SimulatedRobotStages, trajectory: Trajectory, source: FrameSource
 ) -> StereoDrive:
     def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
-        frame = rendered(robot.features.settings, source, trajectory.bodies(k), k)
+        frame = render_frame(robot.features.settings, source, trajectory.bodies(k), k)
         return frame.left, frame.right
 
     index, tilts = trajectory.index(robot.name), trajectory.tilt_rad

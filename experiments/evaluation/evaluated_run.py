@@ -21,11 +21,11 @@ from experiments.evaluation.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.evaluation.truth import why_no_truth
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.fuse import read_fusions
-from experiments.pipeline.stages.match import known_at
+from experiments.pipeline.stages.match import latest_at
 from experiments.pipeline.stages.memory import require_memory
-from experiments.pipeline.stages.pipeline import PairStages, Pipeline, RobotStages, lay_out
+from experiments.pipeline.stages.pipeline import PairStages, Pipeline, RobotStages, build_pipeline
 from experiments.pipeline.stages.slam import RobotFolders, read_findings, stored_maps
-from experiments.pipeline.store import StageFolder, Store, require_sound
+from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
 from experiments.scenario.settings import AnyScenario, Recording
@@ -60,7 +60,7 @@ class JudgedRun:
     @classmethod
     def of(cls, scenario: AnyScenario, store: Store) -> "JudgedRun":
         """Lay out a scenario; nothing is computed."""
-        pipeline, chosen = lay_out(scenario), scenario.merge
+        pipeline, chosen = build_pipeline(scenario), scenario.merge
         merge = MergeSettings(chosen.aligner, chosen.parameters)
         align, radius_m = scenario.align, scenario.evaluate.true_pair_radius_m
         settings = JudgeSettings(align.judge, merge, radius_m)
@@ -105,7 +105,7 @@ class JudgedRun:
     def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
         """All robots' maps at an iteration as they were stored, by name."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
-        return {name: known_at(stored_maps(each), iteration) for name, each in folders.items()}
+        return {name: latest_at(stored_maps(each), iteration) for name, each in folders.items()}
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
         """What the smoother made of all robots' logs, joined with the truth."""
@@ -214,7 +214,7 @@ class JudgedRun:
         try:
             with workers(jobs) as pool:
                 run_tasks(left, pool, on_progress, None if only else self._load_task())
-        except DamagedFileError:  # `mending` wants to know which
+        except DamagedFileError:  # `retry_damaged` needs to know which
             raise
         except InputError as error:
             raise InputError(f"scenario {self.scenario.name}: {error}") from error
@@ -222,7 +222,7 @@ class JudgedRun:
             if not folder.finished:
                 raise InputError(f"{folder.path}: was removed while it was being made; run again")
         for stage in only or self._collected():
-            require_sound(self.store.path(stage))
+            require_undamaged(self.store.path(stage))
 
 
 def _judgement(settings: JudgeSettings, pair: PairStages) -> Stage:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.evaluation.evaluated_run import JudgedRun, finding_of_truth
-from experiments.pipeline.store import Store, link_or_copy, mending
+from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tables import estimate_row
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import callable_aligner
@@ -48,7 +48,7 @@ def record(
             for path in sorted(run.store.path(robot.log).glob("*.parquet")):
                 link_or_copy(path, output / robot.name / path.name)
 
-    mending(run.store, make)
+    retry_damaged(run.store, make)
     return [output / robot.name for robot in run.pipeline.robots]
 
 

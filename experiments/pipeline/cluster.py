@@ -22,7 +22,7 @@ from distributed import Client, LocalCluster
 from distributed.security import Security
 
 from experiments.pipeline.code_version import library_versions, source_hash, use_kernel_cache
-from experiments.pipeline.workers import described, held_back_interrupts
+from experiments.pipeline.workers import blocked_interrupts, describe_defect
 from mapfusion.errors import DamagedFileError, InputError
 
 # Tasks use state of their process (the open PyBullet world, OpenCV's threads). So a worker that was
@@ -48,7 +48,7 @@ class UnfitWorkerError(Exception):
 
 
 @dataclass(frozen=True)
-class Terms:
+class SweepTerms:
     """Terms that all tasks of a sweep share.
 
     Attributes:
@@ -80,7 +80,7 @@ def _prepare() -> None:
     single_threaded()
 
 
-def perform(name: str, task: bytes, terms: Terms, *needs: None) -> object:
+def perform(name: str, task: bytes, terms: SweepTerms, *needs: None) -> object:
     """Run a task. It comes pickled, because it is unpacked only after the process is prepared.
 
     `needs` are the results of the tasks before it (all None); they tell Dask the order.
@@ -107,7 +107,7 @@ def perform(name: str, task: bytes, terms: Terms, *needs: None) -> object:
         return _attempt(name, task, terms)
 
 
-def _attempt(name: str, task: bytes, terms: Terms) -> object:
+def _attempt(name: str, task: bytes, terms: SweepTerms) -> object:
     """Run a task while a file marks it as begun: only a killed process leaves the file behind."""
     stage = name.partition("/")[0]
     mark = terms.attempts / name.replace("/", "_")
@@ -127,7 +127,9 @@ def _attempt(name: str, task: bytes, terms: Terms) -> object:
         raise TaskFailedError(name, reason) from None
     except Exception as error:
         details = traceback.format_exc()
-        raise TaskFailedError(name, f"{stage}: {described(error, details)}", details) from None
+        raise TaskFailedError(
+            name, f"{stage}: {describe_defect(error, details)}", details
+        ) from None
     finally:
         mark.unlink(missing_ok=True)
 
@@ -137,7 +139,7 @@ _STARTS = 3  # attempts to start a cluster: a worker may be killed while it star
 
 _LOCAL_SETTINGS = {
     # Dask blames every task that was assigned to a killed worker, not only the one that ran. So
-    # the sweep counts by itself (`dask_worker.Terms.retries`).
+    # the sweep counts by itself (`SweepTerms.retries`).
     "distributed.scheduler.allowed-failures": 1_000_000,
     # A killed worker is started again, which takes long on a busy machine: Dask must not give up.
     "distributed.deploy.lost-worker-timeout": "1 day",
@@ -156,7 +158,7 @@ _LOCAL_SETTINGS = {
 }
 
 
-def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client]:
+def dask_client(jobs: int, scheduler: str | None) -> AbstractContextManager[Client]:
     """Return a client for a `with` block: of the scheduler at an address, or of `jobs` processes.
 
     Credentials for an address `tls://...` are those of Dask's configuration.
@@ -181,7 +183,7 @@ def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client
 @contextmanager
 def _local(jobs: int) -> Iterator[Client]:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the sweep reports failures
-    with dask.config.set(_LOCAL_SETTINGS), held_back_interrupts() as let_them_come:
+    with dask.config.set(_LOCAL_SETTINGS), blocked_interrupts() as let_them_come:
         cluster = _started(jobs)
         try:
             let_them_come()

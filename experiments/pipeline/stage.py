@@ -105,10 +105,10 @@ class RecordedLog:
         return digest.hexdigest()[:_KEY_LENGTH]
 
 
-def with_those_before(goals: "Iterable[Stage | RecordedLog]") -> list[Stage]:
+def in_dependency_order(goals: "Iterable[Stage | RecordedLog]") -> list[Stage]:
     """Stages and all that come before them, each once and after those before it."""
     found: dict[Stage, None] = {}
     for goal in goals:
         if isinstance(goal, Stage):
-            found |= dict.fromkeys([*with_those_before(goal.before.values()), goal])
+            found |= dict.fromkeys([*in_dependency_order(goal.before.values()), goal])
     return list(found)

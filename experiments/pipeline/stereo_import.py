@@ -87,7 +87,7 @@ class ImportedRecording:
         return [one.too_little for one in self.robots if one.too_little]
 
 
-def imported(
+def import_recording(
     source: Source, recording: StereoRecording, cuts: Sequence[Cut], on_progress: OnProgress
 ) -> ImportedRecording:
     """Make the logs of some robots of a recording that `source` read; raises InputError."""
@@ -132,7 +132,7 @@ def import_stereo(
         raise InputError(f"two robots are named {twice[0]}; name them by --frames NAME=FROM:TO")
     if jobs == 1 or len(names) == 1:
         each = zip(sources, recordings, robots, strict=True)
-        done = [imported(*one, on_progress) for one in each]
+        done = [import_recording(*one, on_progress) for one in each]
     else:
         done = _shared_out(sources, robots, jobs, on_progress)
     return done, write_imported(destination, [log for one in done for log in one.robots])
@@ -157,7 +157,7 @@ def _shared_out(
 
 
 def _one_robot(source: Source, cut: Cut) -> ImportedRecording:
-    return imported(source, source.read(), [cut], lambda *_: None)
+    return import_recording(source, source.read(), [cut], lambda *_: None)
 
 
 def vision_of(scenario: str) -> FrontEndParameters:

@@ -150,7 +150,7 @@ class StageFolder:
         shutil.rmtree(self.path, ignore_errors=True)
 
 
-def require_sound(stage: Path, pattern: str = "*") -> None:
+def require_undamaged(stage: Path, pattern: str = "*") -> None:
     """Check the files in the folder of a stage against the marks of its finished parts.
 
     A folder without marks, such as a log of the user's, is not checked.
@@ -230,13 +230,13 @@ def _read_mark(path: Path) -> _Mark:
 
 def _is_sound(stage: Path) -> bool:
     try:
-        require_sound(stage)
+        require_undamaged(stage)
     except DamagedFileError:
         return False
     return True
 
 
-def mending(store: Store, work: Callable[[], T]) -> T:
+def retry_damaged(store: Store, work: Callable[[], T]) -> T:
     """Return the result of `work`; call it again if it has read a damaged stage of the store.
 
     The stage is removed with a warning, and `work` has to make it again.

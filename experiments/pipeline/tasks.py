@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.pipeline.stage import Job, RecordedLog, Stage
-from experiments.pipeline.store import StageFolder, Store, require_sound
+from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.workers import Workers
 from mapfusion.files import remove_abandoned
 
@@ -94,7 +94,7 @@ def _task(stage: Stage, part: str, folder: StageFolder, store: Store) -> Task:
 def _perform(work: Callable[..., Any], settings: Any, job: Job, folder: StageFolder) -> None:
     """Make a part of a stage from inputs that are sound, and mark it as finished."""
     for stage in job.inputs.values():
-        require_sound(stage)
+        require_undamaged(stage)
     remove_abandoned(folder.path)  # by a process that was killed while it made the same
     started = time.perf_counter()
     figures = dict(work(settings, job) or {})

@@ -27,7 +27,7 @@ from mapfusion.errors import InputError
 
 
 @contextmanager
-def held_back_interrupts() -> Iterator[Callable[[], None]]:
+def blocked_interrupts() -> Iterator[Callable[[], None]]:
     """Until the end of a `with` block, or until what it gives is called, this thread blocks Ctrl-C.
 
     A terminal sends it to the command and to all its processes. Those that are started meanwhile,
@@ -70,7 +70,7 @@ _FRAME = re.compile(r'File "([^"]+)", line (\d+), in (\S+)')
 _LONGEST_REASON = 200  # characters
 
 
-def described(error: BaseException, details: str) -> str:
+def describe_defect(error: BaseException, details: str) -> str:
     """What went wrong and where, in one line; `details` is the error's traceback."""
     frames = _FRAME.findall(details)
     place = "at {}:{} in {}".format(*frames[-1]) if frames else "at an unknown place"
@@ -78,7 +78,7 @@ def described(error: BaseException, details: str) -> str:
     return f"a defect of mapfusion itself: {reason} {place}"
 
 
-def saved_defect(error: BaseException) -> str:
+def save_defect(error: BaseException) -> str:
     """The same, once the whole traceback is in a file, which it names.
 
     What was finished before is in the store, and a repaired program goes on from there.
@@ -90,7 +90,7 @@ def saved_defect(error: BaseException) -> str:
     with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
         file.write(details)
     told = "what was finished is kept; please report it with its traceback"
-    return f"{described(error, details)}; {told}: {path}"
+    return f"{describe_defect(error, details)}; {told}: {path}"
 
 
 # While a process works on one task, the next is there already. More of them would be begun in the
@@ -132,7 +132,7 @@ class Workers:
         if self._jobs == 1:
             self._pending[functools.partial(function, *arguments)] = tag
             return
-        with held_back_interrupts():  # a task may start a process
+        with blocked_interrupts():  # a task may start a process
             if self._pool is None:
                 self._pool = self._started()
             self._pending[self._pool.submit(function, *arguments)] = tag

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapfusion.geometry.numerics import Float, kernel
-from sim.rendering.scene import Level
-from sim.rendering.walls import Pinhole, anywhere
+from sim.rendering.scene import HorizontalPlane
+from sim.rendering.walls import Pinhole, at_origin
 
 BACKGROUND = 255.0  # grey level of what is nowhere, as PyBullet has it
 MOST_SAMPLES = 64  # along a footprint
@@ -30,7 +30,7 @@ WHOLE_SHARE, LOW_SHARE = np.uint32(1 << SHARE_BITS), np.uint32((1 << SHARE_BITS)
 FIRST_AND_THIRD = np.uint32(0x00FF00FF)  # bytes of a cell
 BYTE, HALF, LOW_HALF = np.uint32(8), np.uint32(16), np.uint32(0xFFFF)
 
-Way = tuple[float, float, float]
+RayCoefficients = tuple[float, float, float]
 Line = tuple[float, float, float, float]  # x, y and their steps from pixel to pixel
 Size = tuple[int, int]  # of a copy of the picture: rows and columns
 
@@ -43,10 +43,10 @@ def row_depth_m(camera: Pinhole, height_m: ArrayLike, v: ArrayLike) -> Float:
         return np.where(drop * down > 0, drop / down, np.inf)
 
 
-def footprints(camera: Pinhole, level: Level) -> np.ndarray:
+def footprints(camera: Pinhole, level: HorizontalPlane) -> np.ndarray:
     """How each row is sampled (H, 3) int64: samples along, samples across, copy of the picture."""
     per_m = float(level.shape[0, 1] / level.size_m[0])
-    return _footprints(anywhere(camera), level.height_m, per_m, len(level.first))
+    return _footprints(at_origin(camera), level.height_m, per_m, len(level.first))
 
 
 @functools.lru_cache(maxsize=8)
@@ -68,7 +68,9 @@ def _footprints(camera: Pinhole, height_m: float, per_m: float, copies: int) -> 
     return plan
 
 
-def ways(camera: Pinhole, level: Level) -> tuple[Way, Way]:
+def ray_coefficients(
+    camera: Pinhole, level: HorizontalPlane
+) -> tuple[RayCoefficients, RayCoefficients]:
     """How rays go over a picture: right = a + (b + c u) Z, and up likewise, both 0 to 1 on it."""
     cos, sin = math.cos(camera.theta), math.sin(camera.theta)
     left = camera.center_u / camera.focal_px
@@ -76,14 +78,18 @@ def ways(camera: Pinhole, level: Level) -> tuple[Way, Way]:
     x0, y0 = camera.eye_x_m - corner_x, camera.eye_y_m - corner_y
     dx, dy = cos - left * sin, sin + left * cos
 
-    def along(x: float, y: float) -> Way:
+    def along(x: float, y: float) -> RayCoefficients:
         return x * x0 + y * y0, x * dx + y * dy, (x * sin - y * cos) / camera.focal_px
 
     return along(*level.right_per_m2.tolist()), along(*level.up_per_m2.tolist())
 
 
-def fill(
-    camera: Pinhole, level: Level, is_above: bool, open_rows: np.ndarray, picture: np.ndarray
+def draw_plane(
+    camera: Pinhole,
+    level: HorizontalPlane,
+    is_above: bool,
+    open_rows: np.ndarray,
+    picture: np.ndarray,
 ) -> None:
     """Draw floor or ceiling where walls leave pixels open on its side of the horizon.
 
@@ -94,7 +100,7 @@ def fill(
         open_rows: (W,) so many rows of each column, from the picture's edge on, are open.
         picture: (H, W) uint8, changed.
     """
-    plan, way = footprints(camera, level), ways(camera, level)
+    plan, way = footprints(camera, level), ray_coefficients(camera, level)
     rise = (camera.eye_z_m - level.height_m) * camera.focal_px
     texels = level.shape, level.first, level.cells
     _fill(*texels, plan, way, rise, camera.center_v, is_above, open_rows, picture)
@@ -106,7 +112,7 @@ def _fill(
     firsts: np.ndarray,
     cells: np.ndarray,
     plan: np.ndarray,
-    way: tuple[Way, Way],
+    way: tuple[RayCoefficients, RayCoefficients],
     rise: float,
     center_v: float,
     is_above: bool,
@@ -183,7 +189,7 @@ def _fill(
 
 
 @kernel
-def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
+def _line(way: tuple[RayCoefficients, RayCoefficients], u: float, z: float, size: Size) -> Line:
     """Where a row's pixels lie on a copy of the picture, in cells, from the one at `u` on.
 
     Cells lie between the middles of texels.
@@ -254,7 +260,7 @@ def _add_at_the_edge(
             sums[i] += np.uint32(SUM_UNIT * int(BACKGROUND))
 
 
-def texels(level: Level, right: Float, up: Float) -> np.ndarray:
+def lookup_texels(level: HorizontalPlane, right: Float, up: Float) -> np.ndarray:
     """The texels (...) that points of the picture lie on; the background beside it."""
     inside = (right >= 0) & (right < 1) & (up >= 0) & (up < 1)
     height, width = level.shape[0]

@@ -20,20 +20,33 @@ from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se3 import planar
 from sim.p3at import URDF
-from sim.rendering.floor_and_ceiling import Way, fill, row_depth_m, texels, ways
+from sim.rendering.floor_and_ceiling import (
+    RayCoefficients,
+    draw_plane,
+    lookup_texels,
+    ray_coefficients,
+    row_depth_m,
+)
 from sim.rendering.robots import (
-    Body,
+    ProjectedRobot,
     Solids,
-    by_distance,
-    cast,
-    draw,
-    is_hidden,
-    place,
+    cast_rays,
+    draw_robots,
+    is_occluded,
+    project_robot,
     read_solids,
+    sorted_by_distance,
     within_view,
 )
-from sim.rendering.scene import REFUSED, Level, Scene, Walls, read_scene
-from sim.rendering.walls import NONE, Pinhole, Plan, anywhere, draw_walls, look
+from sim.rendering.scene import REFUSED, HorizontalPlane, Scene, Walls, read_scene
+from sim.rendering.walls import (
+    NO_WALL,
+    Pinhole,
+    VisibleWalls,
+    at_origin,
+    draw_walls,
+    find_visible_walls,
+)
 from sim.stereo_head import (
     NEAR_M,
     SAME_SURFACE,
@@ -45,7 +58,7 @@ from sim.stereo_head import (
 )
 
 
-class Sight(NamedTuple):
+class VisibleScene(NamedTuple):
     """Where things are before a camera, whatever their colours.
 
     Attributes:
@@ -55,20 +68,20 @@ class Sight(NamedTuple):
     """
 
     camera: Pinhole
-    plan: Plan
-    bodies: list[Body]
+    plan: VisibleWalls
+    bodies: list[ProjectedRobot]
 
 
-def sight(camera: Pinhole, walls: Walls, solids: Solids, poses: Float) -> Sight:
+def find_visible(camera: Pinhole, walls: Walls, solids: Solids, poses: Float) -> VisibleScene:
     """What a camera has before it, robots at poses (R, 3) among it."""
-    plan, bodies = look(camera, walls), list[Body]()
-    for pose in by_distance(camera, within_view(camera, solids.reach_m, poses)):
-        if not is_hidden(camera, plan, solids.reach_m, pose):
-            bodies.append(place(camera, solids, pose))
-    return Sight(camera, plan, [body for body in bodies if len(body.shown)])
+    plan, bodies = find_visible_walls(camera, walls), list[ProjectedRobot]()
+    for pose in sorted_by_distance(camera, within_view(camera, solids.reach_m, poses)):
+        if not is_occluded(camera, plan, solids.reach_m, pose):
+            bodies.append(project_robot(camera, solids, pose))
+    return VisibleScene(camera, plan, [body for body in bodies if len(body.shown)])
 
 
-def filtered(of: Sight, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
+def render_filtered(of: VisibleScene, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
     """Grey levels (H, W) uint8, each the mean over the pixel's footprint.
 
     Args:
@@ -79,37 +92,37 @@ def filtered(of: Sight, scene: Scene, solids: Solids, grey: Float) -> np.ndarray
     """
     camera, plan = of.camera, of.plan
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
-    fill(camera, scene.ceiling, True, plan.above, picture)
-    fill(camera, scene.floor, False, plan.below, picture)
+    draw_plane(camera, scene.ceiling, True, plan.above, picture)
+    draw_plane(camera, scene.floor, False, plan.below, picture)
     # walls are drawn by columns, which in a picture lie far apart in memory
     columns = cv2.transpose(picture)
     draw_walls(camera, scene.walls, plan, columns)
     picture = cv2.transpose(columns)
     if of.bodies:
-        draw(camera, plan, solids, of.bodies, grey, picture)
+        draw_robots(camera, plan, solids, of.bodies, grey, picture)
     return picture
 
 
-def depths(of: Sight, scene: Scene, solids: Solids) -> np.ndarray:
+def render_depth(of: VisibleScene, scene: Scene, solids: Solids) -> np.ndarray:
     """Depth (H, W) float32 along the optical axis behind the pixels' middles; NaN for nothing."""
     depth_m = _still_depths(of, scene)
-    cast(of.camera, solids, of.bodies, np.zeros(len(solids.rgb)), depth_m)
-    if np.any(of.plan.middle == NONE):
+    cast_rays(of.camera, solids, of.bodies, np.zeros(len(solids.rgb)), depth_m)
+    if np.any(of.plan.middle == NO_WALL):
         depth_m[np.isinf(depth_m)] = np.nan
     return depth_m
 
 
-def _still_depths(of: Sight, scene: Scene) -> np.ndarray:
+def _still_depths(of: VisibleScene, scene: Scene) -> np.ndarray:
     """Depth (H, W) of what stands still; infinity for nothing."""
     camera, plan = of.camera, of.plan
-    levels_m = _depths_of_levels(anywhere(camera), scene.floor.height_m, scene.ceiling.height_m)
+    levels_m = _depths_of_levels(at_origin(camera), scene.floor.height_m, scene.ceiling.height_m)
     depth_m = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
     np.minimum(plan.middle_m.astype(np.float32), levels_m.astype(np.float32)[:, None], out=depth_m)
-    beside = np.flatnonzero(plan.middle == NONE)
+    beside = np.flatnonzero(plan.middle == NO_WALL)
     if len(beside):  # only a column without walls shows where floors end
         for level, rows in _sides(camera, scene):
             z = levels_m[rows, None]
-            right, up = (_along(way, beside, z) for way in ways(camera, level))
+            right, up = (_along(way, beside, z) for way in ray_coefficients(camera, level))
             inside = (right >= 0) & (right < 1) & (up >= 0) & (up < 1)
             depth_m[rows, beside] = np.where(inside, z, np.inf)
     return depth_m
@@ -123,32 +136,34 @@ def _depths_of_levels(camera: Pinhole, floor_m: float, ceiling_m: float) -> Floa
     return row_depth_m(camera, height_m, v)
 
 
-def _sides(camera: Pinhole, scene: Scene) -> list[tuple[Level, slice]]:
+def _sides(camera: Pinhole, scene: Scene) -> list[tuple[HorizontalPlane, slice]]:
     """Ceiling and floor, and the rows on their side of the horizon."""
     horizon = min(max(math.ceil(camera.center_v), 0), camera.height_px)
     return [(scene.ceiling, slice(horizon)), (scene.floor, slice(horizon, camera.height_px))]
 
 
-def sampled(of: Sight, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
+def render_sampled(of: VisibleScene, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
     """Grey levels (H, W) uint8 of what the pixels' middles hit; arguments as of `filtered`."""
     picture = _still_texels(of, scene)
-    cast(of.camera, solids, of.bodies, grey, _still_depths(of, scene), picture)
+    cast_rays(of.camera, solids, of.bodies, grey, _still_depths(of, scene), picture)
     return picture
 
 
-def _still_texels(of: Sight, scene: Scene) -> np.ndarray:
+def _still_texels(of: VisibleScene, scene: Scene) -> np.ndarray:
     """Texels (H, W) uint8 of what stands still."""
     camera, plan, walls, u = of.camera, of.plan, scene.walls, np.arange(of.camera.width_px)
     face, wall_m = plan.middle, plan.middle_m
     seen, size = plan.seen[face], walls.size[face]
-    levels_m = _depths_of_levels(anywhere(camera), scene.floor.height_m, scene.ceiling.height_m)
-    along = np.where(face == NONE, 0.0, (seen[:, 4] + seen[:, 5] * u) * wall_m - seen[:, 6])
+    levels_m = _depths_of_levels(at_origin(camera), scene.floor.height_m, scene.ceiling.height_m)
+    along = np.where(face == NO_WALL, 0.0, (seen[:, 4] + seen[:, 5] * u) * wall_m - seen[:, 6])
     right = np.clip(along / walls.width_m[face] * size[:, 0], 0, size[:, 0] - 1).astype(np.int64)
     first = walls.first[face] + right * (size[:, 1] + 1)
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
     for level, rows in _sides(camera, scene):
-        to_right, to_up = (_along(way, u, levels_m[rows, None]) for way in ways(camera, level))
-        picture[rows] = texels(level, to_right, to_up)
+        to_right, to_up = (
+            _along(way, u, levels_m[rows, None]) for way in ray_coefficients(camera, level)
+        )
+        picture[rows] = lookup_texels(level, to_right, to_up)
     v, j = np.nonzero(wall_m < levels_m[:, None])
     height_m = camera.eye_z_m - (v - camera.center_v) * wall_m[j] / camera.focal_px
     up = (height_m / walls.height_m * size[j, 1]).astype(np.int64)
@@ -158,7 +173,7 @@ def _still_texels(of: Sight, scene: Scene) -> np.ndarray:
     return picture
 
 
-def _along(way: Way, u: np.ndarray, z: Float) -> Float:
+def _along(way: RayCoefficients, u: np.ndarray, z: Float) -> Float:
     """Where on a level's picture columns' rays are at depths, see `ways`; NaN infinitely far."""
     with np.errstate(invalid="ignore"):
         return way[0] + (way[1] + way[2] * u) * z
@@ -334,18 +349,18 @@ class RayCaster:
         view = self._view(T_world_robot, y_m)
         return self._depth_m(view, self._sight(view, _poses(others)))
 
-    def _sight(self, view: Pinhole | TiltedView, poses: Float) -> Sight:
+    def _sight(self, view: Pinhole | TiltedView, poses: Float) -> VisibleScene:
         camera = view if isinstance(view, Pinhole) else view.level
-        return sight(camera, self._scene.walls, self._solids, poses)
+        return find_visible(camera, self._scene.walls, self._solids, poses)
 
-    def _depth_m(self, view: Pinhole | TiltedView, seen: Sight) -> np.ndarray:
-        found = depths(seen, self._scene, self._solids)
+    def _depth_m(self, view: Pinhole | TiltedView, seen: VisibleScene) -> np.ndarray:
+        found = render_depth(seen, self._scene, self._solids)
         return found if isinstance(view, Pinhole) else view.depth_m(found)
 
     def _draw(
-        self, scene: Scene, view: Pinhole | TiltedView, seen: Sight, grey: Float
+        self, scene: Scene, view: Pinhole | TiltedView, seen: VisibleScene, grey: Float
     ) -> np.ndarray:
-        kind = filtered if self._sampling == "footprint" else sampled
+        kind = render_filtered if self._sampling == "footprint" else render_sampled
         drawn = kind(seen, scene, self._solids, grey)
         return drawn if isinstance(view, Pinhole) else view.picture(drawn)
 

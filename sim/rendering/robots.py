@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
 from mapfusion.geometry.numerics import Float, kernel
-from sim.rendering.walls import Pinhole, Plan, inverse_depths
+from sim.rendering.walls import Pinhole, VisibleWalls, inverse_depths
 
 MARGIN_M = 0.001  # by which PyBullet shows cylinders too large
 
@@ -242,7 +242,7 @@ def _area(left: float, right: float, border: float) -> float:
 
 
 @kernel
-def fill_least(edges: Float, in_row: Float, per_column: Float, least: Float) -> None:
+def fill_minimum(edges: Float, in_row: Float, per_column: Float, least: Float) -> None:
     """Fill in the least of K linear functions at the pixels (H, W) whose middles an outline holds.
 
     The outline's edges are as above. The functions have the values `in_row` (H, K) in the first
@@ -270,7 +270,7 @@ def fill_least(edges: Float, in_row: Float, per_column: Float, least: Float) -> 
                 inside[i] = min(inside[i], at + step * i)
 
 
-class Body(NamedTuple):
+class ProjectedRobot(NamedTuple):
     """A robot before a camera.
 
     Attributes:
@@ -306,9 +306,9 @@ class Body(NamedTuple):
         return self.outline_px[self.first_edge[i] : self.first_edge[i + 1]]
 
 
-def place(camera: Pinhole, solids: Solids, pose: Float) -> Body:
+def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobot:
     """A robot at a pose (3,) before a camera."""
-    eye, axes = in_robot(camera, pose)
+    eye, axes = camera_in_robot_frame(camera, pose)
     outside = solids.planes[:, :3] @ eye - solids.planes[:, 3]
     x, y, up = (solids.corners_m - eye).T
     ahead, left = axes[0, 0] * x + axes[0, 1] * y, axes[1, 0] * x + axes[1, 1] * y
@@ -339,10 +339,12 @@ def place(camera: Pinhole, solids: Solids, pose: Float) -> Body:
     corner = np.repeat(windows[:, [2, 0, 2, 0]], np.diff(first_edge), axis=0)
     outline = uv[ends].reshape(-1, 4) - corner
     farthest_m = float(ahead.max())
-    return Body(eye, axes, outside, windows, shown, is_cut, farthest_m, outline, first_edge)
+    return ProjectedRobot(
+        eye, axes, outside, windows, shown, is_cut, farthest_m, outline, first_edge
+    )
 
 
-def in_robot(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
+def camera_in_robot_frame(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
     """The eye (3,) in a robot's frame, and the camera's axes (3, 3) there: ahead, left, up."""
     theta = float(pose[2])
     cos, sin = math.cos(theta), math.sin(theta)
@@ -352,7 +354,7 @@ def in_robot(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
     return eye, np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
-def by_distance(camera: Pinhole, poses: Float) -> Float:
+def sorted_by_distance(camera: Pinhole, poses: Float) -> Float:
     """The poses (R, 3) from the nearest to the farthest."""
     if len(poses) < 2:
         return poses
@@ -375,7 +377,7 @@ def within_view(camera: Pinhole, reach_m: float, poses: Float) -> Float:
     return poses[(ahead > -reach_m) & (beside <= reach_m * math.hypot(1, widest / camera.focal_px))]
 
 
-def is_hidden(camera: Pinhole, plan: Plan, reach_m: float, pose: Float) -> bool:
+def is_occluded(camera: Pinhole, plan: VisibleWalls, reach_m: float, pose: Float) -> bool:
     """Whether walls hide all that could be within reach of a robot at a pose (3,)."""
     cos, sin = math.cos(camera.theta), math.sin(camera.theta)
     x, y = float(pose[0]) - camera.eye_x_m, float(pose[1]) - camera.eye_y_m
@@ -414,8 +416,8 @@ def _windows(camera: Pinhole, low_px: Float, high_px: Float) -> np.ndarray:
 _PARALLEL = 1e-12  # of a ray's direction along an axis: it meets no plane across that
 
 
-def cast(
-    camera: Pinhole, solids: Solids, bodies: list[Body], grey: Float, depth_m: np.ndarray,
+def cast_rays(
+    camera: Pinhole, solids: Solids, bodies: list[ProjectedRobot], grey: Float, depth_m: np.ndarray,
     picture: np.ndarray | None = None,
 ) -> None:  # fmt: skip
     """Draw robots into pixels whose middles hit them nearer than `depth_m` (H, W).
@@ -434,7 +436,7 @@ def cast(
                 picture[top : bottom + 1, left : right + 1][is_nearer] = grey[i]
 
 
-def _nearness(camera: Pinhole, solids: Solids, i: int, body: Body) -> Float:
+def _nearness(camera: Pinhole, solids: Solids, i: int, body: ProjectedRobot) -> Float:
     """Inverse depth of a solid behind its window's pixels; 0 where it is not.
 
     Inverse depth is linear in the picture on each of its planes. Its surface is the farthest of
@@ -449,7 +451,7 @@ def _nearness(camera: Pinhole, solids: Solids, i: int, body: Body) -> Float:
         ahead, aside, above = -sign * (body.axes @ n.T) / outside_m
         in_row = ahead + aside * ((camera.center_u - left) / f) + above * up[:, None]
         found = np.zeros((len(up), right + 1 - left))
-        fill_least(edges, in_row, -aside / f, found)
+        fill_minimum(edges, in_row, -aside / f, found)
         return found
 
     facing = body.outside_m[own] > 0
@@ -464,8 +466,8 @@ def _nearness(camera: Pinhole, solids: Solids, i: int, body: Body) -> Float:
     return np.where(nearness > np.maximum(leaves, 0.0), nearness, 0.0)
 
 
-def draw(
-    camera: Pinhole, plan: Plan, solids: Solids, bodies: list[Body], grey: Float,
+def draw_robots(
+    camera: Pinhole, plan: VisibleWalls, solids: Solids, bodies: list[ProjectedRobot], grey: Float,
     picture: np.ndarray,
 ) -> None:  # fmt: skip
     """Draw robots over a picture (H, W) uint8, each pixel by the share they cover.
@@ -504,7 +506,7 @@ def draw(
 
 
 def _open_shares(
-    camera: Pinhole, plan: Plan, solids: Solids, body: Body, first: int, last: int
+    camera: Pinhole, plan: VisibleWalls, solids: Solids, body: ProjectedRobot, first: int, last: int
 ) -> Float:
     """Shares (S, N) of columns from `first` to before `last` in which no wall hides a solid."""
     w = inverse_depths(plan, first, last)

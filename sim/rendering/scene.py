@@ -38,7 +38,7 @@ class Walls(NamedTuple):
     sums: np.ndarray
 
 
-class Level(NamedTuple):
+class HorizontalPlane(NamedTuple):
     """The floor or the ceiling.
 
     Attributes:
@@ -75,8 +75,8 @@ class Scene:
     """
 
     walls: Walls
-    floor: Level
-    ceiling: Level
+    floor: HorizontalPlane
+    ceiling: HorizontalPlane
 
 
 def read_scene(folder: Path, channel: int | None = None) -> Scene:
@@ -163,13 +163,13 @@ def _sums(grey: np.ndarray) -> np.ndarray:
     return np.cumsum(along, axis=1, dtype=np.int32, out=along)
 
 
-def _nowhere(height_m: float) -> Level:
+def _nowhere(height_m: float) -> HorizontalPlane:
     corners_m = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     level = _level(corners_m, np.zeros((1, 1), dtype=np.uint8))
     return level._replace(height_m=height_m, corner_m=np.full(2, np.inf))
 
 
-def _level(corners_m: Float, grey: np.ndarray) -> Level:
+def _level(corners_m: Float, grey: np.ndarray) -> HorizontalPlane:
     corner, right, _, up = corners_m[:, :2]
     right, up = right - corner, up - corner
     copies: list[np.ndarray] = [grey.astype(np.float32)]
@@ -180,7 +180,7 @@ def _level(corners_m: Float, grey: np.ndarray) -> Level:
         copies.append(cv2.resize(copies[-1], half, interpolation=cv2.INTER_AREA))
     cells = [_cells(copy) for copy in copies]
     first = np.concatenate([[0], np.cumsum([len(copy) for copy in cells])[:-1]])
-    return Level(
+    return HorizontalPlane(
         float(corners_m[0, 2]),
         corner.copy(),
         right / (right @ right),

@@ -20,7 +20,7 @@ import numpy as np
 from mapfusion.geometry.numerics import Float, kernel
 from sim.rendering.scene import Walls
 
-NONE = -1  # no wall
+NO_WALL = -1  # no wall
 _THINNEST_PX = 1e-9  # what is thinner is not told apart
 _JUST_RIGHT_PX = 1e-7  # of a place: there what begins at it is nearer than the rest, or is not
 _MOST_PIECES = 10  # for each face; an upper envelope of so many segments has fewer
@@ -54,12 +54,12 @@ class Pinhole(NamedTuple):
     near_m: float
 
 
-def anywhere(camera: Pinhole) -> Pinhole:
+def at_origin(camera: Pinhole) -> Pinhole:
     """A camera whose rows see floors as far off as those of another one do."""
     return camera._replace(eye_x_m=0.0, eye_y_m=0.0, theta=0.0)
 
 
-class Plan(NamedTuple):
+class VisibleWalls(NamedTuple):
     """What a camera sees of the walls, from left to right: N strips of one face and column each.
 
     Column j reaches from u = j - 1/2 to j + 1/2.
@@ -88,7 +88,7 @@ class Plan(NamedTuple):
 
 
 @kernel
-def look(camera: Pinhole, walls: Walls) -> Plan:
+def find_visible_walls(camera: Pinhole, walls: Walls) -> VisibleWalls:
     """What a camera sees of the walls."""
     # Project faces (F, 7) into the picture: from u, to u, w0, w1, t0, t1, t2: w = w0 + w1 u.
     # t is the place along the face in metres: t = (t0 + t1 u) / w - t2. A face that is not seen,
@@ -119,7 +119,7 @@ def look(camera: Pinhole, walls: Walls) -> Plan:
                 seen[i, k] = (1 / camera.near_m - w_0) / w_u
     face, low, high, first, middle, middle_m = _strips(seen, camera.width_px)
     above, below = _open_rows(camera, walls.height_m, seen, face, low, high, first)
-    return Plan(seen, face, low, high, first, middle, middle_m, above, below)
+    return VisibleWalls(seen, face, low, high, first, middle, middle_m, above, below)
 
 
 @kernel
@@ -136,21 +136,21 @@ def _strips(
     first, middle = np.empty(width_px + 1, dtype=np.int64), np.empty(width_px, dtype=np.int64)
     middle_m = np.empty(width_px)
     first[0], column, n = 0, 0, 0
-    at, now, last = -0.5, NONE, width_px - 0.5
+    at, now, last = -0.5, NO_WALL, width_px - 0.5
     while at < last:
-        if now == NONE:
+        if now == NO_WALL:
             nearest = 0.0
             for i in range(len(seen)):
                 w = seen[i, 2] + seen[i, 3] * (at + _JUST_RIGHT_PX)
                 if seen[i, 0] <= at < seen[i, 1] and w > nearest:
                     now, nearest = i, w
-        stop, w_0, w_u, follower = last, 0.0, 0.0, NONE
-        if now != NONE:
+        stop, w_0, w_u, follower = last, 0.0, 0.0, NO_WALL
+        if now != NO_WALL:
             stop, w_0, w_u = min(seen[now, 1], last), seen[now, 2], seen[now, 3]
         for i in range(len(seen)):
             start, more_0, more_u = seen[i, 0], seen[i, 2] - w_0, seen[i, 3] - w_u
             if at < start < stop and more_0 + more_u * (start + _JUST_RIGHT_PX) > 0:
-                stop, follower = start, NONE
+                stop, follower = start, NO_WALL
             elif more_u > 0 and max(at, start) < -more_0 / more_u < min(stop, seen[i, 1]):
                 stop, follower = -more_0 / more_u, i
         while at < stop:
@@ -160,7 +160,7 @@ def _strips(
                 n += 1
             if at <= column < end:
                 middle[column], middle_m[column] = now, np.inf
-                if now != NONE:
+                if now != NO_WALL:
                     middle_m[column] = 1 / (w_0 + w_u * column)
             if end == column + 0.5:
                 column += 1
@@ -188,7 +188,7 @@ def _open_rows(
         w = np.inf  # where walls are farthest; nowhere they are infinitely far
         for s in range(first[j], first[j + 1]):
             w_0, w_u = seen[face[s], 2], seen[face[s], 3]
-            w = min(w, w_0 + w_u * low[s], w_0 + w_u * high[s]) if face[s] != NONE else 0.0
+            w = min(w, w_0 + w_u * low[s], w_0 + w_u * high[s]) if face[s] != NO_WALL else 0.0
         top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
         bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
         above[j] = max(0, min(int(max(np.floor(top + 0.5) + 1, 0.0)), horizon))
@@ -196,12 +196,12 @@ def _open_rows(
     return above, below
 
 
-def inverse_depths(plan: Plan, first: int, last: int) -> Float:
+def inverse_depths(plan: VisibleWalls, first: int, last: int) -> Float:
     """Of what is seen in the middles of strips (N,) in columns from `first` to before `last`."""
     strips = slice(plan.first[first], plan.first[last])
     face, middle = plan.face[strips], (plan.low[strips] + plan.high[strips]) / 2
     w = plan.seen[face, 2] + plan.seen[face, 3] * middle
-    w[face == NONE] = 0.0
+    w[face == NO_WALL] = 0.0
     return w
 
 
@@ -215,7 +215,7 @@ LEAST_TEXELS = 1e-6  # of a strip at a wall's end: sums still tell them apart
 
 
 @kernel
-def draw_walls(camera: Pinhole, walls: Walls, plan: Plan, columns: np.ndarray) -> None:
+def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.ndarray) -> None:
     """Draw walls over what is behind them.
 
     Args:
@@ -241,7 +241,7 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: Plan, columns: np.ndarray) -
             total[v], covered[v] = 0.0, 0.0
         for s in range(plan.first[j], plan.first[j + 1]):
             i, low, high = face[s], lows[s], highs[s]
-            n = 0 if i == NONE else _cuts(camera, height_m, seen, i, low, high)
+            n = 0 if i == NO_WALL else _cuts(camera, height_m, seen, i, low, high)
             for k in range(n):
                 a, b = low + k * (high - low) / n, low + (k + 1) * (high - low) / n
                 top, bottom, step = _rows(camera, height_m, seen, i, a, b, size)

@@ -44,10 +44,10 @@ class DriveSettings:
 
 def run(settings: DriveSettings, job: Job) -> None:
     """Drive, and write the trajectory."""
-    write_trajectory(job.output / TRAJECTORY_FILE, driven(settings))
+    write_trajectory(job.output / TRAJECTORY_FILE, drive_robots(settings))
 
 
-def driven(settings: DriveSettings) -> Trajectory:
+def drive_robots(settings: DriveSettings) -> Trajectory:
     """Drive, from the scenario's starts moved by the seed within the jitter; bodies sway on top.
 
     Raises:

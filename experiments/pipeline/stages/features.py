@@ -125,7 +125,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     for iteration in frames:
         poses = trajectory.bodies(iteration)
         started = time.perf_counter()
-        frame = rendered(settings, source, poses, iteration)
+        frame = render_frame(settings, source, poses, iteration)
         rendering_s += time.perf_counter() - started
         found = front_end.extract(frame.left, frame.right)
         own_pose = poses[trajectory.index(robot)]
@@ -149,7 +149,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     return {"rendering_s": rendering_s}
 
 
-def rendered(
+def render_frame(
     settings: FeatureSettings, source: FrameSource, poses: Float, iteration: int
 ) -> StereoFrame:
     """One frame of a robot, without colour, with the robots at poses (R, 3) or (R, 4, 4)."""

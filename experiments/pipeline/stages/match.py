@@ -71,7 +71,7 @@ def run(settings: MatchSettings, job: Job) -> None:
 @functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
 def _witness(folders: RobotFolders, iteration: int) -> Witness:
     """A robot's map, with what it was asked: it is in as many pairs as there are other robots."""
-    return Witness(known_at(stored_maps(folders), iteration))
+    return Witness(latest_at(stored_maps(folders), iteration))
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
@@ -107,9 +107,9 @@ def pairs_of_maps(
     a, b = maps_of_both(job)
     start = int(job.part) * _ITERATIONS_PER_BATCH
     for k in iterations[start : start + _ITERATIONS_PER_BATCH]:
-        yield k, known_at(a, k), known_at(b, k)
+        yield k, latest_at(a, k), latest_at(b, k)
 
 
-def known_at(known: Mapping[int, _Known], iteration: int) -> _Known:
+def latest_at(known: Mapping[int, _Known], iteration: int) -> _Known:
     """A robot's map, or what belongs to it, at an iteration: the last of a log that ended."""
     return known[max((k for k in known if k <= iteration), default=min(known))]

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.pipeline.stage import RecordedLog, Stage, with_those_before
+from experiments.pipeline.stage import RecordedLog, Stage, in_dependency_order
 from experiments.pipeline.stages import (
     align,
     aligner,
@@ -106,10 +106,10 @@ class Pipeline:
         maps = [robot.smooth for robot in self.robots]
         estimates = (pair.estimates for pair in self.pairs)
         in_order = [*images, *logs, *filters, *maps, *self.fusers.values(), *estimates]
-        return with_those_before(in_order)
+        return in_dependency_order(in_order)
 
 
-def lay_out(scenario: AnyScenario) -> Pipeline:
+def build_pipeline(scenario: AnyScenario) -> Pipeline:
     """The stages of a scenario; of recorded logs the names and lengths are read.
 
     Raises:

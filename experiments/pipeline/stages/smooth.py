@@ -94,9 +94,9 @@ def run(settings: SmoothSettings, job: Job) -> None:
     A log that cannot be smoothed has no map and an empty path, with the reason.
     """
     log, covariance = log_as_filtered(job.inputs["log"], job.inputs["slam"])
-    given = filtered_until(job, log, int(job.part), settings.noise_floor_m)
+    given = smoother_inputs(job, log, int(job.part), settings.noise_floor_m)
     own = replace(settings, smoother=replace(settings.smoother, odometry_covariance=covariance))
-    made = smoothed_anew(own, *given, read_attitude(job.inputs["log"]))
+    made = smooth_log(own, *given, read_attitude(job.inputs["log"]))
     landmarks, path, landmark, ended = made
     if landmarks is not None:
         write_map(_map_path(job.output, job.part), landmarks)
@@ -116,7 +116,7 @@ def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> Robo
     return replace(part, observations=replace(part.observations, covariance_m2=covariance))
 
 
-def filtered_until(
+def smoother_inputs(
     job: Job, log: RobotLog, iteration: int, noise_floor_m: float
 ) -> tuple[RobotLog, np.ndarray, Float]:
     """What is smoothed: the log until then, the filter's associations as they were, its path."""
@@ -125,7 +125,7 @@ def filtered_until(
     return log, landmark, final_path(job.inputs["slam"])[: iteration + 1]
 
 
-def smoothed_anew(
+def smooth_log(
     settings: SmoothSettings,
     log: RobotLog,
     landmark: np.ndarray,

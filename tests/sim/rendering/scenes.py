@@ -7,7 +7,7 @@ import numpy as np
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import compose
 from sim.p3at import URDF
-from sim.rendering.ray_caster import filtered, sight
+from sim.rendering.ray_caster import find_visible, render_filtered
 from sim.rendering.robots import read_solids
 from sim.rendering.scene import Scene, make_scene
 from sim.rendering.walls import Pinhole
@@ -48,8 +48,8 @@ def slanted(distance_m: float, slant_rad: float, half_m: float) -> tuple[np.ndar
 
 def look(scene: Scene, camera: Pinhole) -> np.ndarray:
     """The filtered picture (H, W) as float64, nobody else in view."""
-    seen = sight(camera, scene.walls, SOLIDS, NOBODY)
-    return filtered(seen, scene, SOLIDS, GREY).astype(np.float64)
+    seen = find_visible(camera, scene.walls, SOLIDS, NOBODY)
+    return render_filtered(seen, scene, SOLIDS, GREY).astype(np.float64)
 
 
 def along_m(start: np.ndarray, end: np.ndarray, camera: Pinhole, u: np.ndarray) -> np.ndarray:

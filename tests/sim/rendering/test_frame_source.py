@@ -61,7 +61,7 @@ def test_any_order_and_any_process_give_the_same_bits(
     program = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from pathlib import Path\n"
-        "import test_recorder as t\n"
+        "import test_frame_source as t\n"
         "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, 'ab', sys.argv[2])\n"
         "print(t.digest([t.render(s, k) for k in (2, 0, 3, 1)][1::2]))\n"
     )
