@@ -226,14 +226,14 @@ def test_robots_that_are_not_looked_at_are_in_nobodys_way() -> None:
         near, asks_all = (
             _Driver(route("a", [1, 3, 0], (7, 3)), nobody, settings) for _ in range(2)
         )
-        asks_all._looks_m = np.inf
+        asks_all._range_m = np.inf
         found = set()
         for _ in range(300):
             pose, *there = map(tuple, rng.uniform([-2, -2, -4], [2, 2, 4], (3, 3)).tolist())
             flags = rng.random((2, 2)) < 0.5
             others = [_Other(T, k, *flags[k].tolist()) for k, T in enumerate(there)]
-            found.add(asks_all._first_in_the_way(pose, others))
-            assert near._first_in_the_way(pose, others) == asks_all._first_in_the_way(pose, others)
+            found.add(asks_all._blocking_robot(pose, others))
+            assert near._blocking_robot(pose, others) == asks_all._blocking_robot(pose, others)
         assert found == {None, 0, 1}
 
 

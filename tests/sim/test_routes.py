@@ -53,7 +53,8 @@ def arrived(trajectory: Trajectory, routes: list[Route]) -> list[bool]:
 @pytest.mark.parametrize("first", ["south", "north"])
 def test_two_that_come_head_on_get_through(first: str) -> None:
     routes = joining(first)
-    with patch("sim.driver.resolve_deadlock", return_value=None), pytest.raises(InputError, match="waits"):
+    never = patch("sim.driver.resolve_deadlock", return_value=None)
+    with never, pytest.raises(InputError, match="waits"):
         driven(routes)
     both = driven(routes)
     assert arrived(both, routes) == [True, True]
@@ -75,7 +76,7 @@ def test_a_robot_that_holds_lets_the_others_by() -> None:
     came = [driver.progress(here) for driver in drivers]
     drivers[0].hold(came, [here, there], 1.0)
     (seen,) = _others(1, [here, there], [False, False], drivers)
-    assert (seen.goes_first, seen.lets_by) == (True, True)
+    assert (seen.goes_first, seen.yields) == (True, True)
 
 
 def test_a_circle_of_three_is_found() -> None:

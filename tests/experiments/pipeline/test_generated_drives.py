@@ -24,7 +24,8 @@ def test_robots_that_met_head_on_get_through(seed: int, n_robots: int) -> None:
         for each in build_pipeline(load_scenario(ROOMS_LOW, settings, seed)).stages()
         if each.name == "drive"
     )
-    with wheels_alone(), patch("sim.driver.resolve_deadlock", side_effect=resolve_deadlock) as asked:
+    counted = patch("sim.driver.resolve_deadlock", side_effect=resolve_deadlock)
+    with wheels_alone(), counted as asked:
         trajectory = drive_robots(cast(DriveSettings, stage.settings))
     assert asked.call_count > 0
     steps_m = np.linalg.norm(np.diff(trajectory.T_world_robot[:, :, :2], axis=1), axis=2)
