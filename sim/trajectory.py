@@ -76,7 +76,7 @@ class Trajectory:
             raise ValueError("time_s: must increase")
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.time_s)
 
     def index(self, robot: str) -> int:

@@ -1,8 +1,12 @@
 """Ray caster: images of a rectified stereo pair in a painted world with robots.
 
-The ray caster draws walls by columns and floors by rows, which only a level camera has. A camera
-that turns about its optical centre sees the same rays elsewhere: a homography takes the picture of
-a level camera, wide enough and twice as fine, to that of the tilted one.
+In plan a pixel column of a level camera is a wedge. It shows the nearest wall over the whole height
+of the wall, the ceiling above and the floor below. So walls are drawn by columns and horizontal
+planes by rows, each pixel as the mean over its footprint, and then the other robots over them. As
+an alternative each pixel is the texel at its centre, as in PyBullet's TinyRenderer.
+
+A tilted camera sees the same rays as a level camera with the same optical centre. A homography maps
+the image of a level camera, wide enough and twice as fine, to that of the tilted one.
 """
 
 import functools
@@ -59,12 +63,12 @@ from sim.stereo_head import (
 
 
 class VisibleScene(NamedTuple):
-    """Where things are before a camera, whatever their colours.
+    """Geometry of a view, without colours.
 
     Attributes:
-        camera: level.
-        plan: what it sees of the walls.
-        bodies: the robots that walls do not hide, from the nearest to the farthest.
+        camera: level camera.
+        plan: visible walls.
+        bodies: robots that walls do not hide, from the nearest to the farthest.
     """
 
     camera: Pinhole
@@ -73,7 +77,7 @@ class VisibleScene(NamedTuple):
 
 
 def find_visible(camera: Pinhole, walls: Walls, solids: Solids, poses: Float) -> VisibleScene:
-    """What a camera has before it, robots at poses (R, 3) among it."""
+    """Return the visible geometry of a scene with robots at poses (R, 3)."""
     plan, bodies = find_visible_walls(camera, walls), list[ProjectedRobot]()
     for pose in sorted_by_distance(camera, within_view(camera, solids.reach_m, poses)):
         if not is_occluded(camera, plan, solids.reach_m, pose):
@@ -82,19 +86,19 @@ def find_visible(camera: Pinhole, walls: Walls, solids: Solids, poses: Float) ->
 
 
 def render_filtered(of: VisibleScene, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
-    """Grey levels (H, W) uint8, each the mean over the pixel's footprint.
+    """Return grey levels (H, W) uint8, each the mean over the pixel's footprint.
 
     Args:
-        of: what the camera has before it.
-        scene: what stands still.
-        solids: of one robot.
-        grey: (S,) the solids' grey levels.
+        of: visible geometry.
+        scene: static scene.
+        solids: solids of one robot.
+        grey: grey levels of the solids, shape (S,).
     """
     camera, plan = of.camera, of.plan
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
     draw_plane(camera, scene.ceiling, True, plan.above, picture)
     draw_plane(camera, scene.floor, False, plan.below, picture)
-    # walls are drawn by columns, which in a picture lie far apart in memory
+    # walls are drawn by columns, which are not contiguous in an image
     columns = cv2.transpose(picture)
     draw_walls(camera, scene.walls, plan, columns)
     picture = cv2.transpose(columns)
@@ -104,22 +108,22 @@ def render_filtered(of: VisibleScene, scene: Scene, solids: Solids, grey: Float)
 
 
 def render_depth(of: VisibleScene, scene: Scene, solids: Solids) -> np.ndarray:
-    """Depth (H, W) float32 along the optical axis behind the pixels' middles; NaN for nothing."""
-    depth_m = _still_depths(of, scene)
+    """Return depths (H, W) float32 along the optical axis at pixel centres; NaN for background."""
+    depth_m = _static_depth(of, scene)
     cast_rays(of.camera, solids, of.bodies, np.zeros(len(solids.rgb)), depth_m)
     if np.any(of.plan.middle == NO_WALL):
         depth_m[np.isinf(depth_m)] = np.nan
     return depth_m
 
 
-def _still_depths(of: VisibleScene, scene: Scene) -> np.ndarray:
-    """Depth (H, W) of what stands still; infinity for nothing."""
+def _static_depth(of: VisibleScene, scene: Scene) -> np.ndarray:
+    """Return depths (H, W) of the static scene; infinity for the background."""
     camera, plan = of.camera, of.plan
     levels_m = _depths_of_levels(at_origin(camera), scene.floor.height_m, scene.ceiling.height_m)
     depth_m = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
     np.minimum(plan.middle_m.astype(np.float32), levels_m.astype(np.float32)[:, None], out=depth_m)
     beside = np.flatnonzero(plan.middle == NO_WALL)
-    if len(beside):  # only a column without walls shows where floors end
+    if len(beside):  # only columns without a wall show the edge of floor or ceiling
         for level, rows in _sides(camera, scene):
             z = levels_m[rows, None]
             right, up = (_along(way, beside, z) for way in ray_coefficients(camera, level))
@@ -130,27 +134,20 @@ def _still_depths(of: VisibleScene, scene: Scene) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1)
 def _depths_of_levels(camera: Pinhole, floor_m: float, ceiling_m: float) -> Float:
-    """Depths (H,) of floor and ceiling at two heights, were there no walls."""
+    """Return depths (H,) of floor and ceiling at two heights in a scene without walls."""
     v = np.arange(camera.height_px)
     height_m = np.where(v < camera.center_v, ceiling_m, floor_m)
     return row_depth_m(camera, height_m, v)
 
 
 def _sides(camera: Pinhole, scene: Scene) -> list[tuple[HorizontalPlane, slice]]:
-    """Ceiling and floor, and the rows on their side of the horizon."""
+    """Return ceiling and floor with the rows on their side of the horizon."""
     horizon = min(max(math.ceil(camera.center_v), 0), camera.height_px)
     return [(scene.ceiling, slice(horizon)), (scene.floor, slice(horizon, camera.height_px))]
 
 
 def render_sampled(of: VisibleScene, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
-    """Grey levels (H, W) uint8 of what the pixels' middles hit; arguments as of `filtered`."""
-    picture = _still_texels(of, scene)
-    cast_rays(of.camera, solids, of.bodies, grey, _still_depths(of, scene), picture)
-    return picture
-
-
-def _still_texels(of: VisibleScene, scene: Scene) -> np.ndarray:
-    """Texels (H, W) uint8 of what stands still."""
+    """Return grey levels (H, W) uint8 at pixel centres; arguments of `render_filtered`."""
     camera, plan, walls, u = of.camera, of.plan, scene.walls, np.arange(of.camera.width_px)
     face, wall_m = plan.middle, plan.middle_m
     seen, size = plan.seen[face], walls.size[face]
@@ -159,40 +156,45 @@ def _still_texels(of: VisibleScene, scene: Scene) -> np.ndarray:
     right = np.clip(along / walls.width_m[face] * size[:, 0], 0, size[:, 0] - 1).astype(np.int64)
     first = walls.first[face] + right * (size[:, 1] + 1)
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
+    # floor and ceiling
     for level, rows in _sides(camera, scene):
         to_right, to_up = (
             _along(way, u, levels_m[rows, None]) for way in ray_coefficients(camera, level)
         )
         picture[rows] = lookup_texels(level, to_right, to_up)
+    # walls in front of them: a texel is a difference of four sums
     v, j = np.nonzero(wall_m < levels_m[:, None])
     height_m = camera.eye_z_m - (v - camera.center_v) * wall_m[j] / camera.focal_px
     up = (height_m / walls.height_m * size[j, 1]).astype(np.int64)
     here = first[j] + np.minimum(up, size[j, 1] - 1)
     there, sums = here + size[j, 1] + 1, walls.sums
     picture[v, j] = sums[there + 1] - sums[there] - sums[here + 1] + sums[here]
+    cast_rays(camera, solids, of.bodies, grey, _static_depth(of, scene), picture)
     return picture
 
 
 def _along(way: RayCoefficients, u: np.ndarray, z: Float) -> Float:
-    """Where on a level's picture columns' rays are at depths, see `ways`; NaN infinitely far."""
+    """Return texture coordinates of rays at depths, see `ray_coefficients`; NaN at infinity."""
     with np.errstate(invalid="ignore"):
         return way[0] + (way[1] + way[2] * u) * z
 
 
-_FINER = 2  # pixels of the level picture, and samples of the tilted one, a pixel and axis
-_BORDER_PX = 4.0  # of the level picture around what is needed: an interpolation's reach
-_LEAST_AHEAD = 0.3  # of a ray's length: a level camera sees no farther to its sides, up and down
+_FINER = 2  # resolution of the level image, and samples of the tilted image, per pixel and axis
+_BORDER_PX = 4.0  # margin of the level image: reach of the interpolation
+_LEAST_AHEAD = (
+    0.3  # least depth of a ray of unit length: bounds the angle of view of the level camera
+)
 
 
 @dataclass(frozen=True)
 class TiltedView:
-    """A tilted camera, and the level one at its place.
+    """Tilted camera, and a level camera with the same optical centre.
 
     Attributes:
-        size: width and height of the tilted one's pictures.
-        level: the level one, which looks to where the tilted one's axis points in plan.
-        to_level: (3, 3) from homogeneous pixels of the tilted one to rays of the level one: ahead,
-            and the pixel times that.
+        size: width and height of the tilted camera's images.
+        level: level camera, whose axis is that of the tilted camera in plan.
+        to_level: homography, shape (3, 3), from homogeneous pixels of the tilted camera to depth,
+            and pixel times depth, of the level camera.
     """
 
     size: tuple[int, int]
@@ -201,7 +203,11 @@ class TiltedView:
 
     @classmethod
     def of(cls, camera: StereoCamera, T_world_camera: Float) -> Self:
-        """The view of a camera at (4, 4), x along the optical axis; raises InputError."""
+        """Return the view of a camera at a pose (4, 4), x along the optical axis.
+
+        Raises:
+            InputError: the camera tilts too far.
+        """
         R = T_world_camera[:3, :3]
         theta = math.atan2(R[1, 0], R[0, 0])
         cos, sin = math.cos(theta), math.sin(theta)
@@ -229,9 +235,9 @@ class TiltedView:
         return cls((width, height), level, pixel_of @ ray_of)
 
     def picture(self, level: np.ndarray) -> np.ndarray:
-        """Grey levels (H, W) uint8 of the tilted camera, from those of the level one."""
+        """Return the tilted camera's grey levels (H, W) uint8 from those of the level camera."""
         width, height = self.size
-        first = 0.5 / _FINER - 0.5  # of a pixel's samples, from its middle
+        first = 0.5 / _FINER - 0.5  # offset of a pixel's first sample from its centre
         pixel_of = np.array([[1 / _FINER, 0, first], [0, 1 / _FINER, first], [0, 0, 1]])
         rows = self.to_level[[1, 2, 0]]
         made = cv2.warpPerspective(
@@ -244,14 +250,14 @@ class TiltedView:
         return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
 
     def depth_m(self, level: np.ndarray) -> np.ndarray:
-        """Depth (H, W) float32 along the tilted axis, from that of the level one along its own."""
+        """Return depths (H, W) float32 along the tilted axis from those of the level camera."""
         width, height = self.size
-        return _depths(level, self.to_level, height, width)
+        return _tilted_depth(level, self.to_level, height, width)
 
 
 @kernel
-def _depths(level: np.ndarray, to_level: Float, height: int, width: int) -> np.ndarray:
-    """As `sim.stereo_head.depth_at` at each pixel's place in the level image, tilted again."""
+def _tilted_depth(level: np.ndarray, to_level: Float, height: int, width: int) -> np.ndarray:
+    """Return `sim.stereo_head.depth_at` at each pixel's position in the level image, tilted."""
     depth_m = np.empty((height, width), dtype=np.float32)
     for j in range(height):
         for i in range(width):
@@ -268,7 +274,7 @@ def _depths(level: np.ndarray, to_level: Float, height: int, width: int) -> np.n
                     near, far = min(near, own), max(far, own)
                     smooth += share / own
             nearest = level[m + int(b > 0.5), k + int(a > 0.5)]
-            # comparisons with NaN are false, so a pixel of the background makes an edge too
+            # comparisons with NaN are false, so the background has edges too
             one_surface = smooth == smooth and far - near <= SAME_SURFACE * nearest
             depth_m[j, i] = (1 / smooth if one_surface else nearest) / ahead
     return depth_m
@@ -278,15 +284,15 @@ Sampling = Literal["footprint", "middle"]
 
 
 class RayCaster:
-    """Draws a painted world with robots in it.
+    """Renderer of a painted world with robots.
 
     Args:
-        faces: folder that `sim.world.write_faces` has filled.
-        camera: of the robot that looks.
-        sampling: a pixel is the mean over its footprint, or what its middle hits.
+        faces: folder that `sim.world.write_faces` wrote.
+        camera: stereo camera of the robot.
+        sampling: a pixel is the mean over its footprint, or the texel at its centre.
 
     Raises:
-        InputError: the world or the camera is one that it cannot draw.
+        InputError: the ray caster cannot draw the world or the camera's view.
         DamagedFileError: a file of the folder is missing or damaged.
     """
 
@@ -308,10 +314,17 @@ class RayCaster:
         rng: np.random.Generator,
         colour: bool = False,
     ) -> StereoFrame:
-        """Both images and the left one's depth for a robot, others at (R, 3).
+        """Render both images and the left depth of a robot.
 
-        It is at a pose (3,), or (4, 4) where its body tilts; raises InputError where it looks from
-        above the walls, or too far up or down.
+        Args:
+            T_world_robot: robot pose, shape (3,), or (4, 4) for a tilted body.
+            others: poses of the other robots, shape (R, 3).
+            noise: sensor noise.
+            rng: random generator.
+            colour: True to render the left image in colour too.
+
+        Raises:
+            InputError: the camera is above the walls or tilts too far.
         """
         half_m, poses, body = self._camera.baseline_m / 2, _poses(others), body_pose(T_world_robot)
         view = self._view(body, half_m)
@@ -322,18 +335,18 @@ class RayCaster:
         return StereoFrame(expose(left, noise, rng), expose(right, noise, rng), depth_m, rgb)
 
     def grey(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
-        """The grey picture (H, W) uint8 of a camera beside a robot's middle.
+        """Return the grey image (H, W) uint8 of one camera.
 
         Args:
-            T_world_robot: (3,), or (4, 4) of a body that tilts.
-            y_m: of the optical centre, to the left of the robot's axis.
-            others: (R, 3) poses of the robots that may be seen.
+            T_world_robot: robot pose, shape (3,), or (4, 4) for a tilted body.
+            y_m: offset of the optical centre to the left of the robot's axis.
+            others: poses of the other robots, shape (R, 3).
         """
         view = self._view(T_world_robot, y_m)
         return self._draw(self._scene, view, self._sight(view, _poses(others)), self._grey)
 
     def rgb(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
-        """The same in colour (H, W, 3) uint8; three times the work and the memory."""
+        """Return the colour image (H, W, 3) uint8; arguments as of `grey`."""
         if not self._channels:
             self._channels = [read_scene(self._faces, channel) for channel in range(3)]
         view = self._view(T_world_robot, y_m)
@@ -345,7 +358,7 @@ class RayCaster:
         return np.stack(drawn, -1)
 
     def depth_m(self, T_world_robot: ArrayLike, y_m: float, others: ArrayLike) -> np.ndarray:
-        """Depth (H, W) float32 along the optical axis behind each pixel's middle; NaN: nothing."""
+        """Return depths (H, W) float32 at pixel centres; NaN for background; see `grey`."""
         view = self._view(T_world_robot, y_m)
         return self._depth_m(view, self._sight(view, _poses(others)))
 
@@ -365,7 +378,7 @@ class RayCaster:
         return drawn if isinstance(view, Pinhole) else view.picture(drawn)
 
     def _view(self, T_world_robot: ArrayLike, y_m: float) -> Pinhole | TiltedView:
-        """A level camera, which can be drawn as it is, or a tilted one."""
+        """Return the view of a level or a tilted camera."""
         T = camera_pose(self._camera, T_world_robot, y_m)
         eye_z_m = float(T[2, 3])
         if eye_z_m >= self._scene.walls.height_m:
@@ -383,6 +396,6 @@ class RayCaster:
 
 
 def _poses(others: ArrayLike) -> Float:
-    """Poses (R, 3) of robots that are drawn upright, whether they tilt or not."""
+    """Return poses (R, 3) of robots, which are drawn upright even if they tilt."""
     found = np.asarray(others, dtype=np.float64)
     return np.ascontiguousarray(planar(found) if found.ndim == 3 else found).reshape(-1, 3)

@@ -3,9 +3,9 @@
 Each edge adds, to the pixels that it crosses in a row, the change of the covered area to its right;
 sums from the left are the covered shares (Levien 2016, font-rs; the same as FreeType's "cells").
 
-A picture of a convex solid is bounded by the edges between faces that it turns to the eye and
-others, and walls reach from the floor to the ceiling, so whether a wall hides a solid is decided
-column by column in plan.
+The image of a convex solid is bounded by its silhouette edges, between faces towards the camera and
+faces away from it. Walls reach from the floor to the ceiling, so the occlusion of solids by walls
+is computed per column in plan.
 """
 
 import math
@@ -14,35 +14,34 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull
 
 from mapfusion.geometry.numerics import Float, kernel
 from sim.rendering.walls import Pinhole, VisibleWalls, inverse_depths
 
-MARGIN_M = 0.001  # by which PyBullet shows cylinders too large
+MARGIN_M = 0.001  # PyBullet draws cylinders larger by this margin
 
 _Hull = tuple[Float, np.ndarray, np.ndarray]  # planes, edges and sides, see `Solids`
 
 
 class Solids(NamedTuple):
-    """One robot at rest, in its own frame: metres, the floor at z = 0.
+    """Convex solids of one robot at rest in its frame, the floor at z = 0.
 
-    Corners, faces and edges of all S solids one after the other; faces are triangles.
+    Corners, triangular faces and edges of all S solids are concatenated.
 
     Attributes:
-        corners_m: (N, 3).
-        first_corner: (S + 1,) int64, where each solid's begin, and N.
-        planes: (P, 4) the faces' outward normals and offsets: inside, n p <= d.
-        first_plane: (S + 1,) likewise.
-        edges: (E, 2) int64 corners: the first face lies to the left of the way along an edge, seen
-            from outside.
-        sides: (E, 2) int64, the faces that meet there.
-        first_edge: (S + 1,) likewise.
-        low_m: (S, 3) lowest corners of the boxes around them.
-        high_m: (S, 3) highest.
-        rgb: (S, 3) float64 colours as they show, of 255.
-        reach_m: no part is farther from where it stands, in plan.
+        corners_m: corners, shape (N, 3).
+        first_corner: start of each solid's corners, and N, shape (S + 1,) int64.
+        planes: outward normals n and offsets d of the faces, shape (P, 4); inside, n p <= d.
+        first_plane: start of each solid's faces, and P, shape (S + 1,) int64.
+        edges: corners of the edges, shape (E, 2) int64. Seen from outside, the first face of
+            `sides` lies to the left of the edge.
+        sides: faces on both sides of the edges, shape (E, 2) int64.
+        first_edge: start of each solid's edges, and E, shape (S + 1,) int64.
+        low_m: lowest corners of the bounding boxes, shape (S, 3).
+        high_m: highest corners of the bounding boxes, shape (S, 3).
+        rgb: displayed colours, 0 to 255, shape (S, 3) float64.
+        reach_m: largest distance of a corner from the origin in plan.
     """
 
     corners_m: Float
@@ -59,7 +58,7 @@ class Solids(NamedTuple):
 
 
 def read_solids(urdf: Path) -> Solids:
-    """What a URDF's links show: boxes and cylinders, their links where no joint has turned."""
+    """Read boxes and cylinders of a URDF's links, with all joints in their zero position."""
     root = ElementTree.parse(urdf).getroot()  # noqa: S314 - a file of our own
     colours = {m.attrib["name"]: _numbers(m.find("color"), "rgba") for m in root.iter("material")
                if m.find("color") is not None}  # fmt: skip
@@ -90,23 +89,25 @@ def read_solids(urdf: Path) -> Solids:
 
 
 def _begins(parts: list[np.ndarray]) -> np.ndarray:
-    """Where each of the parts begins, one after the other, and where the last ends."""
+    """Return the start of each part in their concatenation, and its length."""
     return np.cumsum([0, *(len(part) for part in parts)])
 
 
 def _numbers(element: ElementTree.Element | None, name: str) -> Float:
+    """Return the numbers in an attribute; zeros without the element or attribute."""
     words = "0 0 0" if element is None else element.attrib.get(name, "0 0 0")
     return np.array([float(word) for word in words.split()])
 
 
 def _named(element: ElementTree.Element, child: str, name: str = "link") -> str:
+    """Return an attribute of a child element."""
     found = element.find(child)
     assert found is not None
     return found.attrib[name]
 
 
 def _shape(visual: ElementTree.Element, place_m: Float) -> tuple[Float, _Hull]:
-    """Corners (K, 3) of a box or a cylinder in the robot's frame, and its faces."""
+    """Return corners (K, 3) and hull of a box or a cylinder in the robot's frame."""
     origin, box = visual.find("origin"), visual.find("geometry/box")
     if box is not None:
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -115,24 +116,29 @@ def _shape(visual: ElementTree.Element, place_m: Float) -> tuple[Float, _Hull]:
         cylinder = visual.find("geometry/cylinder")
         assert cylinder is not None
         radius, half_m = float(cylinder.attrib["radius"]), float(cylinder.attrib["length"]) / 2
-        corners = _bullets_cylinder(radius, half_m)
-    planes, edges, sides = _hull(corners)
-    R, at = _rotation(_numbers(origin, "rpy")), _numbers(origin, "xyz")
+        corners = _cylinder_corners(radius, half_m)
+    planes, edges, sides = _convex_hull(corners)
+    # roll, pitch and yaw of a URDF are about fixed axes
+    (cr, cp, cy), (sr, sp, sy) = (of(_numbers(origin, "rpy")) for of in (np.cos, np.sin))
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    R, at = about_z @ about_y @ about_x, _numbers(origin, "xyz")
     planes[:, :3] = planes[:, :3] @ R.T
     planes[:, 3] += planes[:, :3] @ at
     planes[:, 3] += planes[:, :3] @ place_m
     return corners @ R.T + at + place_m, (planes, edges, sides)
 
 
-def _hull(corners: Float) -> _Hull:
-    """Planes, edges and the faces that meet there, see `Solids`, of the corners of a solid."""
+def _convex_hull(corners: Float) -> _Hull:
+    """Return planes, edges and sides of the convex hull of corners, see `Solids`."""
     hull = ConvexHull(corners)
     a, b, c = np.moveaxis(corners[hull.simplices], 1, 0)
     normals = hull.equations[:, :3]
     turned = np.sum(np.cross(b - a, c - a) * normals, axis=1) < 0
     edges, sides = [], []
     for i, (corner, beside) in enumerate(zip(hull.simplices, hull.neighbors, strict=True)):
-        for k in range(3):  # the edge across from corner k
+        for k in range(3):  # the edge opposite to corner k
             if i < beside[k]:
                 way = [corner[(k + 1) % 3], corner[(k + 2) % 3]]
                 edges.append(way[::-1] if turned[i] else way)
@@ -141,11 +147,11 @@ def _hull(corners: Float) -> _Hull:
     return planes, np.array(edges), np.array(sides)
 
 
-def _bullets_cylinder(radius: float, half_m: float) -> Float:
-    """Corners (42, 3) of what PyBullet shows for a cylinder along z.
+def _cylinder_corners(radius: float, half_m: float) -> Float:
+    """Return corners (42, 3) of the shape that PyBullet displays for a cylinder along z.
 
-    A prism of 32 sides, of which it keeps the farthest corners in 42 directions, each pushed out by
-    a margin (`btShapeHull`): those to the corners and edges of an icosahedron.
+    PyBullet (`btShapeHull`) takes a prism with 32 sides. It keeps the farthest corners in 42
+    directions, those to the corners and edges of an icosahedron, and moves them out by a margin.
     """
     angle = 2 * np.pi * np.arange(32) / 32
     rim = np.column_stack([radius * np.sin(angle), radius * np.cos(angle)])
@@ -162,20 +168,15 @@ def _bullets_cylinder(radius: float, half_m: float) -> Float:
     return prism[np.argmax((directions @ prism.T).round(9), axis=1)] + MARGIN_M * directions
 
 
-def _rotation(rpy: ArrayLike) -> Float:
-    """Roll, pitch and yaw about fixed axes, as URDF has them."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
-
-
 def front_to_back(solids: Solids, eye_m: Float) -> list[int]:
-    """An order (S,) in which none hides one before it, seen from a point (3,) of their frame.
+    """Return an order of the S solids in which no solid hides an earlier one.
 
-    The boxes around them do not overlap, so between any two lies a plane along two axes; what
-    is on the eye's side of it cannot be hidden by the other.
+    The bounding boxes do not overlap, so an axis-aligned plane separates any two. The solid on the
+    camera's side of the plane cannot be hidden by the other one.
+
+    Args:
+        solids: solids of one robot.
+        eye_m: optical centre in the robot's frame, shape (3,).
     """
     low, high = solids.low_m, solids.high_m
     in_front = (high[:, None] <= low + 1e-9) & (eye_m <= low)
@@ -189,25 +190,23 @@ def front_to_back(solids: Solids, eye_m: Float) -> list[int]:
     return order
 
 
-_LEAST_WIDTH_PX = 1e-12  # of an edge within a row, to divide by
+_LEAST_WIDTH_PX = 1e-12  # least width of an edge within a row, to avoid division by zero
 
 
 @kernel
 def fill_coverage(edges: Float, covered: Float) -> None:
-    """Fill in shares (H, W), zeros before, of a window's unit squares that an outline covers.
+    """Fill in the covered shares of a window's pixels.
 
-    Its edges (E, 4) go from u and v to u and v, all in one sense around it, in any order. The
-    window's first pixel has its middle at (0, 0).
+    Args:
+        edges: edges of the outline in any order, all in the same sense of rotation: start and end
+            (u, v, u, v), shape (E, 4). The first pixel of the window has its centre at (0, 0).
+        covered: zeros, shape (H, W); changed to the covered shares.
     """
     height, width = covered.shape
     for k in range(len(edges)):
         u_0, v_0, u_1, v_1 = edges[k, 0], edges[k, 1], edges[k, 2], edges[k, 3]
-        u_0, v_0, u_1, v_1 = (
-            u_0 + 0.5,
-            v_0 + 0.5,
-            u_1 + 0.5,
-            v_1 + 0.5,
-        )  # from its upper left corner
+        # relative to the upper left corner of the window
+        u_0, v_0, u_1, v_1 = u_0 + 0.5, v_0 + 0.5, u_1 + 0.5, v_1 + 0.5
         if v_0 == v_1:
             continue
         sign = 1.0 if v_0 < v_1 else -1.0
@@ -219,7 +218,7 @@ def fill_coverage(edges: Float, covered: Float) -> None:
             at_top = min(max(u_0 + slope * (top - v_0), least), most)
             at_bottom = min(max(u_0 + slope * (bottom - v_0), least), most)
             left, right = min(at_top, at_bottom), max(at_top, at_bottom)
-            # what lies left of the window counts in its first column
+            # parts left of the window count in the first column
             first, last = max(int(np.floor(left)), 0), max(int(np.floor(right)) + 1, 0)
             area, before = _area(left, right, float(first)), 0.0
             for column in range(first, min(last + 1, width)):
@@ -236,17 +235,20 @@ def fill_coverage(edges: Float, covered: Float) -> None:
 
 @kernel
 def _area(left: float, right: float, border: float) -> float:
-    """Between an edge from `left` to `right` and a border to the right of it, for a unit's rise."""
+    """Return the area between an edge from `left` to `right` of unit height and a border."""
     inside = min(max(border - left, 0.0), right - left)
     return inside * inside / (2 * max(right - left, _LEAST_WIDTH_PX)) + max(border - right, 0.0)
 
 
 @kernel
 def fill_minimum(edges: Float, in_row: Float, per_column: Float, least: Float) -> None:
-    """Fill in the least of K linear functions at the pixels (H, W) whose middles an outline holds.
+    """Fill in the minimum of K linear functions at pixels whose centres lie in an outline.
 
-    The outline's edges are as above. The functions have the values `in_row` (H, K) in the first
-    column, and change by `per_column` (K,).
+    Args:
+        edges: edges of the outline, see `fill_coverage`.
+        in_row: values of the functions in the first column, shape (H, K).
+        per_column: change of the functions per column, shape (K,).
+        least: changed to the minimum within the outline, shape (H, W).
     """
     height, width = least.shape
     for row in range(height):
@@ -271,19 +273,19 @@ def fill_minimum(edges: Float, in_row: Float, per_column: Float, least: Float) -
 
 
 class ProjectedRobot(NamedTuple):
-    """A robot before a camera.
+    """Robot projected into a camera.
 
     Attributes:
-        eye_m: (3,) the camera's optical centre in the robot's frame.
-        axes: (3, 3) the camera's axes there: ahead, left, up.
-        outside_m: (P,) how far the eye is before each face's plane.
-        windows: (S, 4) first and last row, first and last column that each solid may show in.
-        shown: (N,) the solids that may show.
-        is_cut: (S,) whether a solid reaches the lens.
-        farthest_m: no part is farther ahead.
-        outline_px: (M, 4) where edges that bound solids' pictures begin and end: u, v, u and v; in
-            its solid's window, whose first pixel has its middle at (0, 0).
-        first_edge: (S + 1,) int64, where each solid's begin among them, and M.
+        eye_m: optical centre in the robot's frame, shape (3,).
+        axes: camera axes ahead, left and up in the robot's frame, shape (3, 3).
+        outside_m: distance of the optical centre in front of each face's plane, shape (P,).
+        windows: first and last row, first and last column that may show each solid, shape (S, 4).
+        shown: indices of the solids that may be visible, shape (N,).
+        is_cut: True for solids that reach the near plane, shape (S,).
+        farthest_m: largest depth of a corner.
+        outline_px: silhouette edges (u, v, u, v) in the window of their solid, whose first pixel
+            has its centre at (0, 0), shape (M, 4).
+        first_edge: start of each solid's silhouette edges, and M, shape (S + 1,) int64.
     """
 
     eye_m: Float
@@ -297,17 +299,17 @@ class ProjectedRobot(NamedTuple):
     first_edge: np.ndarray
 
     def bounds(self) -> tuple[int, int, int, int]:
-        """Rows and columns that it may show in: the first ones, and those after the last."""
+        """Return the first row, the row after the last, and the same of the columns."""
         top, bottom, left, right = self.windows[self.shown].T
         return int(top.min()), int(bottom.max()) + 1, int(left.min()), int(right.max()) + 1
 
     def outline(self, i: int) -> Float:
-        """Edges (E, 4) around a solid's picture, see above."""
+        """Return the silhouette edges (E, 4) of a solid."""
         return self.outline_px[self.first_edge[i] : self.first_edge[i + 1]]
 
 
 def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobot:
-    """A robot at a pose (3,) before a camera."""
+    """Project a robot at a pose (3,) into a camera."""
     eye, axes = camera_in_robot_frame(camera, pose)
     outside = solids.planes[:, :3] @ eye - solids.planes[:, 3]
     x, y, up = (solids.corners_m - eye).T
@@ -318,7 +320,7 @@ def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobo
     if behind.any():
         low, high = np.where(behind[:, None], [[[np.inf]], [[-np.inf]]], uv)
     low, high = np.minimum.reduceat(low, begins), np.maximum.reduceat(high, begins)
-    if behind.any():  # the plane through the lens meets edges
+    if behind.any():  # edges that cross the near plane
         meets = behind[solids.edges[:, 0]] != behind[solids.edges[:, 1]]
         begin, end = solids.edges[meets].T
         t = (ahead[begin] - camera.near_m) / (ahead[begin] - ahead[end])
@@ -327,11 +329,16 @@ def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobo
         of = np.searchsorted(solids.first_corner, begin, side="right") - 1
         np.minimum.at(low, of, met)
         np.maximum.at(high, of, met)
-    windows = _windows(camera, low, high)
+    # windows from the least and largest u and v of all points of each solid
+    size = np.array([camera.width_px, camera.height_px])
+    first = np.minimum(np.maximum(np.floor(low + 0.5), 0), size)
+    last = np.maximum(np.minimum(np.floor(high + 0.5), size - 1), -1)
+    windows = np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], axis=-1)
+    windows = windows.astype(np.int64)
     is_cut = np.logical_or.reduceat(behind, begins)
-    top, bottom, first, last = windows.T
-    shown = np.flatnonzero((top <= bottom) & (first <= last))
-    # edges where a face that the eye sees meets one that it does not, that face to the left
+    top, bottom, leftmost, rightmost = windows.T
+    shown = np.flatnonzero((top <= bottom) & (leftmost <= rightmost))
+    # silhouette edges: between a face towards the camera and one away from it, which is to the left
     sees = outside[solids.sides] > 0
     bounding = np.flatnonzero(sees[:, 0] != sees[:, 1])
     ends = np.where(sees[bounding, :1], solids.edges[bounding], solids.edges[bounding, ::-1])
@@ -345,7 +352,7 @@ def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobo
 
 
 def camera_in_robot_frame(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
-    """The eye (3,) in a robot's frame, and the camera's axes (3, 3) there: ahead, left, up."""
+    """Return optical centre (3,) and axes (3, 3: ahead, left, up) in a robot's frame."""
     theta = float(pose[2])
     cos, sin = math.cos(theta), math.sin(theta)
     x, y = camera.eye_x_m - pose[0], camera.eye_y_m - pose[1]
@@ -355,7 +362,7 @@ def camera_in_robot_frame(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
 
 
 def sorted_by_distance(camera: Pinhole, poses: Float) -> Float:
-    """The poses (R, 3) from the nearest to the farthest."""
+    """Return the poses (R, 3) from the nearest to the farthest."""
     if len(poses) < 2:
         return poses
     x, y = poses[:, 0] - camera.eye_x_m, poses[:, 1] - camera.eye_y_m
@@ -363,73 +370,67 @@ def sorted_by_distance(camera: Pinhole, poses: Float) -> Float:
 
 
 def within_view(camera: Pinhole, reach_m: float, poses: Float) -> Float:
-    """Those of the poses (R, 3) at which robots may show, were there no walls.
+    """Return the poses (R, 3) at which robots may be visible in a scene without walls.
 
-    No part of them is farther than `reach_m` from where they stand, in plan. What shows lies
-    between two lines from the eye, ahead of it.
+    Args:
+        camera: level camera.
+        reach_m: radius of a robot in plan.
+        poses: poses, shape (R, 3).
     """
     cos, sin = math.cos(camera.theta), math.sin(camera.theta)
     x, y = poses[:, 0] - camera.eye_x_m, poses[:, 1] - camera.eye_y_m
     ahead, aside = cos * x + sin * y, np.abs(cos * y - sin * x)
-    # half a pixel from the last one's middle is its edge, the other half is to spare
+    # half a pixel to the edge of the last one, and half a pixel margin
     widest = max(camera.center_u, camera.width_px - 1 - camera.center_u) + 1
     beside = aside - ahead * (widest / camera.focal_px)
     return poses[(ahead > -reach_m) & (beside <= reach_m * math.hypot(1, widest / camera.focal_px))]
 
 
 def is_occluded(camera: Pinhole, plan: VisibleWalls, reach_m: float, pose: Float) -> bool:
-    """Whether walls hide all that could be within reach of a robot at a pose (3,)."""
+    """Return True if walls hide the circle of radius `reach_m` around a robot's pose (3,)."""
     cos, sin = math.cos(camera.theta), math.sin(camera.theta)
     x, y = float(pose[0]) - camera.eye_x_m, float(pose[1]) - camera.eye_y_m
     ahead, aside = cos * x + sin * y, cos * y - sin * x
-    nearest, farthest, left, right = (
-        ahead - reach_m,
-        ahead + reach_m,
-        aside + reach_m,
-        aside - reach_m,
-    )
+    nearest, farthest = ahead - reach_m, ahead + reach_m
+    left, right = aside + reach_m, aside - reach_m
     if nearest <= camera.near_m:
         return False
     u_left = camera.center_u - camera.focal_px * left / (nearest if left > 0 else farthest)
     u_right = camera.center_u - camera.focal_px * right / (nearest if right < 0 else farthest)
-    first, last = (
-        max(math.floor(u_left + 0.5), 0),
-        min(math.floor(u_right + 0.5) + 1, camera.width_px),
-    )
+    first = max(math.floor(u_left + 0.5), 0)
+    last = min(math.floor(u_right + 0.5) + 1, camera.width_px)
     return first >= last or bool(nearest * inverse_depths(plan, first, last).min() >= 1)
 
 
 def _project(camera: Pinhole, ahead: Float, left: Float, up: Float) -> Float:
-    """Pixels (N, 2) of points before the lens."""
+    """Return pixels (N, 2) of points in front of the camera."""
     u = camera.center_u - camera.focal_px * left / ahead
     return np.stack([u, camera.center_v - camera.focal_px * up / ahead], axis=-1)
 
 
-def _windows(camera: Pinhole, low_px: Float, high_px: Float) -> np.ndarray:
-    """Windows (S, 4) from the least and largest u and v (S, 2) of all points of each solid."""
-    size = np.array([camera.width_px, camera.height_px])
-    first = np.minimum(np.maximum(np.floor(low_px + 0.5), 0), size)
-    last = np.maximum(np.minimum(np.floor(high_px + 0.5), size - 1), -1)
-    return np.stack([first[:, 1], last[:, 1], first[:, 0], last[:, 0]], axis=-1).astype(np.int64)
-
-
-_PARALLEL = 1e-12  # of a ray's direction along an axis: it meets no plane across that
+_PARALLEL = 1e-12  # a ray with a smaller component along an axis meets no plane across it
 
 
 def cast_rays(
     camera: Pinhole, solids: Solids, bodies: list[ProjectedRobot], grey: Float, depth_m: np.ndarray,
     picture: np.ndarray | None = None,
 ) -> None:  # fmt: skip
-    """Draw robots into pixels whose middles hit them nearer than `depth_m` (H, W).
+    """Draw robots into pixels whose centres hit them in front of the present depth.
 
-    Both `depth_m`, infinity where nothing is, and `picture` (H, W) are changed.
+    Args:
+        camera: level camera.
+        solids: solids of one robot.
+        bodies: robots.
+        grey: grey levels of the solids, shape (S,).
+        depth_m: depths, infinity for background, shape (H, W); changed.
+        picture: image, shape (H, W); changed.
     """
     for body in bodies:
         for i in body.shown.tolist():
             nearness = _nearness(camera, solids, i, body)
             top, bottom, left, right = body.windows[i].tolist()
             behind_m = depth_m[top : bottom + 1, left : right + 1]
-            with np.errstate(invalid="ignore"):  # no nearness before nothing
+            with np.errstate(invalid="ignore"):  # zero times infinity
                 is_nearer = nearness * behind_m > 1
             behind_m[is_nearer] = 1 / nearness[is_nearer]
             if picture is not None:
@@ -437,10 +438,10 @@ def cast_rays(
 
 
 def _nearness(camera: Pinhole, solids: Solids, i: int, body: ProjectedRobot) -> Float:
-    """Inverse depth of a solid behind its window's pixels; 0 where it is not.
+    """Return the inverse depth of a solid at the pixels of its window; 0 beside the solid.
 
-    Inverse depth is linear in the picture on each of its planes. Its surface is the farthest of
-    those that face the eye, where a ray has not left it before (Kay and Kajiya 1986).
+    Inverse depth is linear in the image for each plane. The surface is the farthest plane that
+    faces the camera, if the ray has not left the solid before (Kay and Kajiya 1986).
     """
     top, bottom, left, right = body.windows[i].tolist()
     own, f = slice(*solids.first_plane[i : i + 2]), camera.focal_px
@@ -457,7 +458,7 @@ def _nearness(camera: Pinhole, solids: Solids, i: int, body: ProjectedRobot) -> 
     facing = body.outside_m[own] > 0
     if not body.is_cut[i]:
         return least(body.outline(i), facing, 1.0)
-    # of what reaches the lens no outline is known: rays through all pixels of the window
+    # a solid that reaches the near plane has no outline: rays through all pixels of the window
     around = np.array(
         [[-1.0, -1, -1, len(up)], [right + 1.0 - left, len(up), right + 1 - left, -1]]
     )
@@ -470,15 +471,15 @@ def draw_robots(
     camera: Pinhole, plan: VisibleWalls, solids: Solids, bodies: list[ProjectedRobot], grey: Float,
     picture: np.ndarray,
 ) -> None:  # fmt: skip
-    """Draw robots over a picture (H, W) uint8, each pixel by the share they cover.
+    """Draw robots over an image, each pixel by the covered share.
 
     Args:
-        camera: level.
-        plan: what it sees of the walls.
-        solids: of one robot.
-        bodies: in the picture, from the nearest to the farthest.
-        grey: (S,) the solids' grey levels.
-        picture: changed.
+        camera: level camera.
+        plan: visible walls.
+        solids: solids of one robot.
+        bodies: visible robots, from the nearest to the farthest.
+        grey: grey levels of the solids, shape (S,).
+        picture: image, shape (H, W) uint8; changed.
     """
     bounds = np.array([body.bounds() for body in bodies])
     (above, first), (below, last) = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
@@ -491,14 +492,14 @@ def draw_robots(
             top, bottom, left, right = windows[i]
             if top > bottom or left > right:
                 continue
-            if body.is_cut[i]:  # by the pixels' middles
+            if body.is_cut[i]:  # by pixel centres
                 covered = (_nearness(camera, solids, i, body) > 0).astype(np.float64)
             else:
                 covered = np.zeros((bottom + 1 - top, right + 1 - left))
                 fill_coverage(body.outline(i), covered)
             columns = slice(left - first, right + 1 - first)
             window = slice(top - above, bottom + 1 - above), columns
-            # what is nearer hides the others where it is, and nowhere else in a pixel
+            # within a pixel, nearer solids take their share first
             share = np.minimum(covered * open_share[i, columns], rest[window])
             rest[window] -= share
             seen[window] += share * (grey[i] - under[window])
@@ -508,7 +509,7 @@ def draw_robots(
 def _open_shares(
     camera: Pinhole, plan: VisibleWalls, solids: Solids, body: ProjectedRobot, first: int, last: int
 ) -> Float:
-    """Shares (S, N) of columns from `first` to before `last` in which no wall hides a solid."""
+    """Return shares (S, N) of columns `first` to `last` - 1 in which no wall hides a solid."""
     w = inverse_depths(plan, first, last)
     if body.farthest_m * w.max() < 1:  # in front of all walls
         return np.ones((len(body.windows), last - first))
@@ -518,10 +519,10 @@ def _open_shares(
     y = np.stack([low[:, 1], high[:, 1], low[:, 1], high[:, 1]])
     corner_m, aside_m = ahead_x * x + ahead_y * y, left_x * x + left_y * y
     left = (camera.center_u - np.arange(first, last)) / camera.focal_px
-    # depths at which columns meet solids' boxes in plan, or of the corners nearest to them
+    # depths at which columns meet the bounding boxes in plan, else of the nearest corners
     enter, leave = np.zeros((len(low), 1)), np.full((len(low), 1), np.inf)
     for axis, ray in enumerate((ahead_x + left * left_x, ahead_y + left * left_y)):
-        ray[np.abs(ray) <= _PARALLEL] = np.nan  # which counts neither as least nor as most
+        ray[np.abs(ray) <= _PARALLEL] = np.nan  # ignored by fmin and fmax
         at_low, at_high = low[:, axis, None] / ray, high[:, axis, None] / ray
         enter = np.fmax(enter, np.minimum(at_low, at_high))
         leave = np.fmin(leave, np.maximum(at_low, at_high))

@@ -1,16 +1,17 @@
 """Walls in an image: visibility per pixel column, and mean texture over each pixel's footprint.
 
-A level camera's picture maps an upright wall's line in plan to inverse depth w = 1 / Z, which is
-linear in the column's coordinate u (Hartley and Zisserman 2004, projection of lines): with the line
-n (p - s) = 0 and a ray Z (1, (c - u) / f), Z n (1, (c - u) / f) = n s. So the nearest wall is the
-upper envelope of straight segments over u, and its breaks lie at segments' ends and crossings.
+In the image of a level camera the inverse depth w = 1 / Z of an upright wall is linear in the
+column coordinate u (Hartley and Zisserman 2004, projection of lines): with the wall's line n (p - s) = 0
+and a ray Z (1, (c - u) / f), Z n (1, (c - u) / f) = n s. So the nearest wall is the upper envelope
+of line segments over u, and its breaks are at ends and crossings of segments.
 
-A level camera sees an upright wall's strip at one depth, so its footprints are rectangles on the
-wall, side by side up the column. Sums of all texels left of and below a corner (Crow 1984) give the
-exact mean over each: first the difference of two columns of sums, then that of two of its rows.
-Loops that only reckon run in the processor's vectors, one that looks up as well does not: so what
-can be reckoned beforehand has a loop of its own. And each is a function of its own that is given
-its arrays by themselves: to hold on to them while it calls others would take as long as a loop.
+A strip of an upright wall has one depth, so the footprints of its pixels are rectangles on the
+wall, side by side up the column. Summed-area tables (Crow 1984) give the exact mean over each rectangle:
+the difference of two columns of sums, then that of two rows.
+
+Arithmetic and look-ups are in separate loops, so that the compiler vectorises the arithmetic. Some
+loops are kernels of their own, because Numba otherwise counts references of their arrays, which
+takes as long as the loop.
 """
 
 from typing import NamedTuple
@@ -20,26 +21,26 @@ import numpy as np
 from mapfusion.geometry.numerics import Float, kernel
 from sim.rendering.scene import Walls
 
-NO_WALL = -1  # no wall
-_THINNEST_PX = 1e-9  # what is thinner is not told apart
-_JUST_RIGHT_PX = 1e-7  # of a place: there what begins at it is nearer than the rest, or is not
-_MOST_PIECES = 10  # for each face; an upper envelope of so many segments has fewer
+NO_WALL = -1  # index of a strip without a wall
+_THINNEST_PX = 1e-9  # thinner strips are dropped
+_JUST_RIGHT_PX = 1e-7  # offset to the right of a break at which depths are compared
+_MOST_PIECES = 10  # bound on strips per face; the upper envelope has fewer
 
 
 class Pinhole(NamedTuple):
-    """One level camera.
+    """Level pinhole camera.
 
     Attributes:
-        width_px: of the picture.
-        height_px: likewise.
+        width_px: width of the image.
+        height_px: height of the image.
         focal_px: focal length.
-        center_u: principal point.
-        center_v: likewise.
-        eye_x_m: optical centre.
-        eye_y_m: likewise.
-        eye_z_m: likewise.
-        theta: of the optical axis, counter-clockwise from the world's x axis.
-        near_m: what is nearer along the axis is not seen.
+        center_u: column of the principal point.
+        center_v: row of the principal point.
+        eye_x_m: x of the optical centre.
+        eye_y_m: y of the optical centre.
+        eye_z_m: z of the optical centre.
+        theta: direction of the optical axis, counter-clockwise from the world's x axis.
+        near_m: depth of the near plane.
     """
 
     width_px: int
@@ -55,25 +56,25 @@ class Pinhole(NamedTuple):
 
 
 def at_origin(camera: Pinhole) -> Pinhole:
-    """A camera whose rows see floors as far off as those of another one do."""
+    """Return the camera at the origin, whose rows have the same depths on horizontal planes."""
     return camera._replace(eye_x_m=0.0, eye_y_m=0.0, theta=0.0)
 
 
 class VisibleWalls(NamedTuple):
-    """What a camera sees of the walls, from left to right: N strips of one face and column each.
+    """Visible walls as N strips of one face and column each, from left to right.
 
     Column j reaches from u = j - 1/2 to j + 1/2.
 
     Attributes:
-        seen: (F, 7) all faces, see `_project`.
-        face: (N,) int64 that is seen in a strip, or NONE.
-        low: (N,) where in u it begins.
-        high: (N,) where it ends.
-        first: (W + 1,) int64 each column's first strip, and N.
-        middle: (W,) int64 the face that each column's middle sees, or NONE.
-        middle_m: (W,) its depth there; infinity for none.
-        above: (W,) int64 how many rows from the upper edge on walls leave open, wholly or partly.
-        below: (W,) int32 the same from the lower edge on.
+        seen: projections of all faces, shape (F, 7), see `find_visible_walls`.
+        face: visible face of each strip, or NO_WALL, shape (N,) int64.
+        low: start of each strip in u, shape (N,).
+        high: end of each strip in u, shape (N,).
+        first: first strip of each column, and N, shape (W + 1,) int64.
+        middle: visible face at the centre of each column, or NO_WALL, shape (W,) int64.
+        middle_m: its depth; infinity without a wall, shape (W,).
+        above: number of rows from the upper edge not fully covered by walls, shape (W,) int64.
+        below: number of rows from the lower edge not fully covered by walls, shape (W,) int64.
     """
 
     seen: Float
@@ -89,10 +90,10 @@ class VisibleWalls(NamedTuple):
 
 @kernel
 def find_visible_walls(camera: Pinhole, walls: Walls) -> VisibleWalls:
-    """What a camera sees of the walls."""
-    # Project faces (F, 7) into the picture: from u, to u, w0, w1, t0, t1, t2: w = w0 + w1 u.
-    # t is the place along the face in metres: t = (t0 + t1 u) / w - t2. A face that is not seen,
-    # being behind or turned away, is from infinity to minus infinity.
+    """Return the visible walls of a camera."""
+    # Projections of the faces: start u, end u, w0, w1, t0, t1, t2, with w = w0 + w1 u. The position
+    # along the face in metres is t = (t0 + t1 u) / w - t2. A face that is behind the camera or
+    # turned away from it starts at infinity and ends at minus infinity.
     cos, sin = np.cos(camera.theta), np.sin(camera.theta)
     f, c = camera.focal_px, camera.center_u
     seen = np.empty((len(walls.width_m), 7))
@@ -102,7 +103,7 @@ def find_visible_walls(camera: Pinhole, walls: Walls) -> VisibleWalls:
         ahead = cos * walls.along[i, 0] + sin * walls.along[i, 1]
         left = cos * walls.along[i, 1] - sin * walls.along[i, 0]
         end_z, end_y = start_z + walls.width_m[i] * ahead, start_y + walls.width_m[i] * left
-        # distance of the eye before the face; its front lies to the right of the way along it
+        # distance of the optical centre in front of the face, whose front is on its right side
         before = start_y * ahead - start_z * left
         seen[i, 0], seen[i, 1] = np.inf, -np.inf
         if before <= 0 or max(start_z, end_z) <= camera.near_m:
@@ -115,7 +116,7 @@ def find_visible_walls(camera: Pinhole, walls: Walls) -> VisibleWalls:
         for k, z, y in ((0, start_z, start_y), (1, end_z, end_y)):
             if z > camera.near_m:
                 seen[i, k] = c - f * y / z
-            else:  # cut where w is that of the near plane
+            else:  # cut at the near plane
                 seen[i, k] = (1 / camera.near_m - w_0) / w_u
     face, low, high, first, middle, middle_m = _strips(seen, camera.width_px)
     above, below = _open_rows(camera, walls.height_m, seen, face, low, high, first)
@@ -126,10 +127,10 @@ def find_visible_walls(camera: Pinhole, walls: Walls) -> VisibleWalls:
 def _strips(
     seen: Float, width_px: int
 ) -> tuple[np.ndarray, Float, Float, np.ndarray, np.ndarray, Float]:
-    """What is seen in each column: `Plan`'s face, low, high, first, middle and its depth.
+    """Return face, low, high, first, middle and middle_m of `VisibleWalls`.
 
-    A face is the nearest until it ends, until another one begins before it, or until another one
-    crosses it, which then is the nearest.
+    A face is the nearest one until it ends, until another face starts in front of it, or until
+    another face crosses it and becomes the nearest.
     """
     face = np.empty(width_px + _MOST_PIECES * (len(seen) + 1), dtype=np.int64)
     low, high = np.empty(len(face)), np.empty(len(face))
@@ -180,12 +181,12 @@ def _open_rows(
     high: Float,
     first: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How many rows of each column walls leave open, see `Plan`."""
+    """Return above and below of `VisibleWalls`."""
     above = np.empty(camera.width_px, dtype=np.int64)
     below = np.empty(camera.width_px, dtype=np.int64)
     horizon = int(np.ceil(camera.center_v))
     for j in range(camera.width_px):
-        w = np.inf  # where walls are farthest; nowhere they are infinitely far
+        w = np.inf  # inverse depth of the farthest wall; 0 without a wall
         for s in range(first[j], first[j + 1]):
             w_0, w_u = seen[face[s], 2], seen[face[s], 3]
             w = min(w, w_0 + w_u * low[s], w_0 + w_u * high[s]) if face[s] != NO_WALL else 0.0
@@ -197,7 +198,7 @@ def _open_rows(
 
 
 def inverse_depths(plan: VisibleWalls, first: int, last: int) -> Float:
-    """Of what is seen in the middles of strips (N,) in columns from `first` to before `last`."""
+    """Return inverse depths (N,) at the centres of strips in columns `first` to `last` - 1."""
     strips = slice(plan.first[first], plan.first[last])
     face, middle = plan.face[strips], (plan.low[strips] + plan.high[strips]) / 2
     w = plan.seen[face, 2] + plan.seen[face, 3] * middle
@@ -205,34 +206,37 @@ def inverse_depths(plan: VisibleWalls, first: int, last: int) -> Float:
     return w
 
 
-# A wall's level lines cross a column at a slope, which cuts a footprint's corners. A strip is cut
-# into so many that lines cross each by no more than this: of cuts twice as fine the picture differs
-# by less than a grey level is rounded, of cuts twice as coarse visibly.
+# Horizontal lines on a wall cross a column at a slope, which a rectangular footprint ignores. A
+# strip is cut so that lines cross each part by at most this number of rows. Half of it changes the
+# image by less than the rounding of grey levels, twice of it changes the image visibly.
 STEEPEST_ROWS = 0.5
-MOST_CUTS = 8  # a bound on the time of walls that are grazed
+MOST_CUTS = 8  # bounds the time for walls at grazing angles
 COVERED = np.float32(1 - 1e-6)  # shares are kept in single precision
-LEAST_TEXELS = 1e-6  # of a strip at a wall's end: sums still tell them apart
+LEAST_TEXELS = 1e-6  # least width of a strip at the end of a wall, to divide by
 
 
 @kernel
 def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.ndarray) -> None:
-    """Draw walls over what is behind them.
+    """Draw walls over the background.
 
     Args:
-        camera: level.
+        camera: level camera.
         walls: all faces.
-        plan: what the camera sees of them.
-        columns: the picture's (W, H) uint8, changed, each one after the other in memory.
+        plan: visible walls.
+        columns: transposed image, shape (W, H) uint8; changed.
     """
     seen, face, lows, highs = plan.seen, plan.face, plan.low, plan.high
     height, height_m, width_m, size = camera.height_px, walls.height_m, walls.width_m, walls.size
     begins, table = walls.first, walls.sums
-    # of a strip: sums of its texels up to each row of texels; of the edges between pixels: the row
-    # of texels that they lie in, the share of it below them, sums up to them; of pixels: grey
-    # levels times covered share, and that share
-    sums = np.empty(_most_rows(size) + 1, dtype=np.float32)
+    # per row of texels in a strip: sum of all texels up to it
+    most_rows = 0
+    for i in range(len(size)):
+        most_rows = max(most_rows, size[i, 1])
+    sums = np.empty(most_rows + 1, dtype=np.float32)
+    # per edge between pixels: row of texels, share of the row below the edge, sum up to the edge
     row, share = np.empty(height + 1, dtype=np.int32), np.empty(height + 1, dtype=np.float32)
     below = np.empty(height + 1, dtype=np.float32)
+    # per pixel: grey level times covered share, and covered share
     total, covered = np.empty(height, dtype=np.float32), np.empty(height, dtype=np.float32)
     for j in range(camera.width_px):
         first, last = height - 1, 0
@@ -248,7 +252,7 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
                 upper = int(max(np.floor(top + 0.5), 0.0))
                 lower = int(min(np.floor(bottom + 0.5), camera.height_px - 1.0))
                 begin, end = _texels(seen, i, a, b, width_m, size)
-                # rows of texels that the strip's rows of the picture see
+                # rows of texels in the rows of the strip
                 at_center = camera.eye_z_m / height_m * size[i, 1]
                 highest_q = at_center - (upper - 0.5 - camera.center_v) * step
                 lowest_q = at_center - (lower + 0.5 - camera.center_v) * step
@@ -256,12 +260,12 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
                 rows, edges = top_row - bottom_row, lower + 2 - upper
                 _add_columns(table, begins[i], size, i, begin, end, bottom_row, top_row, sums)
                 _find_rows(highest_q - bottom_row, step, rows, edges, row, share)
-                # Fill in the sums below edges.
+                # sums up to the edges
                 for v in range(edges):
                     k = np.uint64(row[v])
                     at_row = sums[k]
                     below[v] = at_row + share[v] * (sums[k + np.uint64(1)] - at_row)
-                # Add means over footprints, from the sums below the edges between them.
+                # means over footprints are differences between edges
                 scale = (b - a) / ((end - begin) * step)
                 start, weight = np.uint64(upper), np.float32(scale)
                 for v in range(lower + 1 - upper):
@@ -269,16 +273,16 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
                 _cover(covered, b - a, top, bottom, upper, lower)
                 first, last = min(first, upper), max(last, lower)
                 lowest_top, highest_bottom = max(lowest_top, upper), min(highest_bottom, lower)
-        # rows between the edges of all strips are covered alike; if wholly, nothing shines through
+        # rows between the edges of all strips have the same share; skip blending if it is 1
         begin, end = lowest_top + 1, highest_bottom
         if begin >= end or covered[begin] < COVERED:
             begin = end = last + 1
-        # Draw a column's rows from `begin` to before `end`, which walls cover.
+        # draw rows `begin` to `end` - 1, which walls cover
         start = np.uintp(begin)
         for i in range(end - begin):
             v = start + np.uintp(i)
             columns[j, v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
-        # Draw its other rows, from `first` to `last`, over what is there.
+        # blend the other rows from `first` to `last` with the background
         v = first
         while v <= last:
             if v == begin:
@@ -292,16 +296,8 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
 
 
 @kernel
-def _most_rows(size: np.ndarray) -> int:
-    most = 0
-    for i in range(len(size)):
-        most = max(most, size[i, 1])
-    return most
-
-
-@kernel
 def _cuts(camera: Pinhole, height_m: float, seen: Float, i: int, low: float, high: float) -> int:
-    """Into how many strips one of face i is cut."""
+    """Return the number of parts that a strip of face i is cut into."""
     slope = seen[i, 3]
     w = seen[i, 2] + slope * (low + high) / 2
     highest = max(camera.eye_z_m, height_m - camera.eye_z_m) * camera.focal_px * w
@@ -320,7 +316,7 @@ def _rows(
     high: float,
     size: np.ndarray,
 ) -> tuple[float, float, float]:
-    """Where a strip of face i begins and ends in v, and how many texels a row is high."""
+    """Return start and end of a strip of face i in v, and the height of a row in texels."""
     w = seen[i, 2] + seen[i, 3] * (low + high) / 2
     top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
     bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
@@ -331,7 +327,7 @@ def _rows(
 def _texels(
     seen: Float, i: int, low: float, high: float, width_m: Float, size: np.ndarray
 ) -> tuple[float, float]:
-    """Where a strip begins and ends along face i; never empty, since means over it are wanted."""
+    """Return start and end of a strip along face i in texels; its width is positive."""
     w_0, w_u, t_0, t_u = seen[i, 2], seen[i, 3], seen[i, 4], seen[i, 5]
     begin = (t_0 + t_u * low) / (w_0 + w_u * low) - seen[i, 6]
     end = (t_0 + t_u * high) / (w_0 + w_u * high) - seen[i, 6]
@@ -344,7 +340,7 @@ def _texels(
 def _cover(
     covered: np.ndarray, share: float, top: float, bottom: float, first: int, last: int
 ) -> None:
-    """Add a strip's share to what is covered of pixels, less of those that its edges cross."""
+    """Add a strip's share to the covered shares, less at pixels that its edges cross."""
     begin, whole = np.uintp(first), np.float32(share)
     for i in range(last + 1 - first):
         covered[begin + np.uintp(i)] += whole
@@ -364,7 +360,7 @@ def _add_columns(
     highest: int,
     sums: np.ndarray,
 ) -> None:
-    """Sums of all texels between two places along face i, from the row `lowest` up to each row."""
+    """Fill in sums of texels between two positions along face i, from a row up to each row."""
     texels_along, n = size[i, 0], size[i, 1] + 1
     k, m = min(int(begin), texels_along - 1), min(int(end), texels_along - 1)
     a, b = np.float32(begin - k), np.float32(end - m)
@@ -372,7 +368,7 @@ def _add_columns(
     count = highest + 1 - lowest
     low, after_low = table[left:][:count], table[left + n :][:count]
     high, after_high = table[right:][:count], table[right + n :][:count]
-    # differences are exact, though the sums may have run over
+    # differences are exact, even if the sums have overflowed
     between = np.int32(high[0] - low[0])
     more, less = np.int32(after_high[0] - high[0]), np.int32(after_low[0] - low[0])
     for r in range(count):
@@ -386,9 +382,9 @@ def _add_columns(
 def _find_rows(
     q: float, texels: float, n: int, edges: int, row: np.ndarray, share: np.ndarray
 ) -> None:
-    """Fill in rows of texels in which edges lie, so many texels apart, the first at `q` above.
+    """Fill in row and share of edges at a distance of `texels`, the first one at `q`.
 
-    What sticks out over the n rows of texels adds nothing: it is the share that is not covered.
+    Edges outside the n rows are moved to the border, because the parts outside are not covered.
     """
     top, begin, step, last_row = np.float32(n), np.float32(q), np.float32(texels), np.int32(n - 1)
     for v in range(edges):
