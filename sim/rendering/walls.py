@@ -1,13 +1,13 @@
 """Walls in an image: visibility per pixel column, and mean texture over each pixel's footprint.
 
 In the image of a level camera the inverse depth w = 1 / Z of an upright wall is linear in the
-column coordinate u (Hartley and Zisserman 2004, projection of lines): with the wall's line n (p - s) = 0
-and a ray Z (1, (c - u) / f), Z n (1, (c - u) / f) = n s. So the nearest wall is the upper envelope
-of line segments over u, and its breaks are at ends and crossings of segments.
+column coordinate u (Hartley and Zisserman 2004, projection of lines): with the wall's line
+n (p - s) = 0 and a ray Z (1, (c - u) / f), Z n (1, (c - u) / f) = n s. So the nearest wall is the
+upper envelope of line segments over u, and its breaks are at ends and crossings of segments.
 
 A strip of an upright wall has one depth, so the footprints of its pixels are rectangles on the
-wall, side by side up the column. Summed-area tables (Crow 1984) give the exact mean over each rectangle:
-the difference of two columns of sums, then that of two rows.
+wall, side by side up the column. Summed-area tables (Crow 1984) give the exact mean over each
+rectangle: the difference of two columns of sums, then that of two rows.
 
 Arithmetic and look-ups are in separate loops, so that the compiler vectorises the arithmetic. Some
 loops are kernels of their own, because Numba otherwise counts references of their arrays, which

@@ -11,19 +11,19 @@ from sim.floorplan import FloorPlan, Wall
 from sim.textures import Texture
 from sim.world import write_faces
 
-Look = tuple[str, bool]  # a wall's, and whether it is mirrored
+Look = tuple[str, bool]  # look of a wall, and True if the wall is mirrored
 
 
 @dataclass(frozen=True)
 class Walls:
-    """Polylines in world metres, all of one height and thickness."""
+    """Walls as polylines in world metres, all of the same height and thickness."""
 
     polylines_m: tuple[tuple[tuple[float, float], ...], ...]
     height_m: float
     thickness_m: float
 
     def floor_plan(self, looks: Sequence[Look] | None = None) -> FloorPlan:
-        """As the simulator takes them, with a look each where they are to be seen."""
+        """Return the simulator's floor plan, with looks if the walls are rendered."""
         lines = [np.array(line) for line in self.polylines_m]
         looks = [("", False)] * len(lines) if looks is None else looks
         size = self.height_m, self.thickness_m
@@ -37,7 +37,7 @@ WRITES = ()
 
 @dataclass(frozen=True)
 class FacesSettings:
-    """All that the painted walls depend on."""
+    """Settings of the painted faces."""
 
     seed: int
     walls: Walls
@@ -46,7 +46,7 @@ class FacesSettings:
 
 
 def run(settings: FacesSettings, job: Job) -> None:
-    """Write meshes and pictures."""
+    """Write meshes and textures."""
     rng = generator(settings.seed, "textures")
     plan = settings.walls.floor_plan(settings.looks)
     write_faces(job.output, plan, rng, settings.texture)

@@ -39,14 +39,14 @@ class Killed:
 def test_it_is_started_again(monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
     killed = Killed(failures)
     monkeypatch.setattr(cluster, "LocalCluster", killed)
-    assert cluster._started(2) == "a cluster"
+    assert cluster._start_cluster(2) == "a cluster"
     assert killed.started == failures + 1
 
 
 def test_three_times_in_a_row_is_no_accident(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "LocalCluster", Killed(99))
     with pytest.raises(InputError, match="--jobs 2: 2 workers could not be started, 3 times"):
-        cluster._started(2)
+        cluster._start_cluster(2)
 
 
 @pytest.fixture
