@@ -51,8 +51,8 @@ _STEP = fields(effective_sample_size=FLOAT, resampled=BOOL, n_landmarks=INT, spr
 POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *_STEP])
 _PARTICLE = fields(iteration=INT, particle=INT)
 CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
-# Inconsistencies of a log (mapfusion.datasets.log_consistency), one per row: the iteration of a jump
-# or -1, and for jumps the motion that the observations imply in place of the odometry.
+# Inconsistencies of a log (mapfusion.datasets.log_consistency), one per row: the iteration of a
+# jump or -1, and for jumps the motion that the observations imply in place of the odometry.
 _OBSERVED = [f"observed_{name}" for name in POSE_FIELDS]
 _OBSERVED_COVARIANCE = ["cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"]
 FINDINGS = schema(

@@ -36,8 +36,8 @@ from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.robot_log import RobotLog, first_frames
 from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 
-# Attributes describe the result: `n_steps`, the degrees of freedom of the Student-t distributions of
-# observations and offsets (`observation_dof`, `offset_dof`), the estimated factor on the stated
+# Attributes describe the result: `n_steps`, the degrees of freedom of the Student-t distributions
+# of observations and offsets (`observation_dof`, `offset_dof`), the estimated factor on the stated
 # covariances of observations (`observation_level`), and `not_smoothed`, the reason for a missing
 # path (else empty).
 PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
