@@ -182,7 +182,26 @@ class FloorPlan:
 
     def faces(self) -> list[Face]:
         """Return all faces that are visible inside: walls, then floor, then ceiling."""
-        faces = [face for wall in self.walls for face in self._wall_faces(wall)]
+        faces = list[Face]()
+        for wall in self.walls:
+            left, right = wall.side(left=True), wall.side(left=False)
+            # the left side of a wall is the right side of its mirror image
+            on_left, on_right = ("right", "left") if wall.mirrored else ("left", "right")
+            # seen from the left side the wall runs from right to left
+            edges = [(f"{on_left} {i}", left[i + 1], left[i]) for i in range(len(left) - 1)]
+            edges += [(f"{on_right} {i}", right[i], right[i + 1]) for i in range(len(right) - 1)]
+            # faces beyond the floor's edge and ends inside another wall are never visible
+            edges = [edge for edge in edges if np.all(self.contains(np.stack(edge[1:])))]
+            if not wall.closed:
+                ends = [("first end", left[0], right[0]), ("last end", right[-1], left[-1])]
+                bare = [np.any(self.clearance_m(np.stack(end[1:])) > -BURIED_M) for end in ends]
+                edges += itertools.compress(ends, bare)
+            for name, start, end in edges:
+                corners = np.zeros((4, 3))
+                corners[:, :2] = [start, end, end, start]
+                corners[2:, 2] = wall.height_m
+                look = f"{wall.look} {name}" if wall.look else ""
+                faces.append(Face(corners, "wall", look, wall.mirrored))
         (x0, y0), (x1, y1) = self.extent_m
         plan = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
         faces.append(Face(np.column_stack([plan, np.zeros(4)]), "floor"))
@@ -191,29 +210,6 @@ class FloorPlan:
             faces.append(
                 Face(np.column_stack([seen_from_below, np.full(4, self.ceiling_m)]), "ceiling")
             )
-        return faces
-
-    def _wall_faces(self, wall: Wall) -> list[Face]:
-        """Return the faces of a wall that are visible inside."""
-        left, right = wall.side(left=True), wall.side(left=False)
-        # the left side of a wall is the right side of its mirror image
-        on_left, on_right = ("right", "left") if wall.mirrored else ("left", "right")
-        # seen from the left side the wall runs from right to left
-        edges = [(f"{on_left} {i}", left[i + 1], left[i]) for i in range(len(left) - 1)]
-        edges += [(f"{on_right} {i}", right[i], right[i + 1]) for i in range(len(right) - 1)]
-        # faces beyond the floor's edge and ends inside another wall are never visible
-        edges = [edge for edge in edges if np.all(self.contains(np.stack(edge[1:])))]
-        if not wall.closed:
-            ends = [("first end", left[0], right[0]), ("last end", right[-1], left[-1])]
-            bare = [np.any(self.clearance_m(np.stack(end[1:])) > -BURIED_M) for end in ends]
-            edges += itertools.compress(ends, bare)
-        faces = []
-        for name, start, end in edges:
-            corners = np.zeros((4, 3))
-            corners[:, :2] = [start, end, end, start]
-            corners[2:, 2] = wall.height_m
-            look = f"{wall.look} {name}" if wall.look else ""
-            faces.append(Face(corners, "wall", look, wall.mirrored))
         return faces
 
 

@@ -410,7 +410,19 @@ def _pairwise_overlap(paths: Sequence[Float]) -> Float:
     points = np.concatenate(paths)
     low, high = points.min(axis=0) - GROUND_HALF_WIDTH_M, points.max(axis=0) + GROUND_HALF_WIDTH_M
     x, y = (np.arange(low[i] + CELL_M / 2, high[i], CELL_M) for i in (0, 1))
-    visited = [_visited_cells(x, y, path) for path in paths]
+    # cells whose centres lie near a path, ascending
+    visited, reach_m = list[np.ndarray](), GROUND_HALF_WIDTH_M + CELL_M
+    for path in paths:
+        near_legs = []
+        for start, end in itertools.pairwise(path):
+            first, last = np.minimum(start, end) - reach_m, np.maximum(start, end) + reach_m
+            columns = np.arange(*np.searchsorted(x, [first[0], last[0]]))
+            rows = np.arange(*np.searchsorted(y, [first[1], last[1]]))
+            column, row = (index.ravel() for index in np.meshgrid(columns, rows))
+            centres = np.stack([x[column], y[row]], -1)
+            near = segment_distance_m(centres, start, end) <= GROUND_HALF_WIDTH_M
+            near_legs.append((row * len(x) + column)[near])
+        visited.append(np.unique(np.concatenate(near_legs)))
     size = np.array([len(cells) for cells in visited])
     starts = np.concatenate([[0], np.cumsum(size)])
     # sparse, because a path visits a small part of a large building
@@ -419,18 +431,3 @@ def _pairwise_overlap(paths: Sequence[Float]) -> Float:
     )
     both = (table @ table.T).toarray()
     return both / (size[:, None] + size - both)
-
-
-def _visited_cells(x: Float, y: Float, path_m: Float) -> np.ndarray:
-    """Return the grid cells, ascending, whose centres lie near a path (N, 2)."""
-    visited = []
-    reach_m = GROUND_HALF_WIDTH_M + CELL_M
-    for start, end in itertools.pairwise(path_m):
-        low, high = np.minimum(start, end) - reach_m, np.maximum(start, end) + reach_m
-        across = np.arange(*np.searchsorted(x, [low[0], high[0]]))
-        along = np.arange(*np.searchsorted(y, [low[1], high[1]]))
-        column, row = (index.ravel() for index in np.meshgrid(across, along))
-        cells = np.stack([x[column], y[row]], -1)
-        near = segment_distance_m(cells, start, end) <= GROUND_HALF_WIDTH_M
-        visited.append((row * len(x) + column)[near])
-    return np.unique(np.concatenate(visited))

@@ -198,7 +198,7 @@ class Store:
         if len(parts) < _DEPTH:
             return False
         stage = root.joinpath(*parts[:2])
-        if mended[path] and (not path.is_file() or _is_sound(stage)):
+        if mended[path] and (not path.is_file() or _is_undamaged(stage)):
             mended[stage] += 1
             return mended[stage] <= _TOLD_LATE_AT_MOST
         mended[path] += 1
@@ -228,7 +228,7 @@ def _read_mark(path: Path) -> _Mark:
         raise DamagedFileError(path, "is not the mark of a finished stage") from error
 
 
-def _is_sound(stage: Path) -> bool:
+def _is_undamaged(stage: Path) -> bool:
     """Return True if no file of a stage is damaged."""
     try:
         require_undamaged(stage)

@@ -117,21 +117,7 @@ def _shape(visual: ElementTree.Element, place_m: Float) -> tuple[Float, _Hull]:
         assert cylinder is not None
         radius, half_m = float(cylinder.attrib["radius"]), float(cylinder.attrib["length"]) / 2
         corners = _cylinder_corners(radius, half_m)
-    planes, edges, sides = _convex_hull(corners)
-    # roll, pitch and yaw of a URDF are about fixed axes
-    (cr, cp, cy), (sr, sp, sy) = (of(_numbers(origin, "rpy")) for of in (np.cos, np.sin))
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    R, at = about_z @ about_y @ about_x, _numbers(origin, "xyz")
-    planes[:, :3] = planes[:, :3] @ R.T
-    planes[:, 3] += planes[:, :3] @ at
-    planes[:, 3] += planes[:, :3] @ place_m
-    return corners @ R.T + at + place_m, (planes, edges, sides)
-
-
-def _convex_hull(corners: Float) -> _Hull:
-    """Return planes, edges and sides of the convex hull of corners, see `Solids`."""
+    # edges between two triangles, seen from outside with the first triangle to the left
     hull = ConvexHull(corners)
     a, b, c = np.moveaxis(corners[hull.simplices], 1, 0)
     normals = hull.equations[:, :3]
@@ -144,7 +130,16 @@ def _convex_hull(corners: Float) -> _Hull:
                 edges.append(way[::-1] if turned[i] else way)
                 sides.append([i, beside[k]])
     planes = hull.equations.round(9) * [1, 1, 1, -1]
-    return planes, np.array(edges), np.array(sides)
+    # roll, pitch and yaw of a URDF are about fixed axes
+    (cr, cp, cy), (sr, sp, sy) = (of(_numbers(origin, "rpy")) for of in (np.cos, np.sin))
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    R, at = about_z @ about_y @ about_x, _numbers(origin, "xyz")
+    planes[:, :3] = planes[:, :3] @ R.T
+    planes[:, 3] += planes[:, :3] @ at
+    planes[:, 3] += planes[:, :3] @ place_m
+    return corners @ R.T + at + place_m, (planes, np.array(edges), np.array(sides))
 
 
 def _cylinder_corners(radius: float, half_m: float) -> Float:

@@ -121,19 +121,8 @@ def make_scene(corners_m: Float, picture: Callable[[int], np.ndarray]) -> Scene:
         raise InputError(REFUSED.format(what="walls of different heights"))
     if not np.all(np.isin(heights[~is_wall], (0.0, top_m))):
         raise InputError(REFUSED.format(what="a ceiling that is not as high as the walls"))
-    walls = _make_walls(corners_m, np.flatnonzero(is_wall), top_m, picture)
-    planes = {
-        float(heights[i, 0]): _make_plane(corners_m[i], picture(i))
-        for i in np.flatnonzero(~is_wall).tolist()
-    }
-    floor = planes.get(0.0, _plane_at_infinity(0.0))
-    return Scene(walls, floor, planes.get(top_m, _plane_at_infinity(top_m)))
-
-
-def _make_walls(
-    corners_m: Float, faces: np.ndarray, top_m: float, picture: Callable[[int], np.ndarray]
-) -> Walls:
-    """Return the walls of some faces with their summed-area tables (Crow 1984)."""
+    # walls with their summed-area tables (Crow 1984)
+    faces = np.flatnonzero(is_wall)
     start, end = corners_m[faces, 0, :2], corners_m[faces, 1, :2]
     width_m = np.linalg.norm(end - start, axis=1)
     pictures = [picture(int(i)) for i in faces]
@@ -146,7 +135,14 @@ def _make_walls(
         along = np.cumsum(grey.T, axis=0, dtype=np.int32)
         table[1:, 1:] = np.cumsum(along, axis=1, dtype=np.int32, out=along)
     direction = (end - start) / width_m[:, None]
-    return Walls(start.copy(), direction, width_m, top_m, size, first, sums)
+    walls = Walls(start.copy(), direction, width_m, top_m, size, first, sums)
+    # floor and ceiling
+    planes = {
+        float(heights[i, 0]): _make_plane(corners_m[i], picture(i))
+        for i in np.flatnonzero(~is_wall).tolist()
+    }
+    floor = planes.get(0.0, _plane_at_infinity(0.0))
+    return Scene(walls, floor, planes.get(top_m, _plane_at_infinity(top_m)))
 
 
 def _plane_at_infinity(height_m: float) -> HorizontalPlane:

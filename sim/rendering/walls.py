@@ -119,7 +119,19 @@ def find_visible_walls(camera: Pinhole, walls: Walls) -> VisibleWalls:
             else:  # cut at the near plane
                 seen[i, k] = (1 / camera.near_m - w_0) / w_u
     face, low, high, first, middle, middle_m = _strips(seen, camera.width_px)
-    above, below = _open_rows(camera, walls.height_m, seen, face, low, high, first)
+    # rows of each column that walls leave open
+    above = np.empty(camera.width_px, dtype=np.int64)
+    below = np.empty(camera.width_px, dtype=np.int64)
+    horizon = int(np.ceil(camera.center_v))
+    for j in range(camera.width_px):
+        w = np.inf  # inverse depth of the farthest wall; 0 without a wall
+        for s in range(first[j], first[j + 1]):
+            w_0, w_u = seen[face[s], 2], seen[face[s], 3]
+            w = min(w, w_0 + w_u * low[s], w_0 + w_u * high[s]) if face[s] != NO_WALL else 0.0
+        top = camera.center_v - (walls.height_m - camera.eye_z_m) * camera.focal_px * w
+        bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
+        above[j] = max(0, min(int(max(np.floor(top + 0.5) + 1, 0.0)), horizon))
+        below[j] = max(0, camera.height_px - max(int(np.floor(bottom + 0.5)), horizon))
     return VisibleWalls(seen, face, low, high, first, middle, middle_m, above, below)
 
 
@@ -169,32 +181,6 @@ def _strips(
             at = end
         now = follower
     return face[:n], low[:n], high[:n], first, middle, middle_m
-
-
-@kernel
-def _open_rows(
-    camera: Pinhole,
-    height_m: float,
-    seen: Float,
-    face: np.ndarray,
-    low: Float,
-    high: Float,
-    first: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return above and below of `VisibleWalls`."""
-    above = np.empty(camera.width_px, dtype=np.int64)
-    below = np.empty(camera.width_px, dtype=np.int64)
-    horizon = int(np.ceil(camera.center_v))
-    for j in range(camera.width_px):
-        w = np.inf  # inverse depth of the farthest wall; 0 without a wall
-        for s in range(first[j], first[j + 1]):
-            w_0, w_u = seen[face[s], 2], seen[face[s], 3]
-            w = min(w, w_0 + w_u * low[s], w_0 + w_u * high[s]) if face[s] != NO_WALL else 0.0
-        top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
-        bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
-        above[j] = max(0, min(int(max(np.floor(top + 0.5) + 1, 0.0)), horizon))
-        below[j] = max(0, camera.height_px - max(int(np.floor(bottom + 0.5)), horizon))
-    return above, below
 
 
 def inverse_depths(plan: VisibleWalls, first: int, last: int) -> Float:
