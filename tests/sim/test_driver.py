@@ -218,7 +218,7 @@ def test_of_two_that_stand_before_each_other_the_one_that_came_so_far_goes_on() 
 
 
 def test_robots_that_are_not_looked_at_are_in_nobodys_way() -> None:
-    """Whether they are skipped as too far or asked for one by one."""
+    """Skipping distant robots gives the same result as checking each one."""
     rng = np.random.default_rng(0)
     for give_way_m in (0.05, 1.6, 3.0):
         settings = DriverSettings(give_way_m=give_way_m)
@@ -267,7 +267,7 @@ MIDDLES: list[Place] = [
 
 
 def standing(world: World) -> set[Place]:
-    """Where the walls' middles are."""
+    """Return the positions of the walls in a world."""
     p, client = world.bullet, world.client
     bodies = range(p.getNumBodies(physicsClientId=client))
     places = [p.getBasePositionAndOrientation(body, physicsClientId=client)[0] for body in bodies]

@@ -66,7 +66,7 @@ def test_two_that_come_head_on_get_through(first: str) -> None:
 
 
 def test_a_robot_that_holds_lets_the_others_by() -> None:
-    """So that these do not give way to it, though it is listed first."""
+    """The other robots do not give way to a holding robot, although it is listed first."""
     here, there = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)
     hold = Hold(0, Progress(0, -9.0), (Passage(1, Progress(0, -1.0), (0.0, 0.0)),))
     drivers = [

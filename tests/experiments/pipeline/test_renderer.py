@@ -1,4 +1,4 @@
-"""Which renderer made a result is known; one that is not there is one clear line."""
+"""A result names its renderer; a missing renderer gives one clear line."""
 
 import json
 from pathlib import Path

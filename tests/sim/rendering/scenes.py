@@ -53,7 +53,7 @@ def look(scene: Scene, camera: Pinhole) -> np.ndarray:
 
 
 def along_m(start: np.ndarray, end: np.ndarray, camera: Pinhole, u: np.ndarray) -> np.ndarray:
-    """Where rays through columns `u` meet a wall's line, in metres from its start."""
+    """Return where rays through columns `u` meet a wall's line, in metres from its start."""
     left = (camera.center_u - u) / camera.focal_px
     cos, sin = np.cos(camera.theta), np.sin(camera.theta)
     ray = np.stack([cos - left * sin, sin + left * cos], -1)

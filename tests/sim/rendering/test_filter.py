@@ -18,7 +18,7 @@ VIEWS = [(1.5, 0.0), (3.0, 0.6), (6.0, -0.9), (12.0, 1.1), (18.0, 1.25)]  # metr
 def test_a_wave_shows_with_the_amplitude_of_its_integral_over_a_pixel(
     distance_m: float, slant_rad: float
 ) -> None:
-    """Of a wave that a pixel covers a third of and more, most is lost, and how much is known."""
+    """A wave is damped by the known transfer function of a pixel's footprint."""
     per_pixel_m = distance_m / CAMERA.focal_px / np.cos(slant_rad)
     wave_m = max(3 * per_pixel_m, 0.16)  # 40 texels, so that texels are fine enough
     start, end = slanted(distance_m, slant_rad, 1.0)

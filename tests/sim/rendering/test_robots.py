@@ -105,7 +105,7 @@ def depths_m(i: int, body: ProjectedRobot) -> np.ndarray:
 
 
 def ahead_m(camera: Pinhole, i: int, pose: np.ndarray) -> np.ndarray:
-    """How far ahead of a camera a solid's corners (K,) are, of a robot at a pose."""
+    """Return depths (K,) of a solid's corners for a robot at a pose."""
     corners = SOLIDS.corners_m[SOLIDS.first_corner[i] : SOLIDS.first_corner[i + 1]]
     x, y = transform_points(pose, corners)[:, :2].T
     x, y = x - camera.eye_x_m, y - camera.eye_y_m
@@ -117,7 +117,7 @@ POSES = [(0.1, -0.4, 0.3), (0.0, 0.45, 1.7), (0.35, -0.4, -2.0)]
 
 @pytest.mark.parametrize("pose", [*POSES, (0.05, 0.0, 0.3), (1.2, 0.3, 0.4)])
 def test_depths_are_those_of_rays_through_all_pixels(pose: tuple) -> None:
-    """Of what reaches the lens and even holds it, and of what is farther off."""
+    """Solids in front of the camera, across the near plane and around the camera."""
     body = project_robot(CAMERA, SOLIDS, np.array(pose))
     seen = np.full((CAMERA.height_px, CAMERA.width_px), np.inf)
     cast_rays(CAMERA, SOLIDS, [body], np.zeros(len(SOLIDS.rgb)), seen)

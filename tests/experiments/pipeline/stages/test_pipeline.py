@@ -1,4 +1,4 @@
-"""How the stages of a scenario are laid out; nothing is run."""
+"""Tests of `experiments.pipeline.stages.pipeline`."""
 
 from experiments.pipeline.stages.pipeline import build_pipeline
 from experiments.scenario.settings import Simulation

@@ -1,4 +1,4 @@
-"""The smoother as a stage: what it is given, what it writes, and when it cannot."""
+"""Tests of `experiments.pipeline.stages.smooth`."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a run will need is estimated, and refused where the machine has less."""
+"""Tests of `experiments.pipeline.stages.memory`."""
 
 from pathlib import Path
 
