@@ -1,4 +1,4 @@
-"""Walls in plan: what stands where, which faces can be seen, how much room is left beside them."""
+"""Floor plan: walls in plan, their visible faces, and clearances beside them."""
 
 import itertools
 from dataclasses import dataclass
@@ -10,20 +10,20 @@ from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import require_finite, require_shape
 
-SHARPEST_CORNER_RAD = np.radians(30)  # below it the mitred outer edge runs off towards infinity
-BURIED_M = 0.001  # deeper in a wall than rounding puts a wall's own surface
+SHARPEST_CORNER_RAD = np.radians(30)  # sharper corners have a very long mitred outer edge
+BURIED_M = 0.001  # an end this deep in another wall is hidden; larger than rounding errors
 
 
 @dataclass(frozen=True)
 class Wall:
-    """An upright wall along a polyline; it is closed where the last point equals the first.
+    """Upright wall along a polyline, which is closed if the last point equals the first.
 
     Attributes:
-        points_m: (K, 2) middle line, K >= 2.
-        height_m: from the floor up.
-        thickness_m: half of it lies on either side of the line.
-        look: walls of one look, which have one shape, carry the same pictures; "": its own.
-        mirrored: whether it is the mirror image of the other walls of its look.
+        points_m: middle line, shape (K, 2), K >= 2.
+        height_m: height above the floor.
+        thickness_m: half of it lies on either side of the middle line.
+        look: walls of the same look have the same shape and textures; empty: textures of its own.
+        mirrored: True if it is the mirror image of the other walls of its look.
     """
 
     points_m: Float
@@ -45,35 +45,35 @@ class Wall:
         steps = np.diff(points, axis=0)
         if np.any(np.hypot(*steps.T) < self.thickness_m):
             raise InputError(
-                f"wall from {_place(points[0])}: a segment is shorter than the wall is thick"
+                f"wall from {format_point(points[0])}: a segment is shorter than the wall is thick"
             )
         pairs = np.concatenate([steps, steps[:1]]) if self.closed else steps
         headings = np.unwrap(np.arctan2(pairs[:, 1], pairs[:, 0]))
         if np.any(np.abs(np.diff(headings)) > np.pi - SHARPEST_CORNER_RAD):
             raise InputError(
-                f"wall from {_place(points[0])}: a corner is sharper than "
+                f"wall from {format_point(points[0])}: a corner is sharper than "
                 f"{np.degrees(SHARPEST_CORNER_RAD):.0f} degrees"
             )
 
     @property
     def closed(self) -> bool:
-        """Whether the polyline ends where it starts."""
+        """True if the polyline ends at its start."""
         return len(self.points_m) > 3 and bool(np.all(self.points_m[0] == self.points_m[-1]))
 
     def side(self, left: bool) -> Float:
-        """The wall's left or right edge in plan (K, 2), joined by mitres at the corners."""
+        """Return the left or right edge in plan, shape (K, 2), mitred at the corners."""
         points = self.points_m
         directions = np.diff(points, axis=0)
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         before = np.concatenate([directions[-1:] if self.closed else directions[:1], directions])
         after = np.concatenate([directions, directions[:1] if self.closed else directions[-1:]])
         normals = np.stack([-(before + after)[:, 1], (before + after)[:, 0]], -1)
-        # the mitre is longer than half the thickness by one over the cosine of half the turn
+        # mitre length: half the thickness over the cosine of half the turn
         normals *= 2 / np.sum(normals**2, axis=1, keepdims=True)
         return points + (0.5 if left else -0.5) * self.thickness_m * normals
 
     def outline(self) -> list[Float]:
-        """Where its faces stand, in plan: closed lines (n, 2), two of a wall that is closed."""
+        """Return the faces in plan: closed lines, shape (n, 2); two for a closed wall."""
         left, right = self.side(left=True), self.side(left=False)
         if self.closed:
             return [left, right]
@@ -82,13 +82,14 @@ class Wall:
 
 @dataclass(frozen=True)
 class Face:
-    """A flat rectangle of the world, seen from its front only.
+    """Flat rectangle of the world, visible from its front only.
 
     Attributes:
-        corners_m: (4, 3) counter-clockwise seen from the front, from the lower left.
+        corners_m: corners, shape (4, 3), counter-clockwise from the lower left, seen from the
+            front.
         kind: "wall", "floor" or "ceiling".
-        look: faces of one look carry the same picture; "": its own.
-        mirrored: whether it carries that picture left to right.
+        look: faces of the same look have the same texture; empty: a texture of its own.
+        mirrored: True if the texture is mirrored left to right.
     """
 
     corners_m: Float
@@ -98,20 +99,20 @@ class Face:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height."""
+        """Width and height of the face."""
         first, second, _, last = self.corners_m
         return float(np.linalg.norm(second - first)), float(np.linalg.norm(last - first))
 
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """Everything that stands still.
+    """Static world: walls, floor and ceiling.
 
-    The floor (and the ceiling) is the smallest upright rectangle around the walls' middle lines.
+    Floor and ceiling are the smallest axis-aligned rectangle around the walls' middle lines.
 
     Attributes:
-        walls: one or more.
-        ceiling: whether there is a ceiling, at the height of the highest wall.
+        walls: one or more walls.
+        ceiling: True if there is a ceiling, at the height of the highest wall.
     """
 
     walls: tuple[Wall, ...]
@@ -126,7 +127,7 @@ class FloorPlan:
 
     @property
     def extent_m(self) -> tuple[Float, Float]:
-        """Lowest and highest corner (2,), (2,) of the floor."""
+        """Lowest and highest corner of the floor, shape (2,) each."""
         points = np.concatenate([wall.points_m for wall in self.walls])
         return points.min(axis=0), points.max(axis=0)
 
@@ -136,7 +137,7 @@ class FloorPlan:
         return max(wall.height_m for wall in self.walls)
 
     def segments(self) -> tuple[Float, Float, Float, Float]:
-        """All walls' segments: starts (S, 2), ends (S, 2), thickness (S,), height (S,)."""
+        """Return all segments: starts (S, 2), ends (S, 2), thickness (S,) and height (S,)."""
         starts = np.concatenate([wall.points_m[:-1] for wall in self.walls])
         ends = np.concatenate([wall.points_m[1:] for wall in self.walls])
         counts = [len(wall.points_m) - 1 for wall in self.walls]
@@ -145,9 +146,9 @@ class FloorPlan:
         return starts, ends, thickness, height
 
     def clearance_m(self, points: ArrayLike) -> Float:
-        """Room (N,) between points (N, 2) and the nearest wall; negative inside a wall.
+        """Return the distances (N,) from points (N, 2) to the nearest wall, negative inside.
 
-        A wall's free end counts as rounded, so that little less room is reported than there is.
+        Free ends of walls count as rounded, so the result is slightly too small there.
         """
         points = np.asarray(points, dtype=np.float64)
         starts, ends, thickness, _ = self.segments()
@@ -155,7 +156,7 @@ class FloorPlan:
         return np.min(distance - thickness / 2, axis=1)
 
     def leg_clearance_m(self, start: ArrayLike, end: ArrayLike) -> float:
-        """Room between the straight leg from `start` to `end` (2,), (2,) and the nearest wall."""
+        """Return the distance between a leg from `start` to `end` and the nearest wall."""
         start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
         starts, ends, thickness, _ = self.segments()
         distance = np.min(
@@ -167,17 +168,40 @@ class FloorPlan:
             ],
             axis=0,
         )
-        distance[_cross(start, end, starts, ends)] = 0.0
+        # segments that properly cross the leg: the ends of each lie on both sides of the other
+        crosses = (_side(start, end, starts) * _side(start, end, ends) < 0) & (
+            _side(starts, ends, start) * _side(starts, ends, end) < 0
+        )
+        distance[crosses] = 0.0
         return float(np.min(distance - thickness / 2))
 
     def contains(self, points: ArrayLike) -> np.ndarray:
-        """Whether points (N, 2) lie on the floor."""
+        """Return a mask (N,): True for points (N, 2) on the floor."""
         low, high = self.extent_m
         return np.all((np.asarray(points) >= low) & (np.asarray(points) <= high), axis=-1)
 
     def faces(self) -> list[Face]:
-        """All faces a robot on the floor can see: walls, then floor, then ceiling."""
-        faces = [face for wall in self.walls for face in self._wall_faces(wall)]
+        """Return all faces that are visible inside: walls, then floor, then ceiling."""
+        faces = list[Face]()
+        for wall in self.walls:
+            left, right = wall.side(left=True), wall.side(left=False)
+            # the left side of a wall is the right side of its mirror image
+            on_left, on_right = ("right", "left") if wall.mirrored else ("left", "right")
+            # seen from the left side the wall runs from right to left
+            edges = [(f"{on_left} {i}", left[i + 1], left[i]) for i in range(len(left) - 1)]
+            edges += [(f"{on_right} {i}", right[i], right[i + 1]) for i in range(len(right) - 1)]
+            # faces beyond the floor's edge and ends inside another wall are never visible
+            edges = [edge for edge in edges if np.all(self.contains(np.stack(edge[1:])))]
+            if not wall.closed:
+                ends = [("first end", left[0], right[0]), ("last end", right[-1], left[-1])]
+                bare = [np.any(self.clearance_m(np.stack(end[1:])) > -BURIED_M) for end in ends]
+                edges += itertools.compress(ends, bare)
+            for name, start, end in edges:
+                corners = np.zeros((4, 3))
+                corners[:, :2] = [start, end, end, start]
+                corners[2:, 2] = wall.height_m
+                look = f"{wall.look} {name}" if wall.look else ""
+                faces.append(Face(corners, "wall", look, wall.mirrored))
         (x0, y0), (x1, y1) = self.extent_m
         plan = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
         faces.append(Face(np.column_stack([plan, np.zeros(4)]), "floor"))
@@ -188,34 +212,11 @@ class FloorPlan:
             )
         return faces
 
-    def _wall_faces(self, wall: Wall) -> list[Face]:
-        left, right = wall.side(left=True), wall.side(left=False)
-        # what is left of a wall is right of its mirror image
-        on_left, on_right = ("right", "left") if wall.mirrored else ("left", "right")
-        # seen from the left side the wall runs from right to left
-        edges = [(f"{on_left} {i}", left[i + 1], left[i]) for i in range(len(left) - 1)]
-        edges += [(f"{on_right} {i}", right[i], right[i + 1]) for i in range(len(right) - 1)]
-        # a face beyond the floor's edge shows to nobody, nor does an end buried in another wall
-        edges = [edge for edge in edges if np.all(self.contains(np.stack(edge[1:])))]
-        if not wall.closed:
-            ends = [("first end", left[0], right[0]), ("last end", right[-1], left[-1])]
-            bare = [np.any(self.clearance_m(np.stack(end[1:])) > -BURIED_M) for end in ends]
-            edges += itertools.compress(ends, bare)
-        return [_upright(start, end, wall, place) for place, start, end in edges]
-
-
-def _upright(start: Float, end: Float, wall: Wall, place: str) -> Face:
-    corners = np.zeros((4, 3))
-    corners[:, :2] = [start, end, end, start]
-    corners[2:, 2] = wall.height_m
-    look = f"{wall.look} {place}" if wall.look else ""
-    return Face(corners, "wall", look, wall.mirrored)
-
 
 def wall_shape(points_m: Float, mirrored: bool) -> Float:
-    """Lengths (m) and turns (rad) of a polyline (K, 2), from its first point on.
+    """Return lengths (m) and turns (rad) of a polyline (K, 2), from its first point on.
 
-    They are equal for polylines that are congruent; of a mirrored one turns change their sign.
+    Congruent polylines have equal values. Turns of a mirrored polyline change their sign.
     """
     steps = np.diff(points_m, axis=0)
     headings = np.arctan2(steps[:, 1], steps[:, 0])
@@ -224,24 +225,20 @@ def wall_shape(points_m: Float, mirrored: bool) -> Float:
 
 
 def segment_distance_m(points: Float, starts: Float, ends: Float) -> Float:
-    """Distances of points (..., 2) to segments (..., 2), broadcast."""
+    """Return the distances of points (..., 2) to segments (..., 2), broadcast."""
     along = ends - starts
     share = np.sum((points - starts) * along, -1) / np.maximum(np.sum(along**2, -1), 1e-300)
     nearest = starts + np.clip(share, 0, 1)[..., None] * along
     return np.linalg.norm(points - nearest, axis=-1)
 
 
-def _cross(start: Float, end: Float, starts: Float, ends: Float) -> np.ndarray:
-    """Whether the segment start-end properly crosses each of the segments (S,)."""
-
-    def side(a: Float, b: Float, c: Float) -> Float:
-        ab, ac = b - a, c - a
-        return np.sign(ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0])
-
-    return (side(start, end, starts) * side(start, end, ends) < 0) & (
-        side(starts, ends, start) * side(starts, ends, end) < 0
-    )
+def _side(a: Float, b: Float, c: Float) -> Float:
+    """Return the side of the line a-b on which c lies: 1 left, -1 right, 0 on the line."""
+    ab, ac = b - a, c - a
+    return np.sign(ab[..., 0] * ac[..., 1] - ab[..., 1] * ac[..., 0])
 
 
-def _place(point: Float) -> str:
-    return f"({point[0]:.2f}, {point[1]:.2f})"
+def format_point(point: ArrayLike) -> str:
+    """Return a point (2,) or pose (3,) as text `(x, y)` in metres."""
+    x, y = np.asarray(point)[:2]
+    return f"({x:.2f}, {y:.2f})"

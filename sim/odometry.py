@@ -1,4 +1,4 @@
-"""Odometry as a real P3-AT computes it: wheel encoders, a calibrated track, and noise."""
+"""Wheel odometry of a P3-AT: encoder increments, a calibrated effective track, and noise."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -13,22 +13,22 @@ from mapfusion.parameters import Range, require_finite, require_in_range, requir
 from sim.p3at import WHEEL_RADIUS_M, P3at
 from sim.world import World
 
-SPIN_WHEEL_RAD_S = 4.0  # a brisk turn, 1.7 rad/s; friction makes the track independent of it
+SPIN_WHEEL_RAD_S = 4.0  # turns at 1.7 rad/s; the effective track does not depend on it
 SPIN_UP_RAD = 1.0  # turned before the measurement begins
-SPIN_TURNS = 2  # whole turns, so that friction that depends on the heading averages out
+SPIN_TURNS = 2  # whole turns average out friction that depends on the heading
 STEPS_PER_READING = 8
 
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """What makes a robot's odometry drift; 0 switches a term off.
+    """Noise of a robot's odometry; 0 switches a term off.
 
     Attributes:
-        translation_m_per_sqrt_m: random walk along the way, per root metre driven.
+        translation_m_per_sqrt_m: random walk along the path, per root metre driven.
         yaw_rad_per_sqrt_m: random walk of the heading, per root metre driven.
         yaw_rad_per_sqrt_rad: random walk of the heading, per root radian turned.
-        scale_sigma: relative error of the wheels' radius, drawn once a robot.
-        track_sigma: relative error of the effective track, drawn once a robot.
+        scale_sigma: relative error of the wheel radius, drawn once per robot.
+        track_sigma: relative error of the effective track, drawn once per robot.
     """
 
     translation_m_per_sqrt_m: Annotated[float, Range(0, 10, "m/sqrt(m)")] = 0.02
@@ -43,10 +43,10 @@ class OdometryNoise:
 
 @cache
 def calibrated_track_m() -> float:
-    """Effective track of the turning robot, from a spin test on an empty floor.
+    """Return the effective track of the turning robot, from a spin test on an empty floor.
 
-    Turning skids: the body yaws less than the wheels would have it do on rails. As on the real
-    robot, two whole turns on the spot are compared with what the encoders read meanwhile.
+    A turning skid-steered robot yaws less than its wheels would turn it without slip. As on a real
+    robot, two whole turns in place are compared with the encoder readings.
     """
     with World() as world:
         world.start_physics()
@@ -59,7 +59,7 @@ def calibrated_track_m() -> float:
 
 
 def _spin(world: World, robot: P3at, until_rad: float) -> tuple[float, Float]:
-    """Step until the body has turned so far; returns what it has turned and the wheels' angles."""
+    """Step until the body has turned by an angle; return the turn and the wheel angles."""
     yaw_rad, last = 0.0, robot.pose()[2]
     while yaw_rad < until_rad:
         world.step(STEPS_PER_READING)
@@ -70,14 +70,14 @@ def _spin(world: World, robot: P3at, until_rad: float) -> tuple[float, Float]:
 
 
 def encoder_increments(wheel_rad: ArrayLike, effective_track_m: float) -> Float:
-    """Motion (T, 3) from frame to frame, in the robot frame of the frame before.
+    """Return the motion from frame to frame, in the robot frame of the previous frame.
 
     Args:
-        wheel_rad: (T, 2) left and right encoder angles.
+        wheel_rad: left and right encoder angles, shape (T, 2).
         effective_track_m: see `calibrated_track_m`.
 
     Returns:
-        Chords of the circular arcs that constant wheel speeds drive; the first row is zero.
+        Chords of the circular arcs of constant wheel speeds, shape (T, 3); the first row is zero.
     """
     wheel = np.asarray(wheel_rad, dtype=np.float64)
     require_shape("wheel_rad", wheel, (None, 2))
@@ -89,11 +89,11 @@ def encoder_increments(wheel_rad: ArrayLike, effective_track_m: float) -> Float:
 
 
 def add_noise(increments: ArrayLike, noise: OdometryNoise, rng: np.random.Generator) -> Float:
-    """Increments (T, 3) as a drifting robot measures them.
+    """Return increments (T, 3) with noise.
 
-    A wrong wheel radius scales distances and turns alike, a wrong track turns alone. The random
-    walks' variances grow with the distance driven and the angle turned, so they do not depend on
-    the frame rate.
+    An error of the wheel radius scales distances and turns, an error of the track scales turns
+    only. The variances of the random walks grow with distance and turn, so the noise does not
+    depend on the frame rate.
     """
     true = np.asarray(increments, dtype=np.float64)
     require_shape("increments", true, (None, 3))
@@ -107,5 +107,5 @@ def add_noise(increments: ArrayLike, noise: OdometryNoise, rng: np.random.Genera
     yaw_variance = noise.yaw_rad_per_sqrt_m**2 * distance + noise.yaw_rad_per_sqrt_rad**2 * turned
     yaw = true[:, 2] * scale / track + np.sqrt(yaw_variance) * walk[:, 0]
     along = distance * scale + noise.translation_m_per_sqrt_m * np.sqrt(distance) * walk[:, 1]
-    direction += (yaw - true[:, 2]) / 2  # a chord points half its arc's turn away from its start
+    direction += (yaw - true[:, 2]) / 2  # angle between a chord and the start of its arc
     return np.stack([along * np.cos(direction), along * np.sin(direction), yaw], -1)

@@ -1,4 +1,4 @@
-"""The Pioneer P3-AT: a body with four driven wheels, steered by skidding."""
+"""Pioneer P3-AT: a skid-steered robot with four driven wheels."""
 
 from pathlib import Path
 
@@ -14,16 +14,18 @@ TRACK_M = 0.394
 WHEELBASE_M = 0.268
 LENGTH_M = 0.508
 WIDTH_M = 0.497
-OUTER_RADIUS_M = float(np.hypot(LENGTH_M, WIDTH_M) / 2)  # the circle it sweeps turning in place
+OUTER_RADIUS_M = float(
+    np.hypot(LENGTH_M, WIDTH_M) / 2
+)  # radius of the circle swept in a turn in place
 TOP_SPEED_M_S = 0.7
 TOP_WHEEL_SPEED_RAD_S = 6.4
 WHEEL_TORQUE_N_M = 20.0
 TIRE_FRICTION = 0.5  # against a ground of friction 1: rubber on a smooth indoor floor
 CENTER_OF_MASS_M = 0.1735  # of the body without wheels, above the floor
 
-# A body turning at w on four sliding points: Coulomb friction opposes each one's slip
-# (v - w t / 2 along, w l / 2 across), and its moment vanishes where v = w (t / 2 + l^2 / (2 t)).
-# So the wheels act as if they stood this far apart (the maker's parameter files: 0.588 m).
+# Effective track in a turn. A body turns at rate w on four sliding points of track t and wheelbase
+# l. Coulomb friction opposes the slip of each point (v - w t / 2 along, w l / 2 across), and its
+# moment vanishes for v = w (t / 2 + l^2 / (2 t)). The maker's parameter files state 0.588 m.
 SKID_TRACK_M = TRACK_M + WHEELBASE_M**2 / TRACK_M
 BODY_B, NORMAL_FORCE = 2, 9  # fields of PyBullet's contact points
 Pose = tuple[float, float, float]  # T_world_robot: x_m, y_m, theta_rad
@@ -31,17 +33,17 @@ WHEELS = ("front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_righ
 
 
 class P3at:
-    """One robot in a world.
+    """Robot in a world.
 
     Attributes:
-        body: its id in the world.
+        body: id of its body in the world.
     """
 
     def __init__(
         self, world: World, T_world_robot: Float, tire_friction: float = TIRE_FRICTION
     ) -> None:
         self._p, self._client = world.bullet, world.client
-        # without the flag the URDF's inertias would be replaced by those of the collision shapes
+        # without the flag PyBullet replaces the URDF's inertias by those of the collision shapes
         self.body = self._p.loadURDF(
             str(URDF), flags=self._p.URDF_USE_INERTIA_FROM_FILE, physicsClientId=self._client
         )
@@ -55,7 +57,7 @@ class P3at:
             self._p.changeDynamics(
                 self.body, wheel, linearDamping=0, angularDamping=0, physicsClientId=self._client
             )
-            # in a call of its own: beside dampings PyBullet passes over the friction
+            # a separate call: PyBullet ignores the friction in a call that sets dampings
             self._p.changeDynamics(
                 self.body, wheel, lateralFriction=tire_friction, physicsClientId=self._client
             )
@@ -68,10 +70,10 @@ class P3at:
         self.drive(0.0, 0.0)
 
     def place(self, T_world_robot: Float, height_m: float = 0.0) -> None:
-        """Put it level at a pose (3,), or as it tilts at (4, 4), whatever the physics say."""
+        """Set the pose, shape (3,) for a level body, else (4, 4)."""
         T = np.asarray(T_world_robot)
         T = T if T.shape == (4, 4) else from_planar(T)
-        # the base's own frame lies in its centre of mass, so place that
+        # the origin of the base frame is the centre of mass
         self._p.resetBasePositionAndOrientation(
             self.body,
             T[:3, 3] + CENTER_OF_MASS_M * T[:3, 2] + [0.0, 0.0, height_m],
@@ -80,7 +82,7 @@ class P3at:
         )
 
     def drive(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Set the wheel motors' speeds; their torque is limited."""
+        """Set the target speeds of the wheel motors, whose torque is limited."""
         top = TOP_WHEEL_SPEED_RAD_S
         left, right = min(max(left_rad_s, -top), top), min(max(right_rad_s, -top), top)
         self._p.setJointMotorControlArray(
@@ -93,7 +95,7 @@ class P3at:
         )
 
     def pose(self) -> Pose:
-        """T_world_robot of the point on the floor below the middle of the wheels."""
+        """Return T_world_robot of the point on the floor below the centre of the wheels."""
         position, quaternion = self._p.getBasePositionAndOrientation(
             self.body, physicsClientId=self._client
         )
@@ -102,13 +104,13 @@ class P3at:
         return position[0], position[1], float(theta)
 
     def wheel_angles(self) -> Float:
-        """Encoders: left and right (2,) in radians since the start, mean of the side's wheels."""
+        """Return the left and right encoder angle since the start in radians, shape (2,)."""
         states = self._p.getJointStates(self.body, self._wheels, physicsClientId=self._client)
         angles = np.array([state[0] for state in states])
         return np.array([angles[:2].mean(), angles[2:].mean()])
 
     def touched_bodies(self) -> set[int]:
-        """Ids of all bodies that press against its body; its wheels meet nothing but the ground."""
+        """Return ids of all bodies that press against its body; wheels touch the ground only."""
         contacts = self._p.getContactPoints(
             bodyA=self.body, linkIndexA=-1, physicsClientId=self._client
         )

@@ -1,13 +1,14 @@
 """Generated floor plans, and routes through them that share ground.
 
-A wing is cut from the west end of the corridor to its east end into rooms, north and south. Every
-room has one or two doors to the corridor and one to each neighbour in its row; the doors between
-neighbours stand in line (an enfilade), so a row can be driven through straight. Wings have no door
-to each other and are closed all around: from one, nothing of another is ever seen.
+A wing has a corridor with a row of rooms to the north and one to the south. Every room has one or
+two doors to the corridor and one door to each neighbour in its row. The doors between neighbours
+are in line (an enfilade), so a robot can drive straight through a row. Wings are closed and have no
+doors to each other, so a camera in one wing never sees another wing.
 
-A loop leaves the corridor by one room's door, runs through the doors between the rooms of that row
-and comes back by another's: a rectangle whose legs cross every door in its middle. All robots drive
-the corridor in the same direction, as a camera that looks ahead sees a wall from one side only.
+A loop leaves the corridor through a door, runs through the doors between the rooms of that row and
+returns through another door: a rectangle whose legs cross every door in its middle. All robots
+drive along the corridor in the same direction, because a camera that looks ahead sees a wall from
+one side only.
 """
 
 import itertools
@@ -25,11 +26,11 @@ from sim.floorplan import segment_distance_m
 from sim.p3at import OUTER_RADIUS_M
 
 SOUTH, NORTH = 0, 1
-# A robot is up to the arrival tolerance (0.2 m) beside its leg, and turns on the spot: its outer
-# circle, that tolerance, and a hand's breadth to spare.
+# Room to turn in place: the outer circle, the arrival tolerance (0.2 m) by which a robot may be
+# beside its leg, and a margin of 0.1 m.
 CLEARANCE_M = OUTER_RADIUS_M + 0.2 + 0.1
 PIER_M = 0.3  # least wall between two doors, or between a door and a corner
-NARROWEST_DOOR_M = 1.2  # 0.25 m for half the body, 0.2 m beside the leg, 0.15 m to spare: twice
+NARROWEST_DOOR_M = 1.2  # twice: half the body 0.25 m, arrival tolerance 0.2 m, margin 0.15 m
 
 _ROOM_TO_TURN_M = round(2.5 * CLEARANCE_M, 2)
 _RoomSide = Annotated[float, Range(0.1, 50, "m")]
@@ -37,14 +38,15 @@ _RoomSide = Annotated[float, Range(0.1, 50, "m")]
 
 @dataclass(frozen=True)
 class PlanParameters:
-    """Sizes that rooms are drawn from.
+    """Ranges of the sizes of rooms, corridors and doors.
 
     Attributes:
-        rooms_a_side: rooms on each side of a wing's corridor.
-        doors_a_room: doors from each room to the corridor, 1 or 2; more doors, more ways to go.
-        room_width_m: along the corridor, smallest and largest.
-        room_depth_m: across it, smallest and largest.
-        corridor_m: its width; the robot turns in it.
+        rooms_a_side: number of rooms on each side of a wing's corridor.
+        doors_a_room: number of doors from each room to the corridor, 1 or 2; two doors allow more
+            loops.
+        room_width_m: smallest and largest size along the corridor.
+        room_depth_m: smallest and largest size across the corridor.
+        corridor_m: width of the corridor, in which the robot turns.
         door_m: width of every door.
     """
 
@@ -75,14 +77,14 @@ class PlanParameters:
 
 @dataclass(frozen=True)
 class Row:
-    """The rooms on one side of a corridor.
+    """Rooms on one side of a corridor.
 
     Attributes:
-        edges_m: (n + 1,) x of the walls between the rooms, from west to east.
-        doors_m: (n * doors a room,) x of the middles of the doors to the corridor, west to east.
+        edges_m: x of the walls between n rooms, from west to east, shape (n + 1,).
+        doors_m: x of the centres of the doors to the corridor, from west to east.
         corridor_wall_m: y of the wall on the corridor.
-        outer_wall_m: y of the wall opposite.
-        enfilade_m: y of the middle of the doors from room to room.
+        outer_wall_m: y of the opposite wall.
+        enfilade_m: y of the centres of the doors from room to room.
     """
 
     edges_m: Float
@@ -94,11 +96,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Wing:
-    """Two rows on one corridor.
+    """Two rows of rooms on one corridor.
 
     Attributes:
-        rows: the southern and the northern.
-        corridor_m: y of the corridor's middle.
+        rows: southern and northern row.
+        corridor_m: y of the centre line of the corridor.
     """
 
     rows: tuple[Row, Row]
@@ -107,11 +109,11 @@ class Wing:
 
 @dataclass(frozen=True)
 class GeneratedPlan:
-    """Wings side by side, and all walls as polylines (K, 2).
+    """Wings side by side, and their walls.
 
     Attributes:
-        wings: from west to east.
-        walls_m: what `sim.floorplan.Wall` takes.
+        wings: wings from west to east.
+        walls_m: all walls as polylines, shape (K, 2).
         door_m: width of every door.
     """
 
@@ -123,34 +125,54 @@ class GeneratedPlan:
 def generate_plan(
     parameters: PlanParameters, n_wings: int, rng: np.random.Generator
 ) -> GeneratedPlan:
-    """Draw a plan of wings that have no door to each other; the south-west corner is (0, 0)."""
+    """Draw a plan of wings without doors to each other; the south-west corner is (0, 0)."""
     depths = [float(rng.uniform(*parameters.room_depth_m)) for _ in (SOUTH, NORTH)]
-    levels = np.cumsum([0.0, depths[SOUTH], parameters.corridor_m, depths[NORTH]])
+    wall_y = np.cumsum([0.0, depths[SOUTH], parameters.corridor_m, depths[NORTH]])
     wings: list[Wing] = []
     west_m = 0.0
     for _ in range(n_wings):
-        wing = _wing(parameters, west_m, levels, rng)
+        wing = _draw_wing(parameters, west_m, wall_y, rng)
         wings.append(wing)
         west_m = float(wing.rows[SOUTH].edges_m[-1])
-    rounded = np.round(levels, 3)
-    walls = [_closed(0.0, 0.0, west_m, float(rounded[-1]))]
+    north_m = float(np.round(wall_y, 3)[-1])
+    outline = [[0.0, 0.0], [west_m, 0.0], [west_m, north_m], [0.0, north_m], [0.0, 0.0]]
+    walls, door_m = [np.array(outline)], parameters.door_m
     for i, wing in enumerate(wings):
-        walls += _wing_walls(wing, parameters.door_m, closes_east=i + 1 < n_wings)
-    return GeneratedPlan(tuple(wings), tuple(walls), parameters.door_m)
+        for row in wing.rows:
+            west, east, y = float(row.edges_m[0]), float(row.edges_m[-1]), row.corridor_wall_m
+            walls += _with_doors([west, y], [east, y], row.doors_m, door_m)
+            for x in row.edges_m[1:-1].tolist():
+                low, high = sorted([row.corridor_wall_m, row.outer_wall_m])
+                walls += _with_doors([x, low], [x, high], np.array([row.enfilade_m]), door_m)
+        if i + 1 < n_wings:  # wall to the next wing
+            x = float(wing.rows[SOUTH].edges_m[-1])
+            ends = [[x, wing.rows[side].outer_wall_m] for side in (SOUTH, NORTH)]
+            walls.append(np.array(ends))
+    return GeneratedPlan(tuple(wings), tuple(walls), door_m)
 
 
-def _wing(
-    parameters: PlanParameters, west_m: float, levels: Float, rng: np.random.Generator
+def _draw_wing(
+    parameters: PlanParameters, west_m: float, wall_y: Float, rng: np.random.Generator
 ) -> Wing:
+    """Draw rooms and doors of a wing whose walls along the corridor have y of `wall_y` (4,)."""
     low, high = parameters.room_width_m
-    length_m = round(float(rng.uniform(low, high, parameters.rooms_a_side).sum()), 3)
-    outer, inner = levels[[0, 3]].round(3), levels[[1, 2]].round(3)
+    n_rooms, n_doors = parameters.rooms_a_side, parameters.doors_a_room
+    length_m = round(float(rng.uniform(low, high, n_rooms).sum()), 3)
+    outer, inner = wall_y[[0, 3]].round(3), wall_y[[1, 2]].round(3)
+    beside, apart = parameters.beside_door_m, parameters.door_m + PIER_M
     rows = []
     for side in (SOUTH, NORTH):
-        edges = west_m + _split(length_m, parameters, rng)
-        doors = [_doors(a, b, parameters, rng) for a, b in itertools.pairwise(edges.tolist())]
+        # widths: the least width and a random share of the remaining length
+        least_m = parameters.room_width_m[0]
+        spare = (length_m - n_rooms * least_m) * rng.dirichlet(np.full(n_rooms, 2.0))
+        edges = west_m + np.concatenate([[0.0], np.cumsum(least_m + spare)])
+        # centres of each room's doors, with room beside and between them
+        doors = []
+        for west, east in itertools.pairwise(edges.tolist()):
+            spare_m = east - west - 2 * beside - (n_doors - 1) * apart
+            drawn = np.sort(rng.uniform(0, spare_m, n_doors))
+            doors.append(west + beside + drawn + apart * np.arange(n_doors))
         low, high = sorted([float(outer[side]), float(inner[side])])
-        beside = parameters.beside_door_m
         rows.append(
             Row(
                 edges.round(3),
@@ -163,42 +185,8 @@ def _wing(
     return Wing((rows[SOUTH], rows[NORTH]), round(float(inner.mean()), 3))
 
 
-def _doors(
-    west_m: float, east_m: float, parameters: PlanParameters, rng: np.random.Generator
-) -> Float:
-    """Middles of one room's doors to the corridor, from west to east."""
-    n, beside = parameters.doors_a_room, parameters.beside_door_m
-    apart = parameters.door_m + PIER_M
-    spare_m = east_m - west_m - 2 * beside - (n - 1) * apart
-    return west_m + beside + np.sort(rng.uniform(0, spare_m, n)) + apart * np.arange(n)
-
-
-def _split(length_m: float, parameters: PlanParameters, rng: np.random.Generator) -> Float:
-    """Edges (n + 1,) that cut a row of that length into rooms no narrower than allowed."""
-    n, least_m = parameters.rooms_a_side, parameters.room_width_m[0]
-    spare = (length_m - n * least_m) * rng.dirichlet(np.full(n, 2.0))
-    return np.concatenate([[0.0], np.cumsum(least_m + spare)])
-
-
-def _wing_walls(wing: Wing, door_m: float, closes_east: bool) -> list[Float]:
-    walls = []
-    for row in wing.rows:
-        west, east = float(row.edges_m[0]), float(row.edges_m[-1])
-        walls += _with_doors(
-            [west, row.corridor_wall_m], [east, row.corridor_wall_m], row.doors_m, door_m
-        )
-        for x in row.edges_m[1:-1].tolist():
-            low, high = sorted([row.corridor_wall_m, row.outer_wall_m])
-            walls += _with_doors([x, low], [x, high], np.array([row.enfilade_m]), door_m)
-    if closes_east:
-        x = float(wing.rows[SOUTH].edges_m[-1])
-        ends = [[x, wing.rows[side].outer_wall_m] for side in (SOUTH, NORTH)]
-        walls.append(np.array(ends))
-    return walls
-
-
 def _with_doors(start: list[float], end: list[float], doors_m: Float, door_m: float) -> list[Float]:
-    """A wall along x or y with gaps around the places `doors_m` on that axis."""
+    """Return a wall along x or y with gaps around the positions `doors_m` on that axis."""
     axis = 0 if start[1] == end[1] else 1
     cuts = np.sort(np.concatenate([doors_m - door_m / 2, doors_m + door_m / 2]))
     places = np.concatenate([[start[axis]], cuts, [end[axis]]]).round(3).reshape(-1, 2)
@@ -210,30 +198,26 @@ def _with_doors(start: list[float], end: list[float], doors_m: Float, door_m: fl
     return pieces
 
 
-def _closed(x0: float, y0: float, x1: float, y1: float) -> Float:
-    return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
-
-
-GROUND_HALF_WIDTH_M = 0.5  # ground this far beside a path counts as visited: about the robot's body
-CELL_M = 0.1  # the ground is counted in squares of this side
-# Between two starts: farther than a robot gives way (1.6 m), with what the start jitter may take.
+GROUND_HALF_WIDTH_M = 0.5  # half width of the visited ground: about that of the robot
+CELL_M = 0.1  # grid cell of visited ground
+# Least distance between two starts: the distance to give way (1.6 m) and the start jitter.
 START_GAP_M = 1.9
-MOST_PLANS = 20  # drawn until one offers the overlap asked for
-NEAR_ENOUGH = 0.03  # of the overlap asked for: drawing stops
-TOLERANCE = 0.13  # of the overlap asked for: farther off is refused (half the gap below 1)
+MOST_PLANS = 20  # most plans drawn for a requested overlap
+NEAR_ENOUGH = 0.03  # error of the overlap at which drawing stops
+TOLERANCE = 0.13  # largest accepted error of the overlap (half the gap below 1)
 MOST_CHOICES = 3000  # sets of loops compared in one plan
-MOST_LISTED = 200_000  # sets of loops that are listed to draw from; of more, any are drawn
+MOST_LISTED = 200_000  # sets of loops that are enumerated; more sets are sampled
 
 _LoopLength = Annotated[float, Range(0.1, 1000, "m")]
 
 
 @dataclass(frozen=True)
 class RouteParameters:
-    """What the robots' routes are to be.
+    """Requirements on the robots' routes.
 
     Attributes:
-        robots: how many, each with a loop of its own.
-        overlap: share of the ground visited by two robots that both visit (mean over pairs).
+        robots: number of robots, each with a loop of its own.
+        overlap: intersection over union of the ground visited by two robots, mean over pairs.
         loop_m: shortest and longest loop.
     """
 
@@ -251,11 +235,11 @@ class RouteParameters:
 
 @dataclass(frozen=True)
 class PlannedRoute:
-    """One robot's loop.
+    """Loop of one robot.
 
     Attributes:
-        T_world_start: (3,) on the loop, looking along it.
-        waypoints_m: (K, 2) visited in order, over and over; the last leg leads to the start's.
+        T_world_start: start pose on the loop, looking along it, shape (3,).
+        waypoints_m: waypoints in order, shape (K, 2); the last leg returns to the start.
     """
 
     T_world_start: Float
@@ -264,12 +248,12 @@ class PlannedRoute:
 
 @dataclass(frozen=True)
 class GeneratedWorld:
-    """A plan with routes.
+    """Plan with routes.
 
     Attributes:
         plan: rooms, doors and walls.
-        routes: one a robot.
-        overlap: achieved, see `ground_overlap`; mean over the pairs of robots.
+        routes: one route per robot.
+        overlap: achieved overlap, see `ground_overlap`; mean over the pairs of robots.
     """
 
     plan: GeneratedPlan
@@ -280,30 +264,30 @@ class GeneratedWorld:
 def generate_world(
     plan_parameters: PlanParameters, parameters: RouteParameters, rng: np.random.Generator
 ) -> GeneratedWorld:
-    """Draw plans and choose loops in them until the overlap is the one asked for.
+    """Draw plans and choose loops in them until the overlap is as requested.
 
-    Without overlap every robot has a wing of its own, so that no wall is common either.
+    For an overlap of 0 every robot has a wing of its own, so the robots share no wall either.
 
     Raises:
-        InputError: no loops of that length, or none with an overlap near what was asked.
+        InputError: there are no loops of that length, or none with an overlap near the request.
     """
     best: GeneratedWorld | None = None
-    apart = parameters.overlap == 0
+    n_wings = parameters.robots if parameters.overlap == 0 else 1
     for child in rng.spawn(MOST_PLANS):
-        plan = generate_plan(plan_parameters, parameters.robots if apart else 1, child)
+        plan = generate_plan(plan_parameters, n_wings, child)
         found = _best_routes(plan, parameters, child)
         if found is None:
             continue
-        if best is None or _miss(found, parameters) < _miss(best, parameters):
+        if best is None or _overlap_error(found, parameters) < _overlap_error(best, parameters):
             best = found
-        if _miss(best, parameters) <= NEAR_ENOUGH:
+        if _overlap_error(best, parameters) <= NEAR_ENOUGH:
             break
     if best is None:
         raise InputError(
             f"loop_m: no loop of {parameters.loop_m[0]:g} to {parameters.loop_m[1]:g} m in "
             f"{MOST_PLANS} plans; change loop_m, rooms_a_side or the sizes of the rooms"
         )
-    if _miss(best, parameters) > TOLERANCE:
+    if _overlap_error(best, parameters) > TOLERANCE:
         raise InputError(
             f"overlap: {parameters.overlap:g} cannot be had with loops of {parameters.loop_m[0]:g} "
             f"to {parameters.loop_m[1]:g} m in such rooms, the nearest is {best.overlap:.2f}; "
@@ -312,41 +296,52 @@ def generate_world(
     return best
 
 
-def _miss(world: GeneratedWorld, parameters: RouteParameters) -> float:
+def _overlap_error(world: GeneratedWorld, parameters: RouteParameters) -> float:
     return abs(world.overlap - parameters.overlap)
 
 
 def _best_routes(
     plan: GeneratedPlan, parameters: RouteParameters, rng: np.random.Generator
 ) -> GeneratedWorld | None:
-    """The loops whose overlap comes nearest, in a random order among equals."""
+    """Return the loops with the overlap nearest to the request; None without loops.
+
+    Equal sets of loops are in random order.
+    """
     westward = bool(rng.integers(2))
     per_wing = [_loops(wing, parameters, westward) for wing in plan.wings]
     if not all(per_wing):
         return None
     offered = per_wing if len(per_wing) > 1 else per_wing * parameters.robots
-    choices = _choices([len(loops) for loops in offered], rng)
-    shared = _pairwise([np.concatenate([loop, loop[:1]]) for loops in per_wing for loop in loops])
+    choices = _draw_choices([len(loops) for loops in offered], rng)
+    shared = _pairwise_overlap(
+        [np.concatenate([loop, loop[:1]]) for loops in per_wing for loop in loops]
+    )
     first = (
         np.cumsum([0, *map(len, per_wing)]) if len(per_wing) > 1 else np.zeros(len(offered), int)
     )
     best, best_miss = None, np.inf
-    overlaps = _mean_pair(shared, choices + first[: len(offered)])
+    # overlap of each choice: the mean over its pairs of robots, 1 for a single robot
+    rows = choices + first[: len(offered)]
+    pairs = [
+        shared[rows[:, a], rows[:, b]] for a, b in itertools.combinations(range(rows.shape[1]), 2)
+    ]
+    overlaps = np.mean(pairs, axis=0) if pairs else np.ones(len(rows))
     for choice, overlap in zip(choices.tolist(), overlaps.tolist(), strict=True):
         if abs(overlap - parameters.overlap) < best_miss:
-            starts = _starts([loops[i] for loops, i in zip(offered, choice, strict=True)], rng)
-            if starts is not None:
+            chosen = [loops[i] for loops, i in zip(offered, choice, strict=True)]
+            routes = _draw_starts(chosen, rng)
+            if routes is not None:
                 best_miss = abs(overlap - parameters.overlap)
-                best = GeneratedWorld(plan, starts, overlap)
+                best = GeneratedWorld(plan, routes, overlap)
     return best
 
 
-def _choices(n_offered: list[int], rng: np.random.Generator) -> np.ndarray:
-    """Which loop each robot takes: sets (C, R), MOST_CHOICES of all there are at most."""
+def _draw_choices(n_offered: list[int], rng: np.random.Generator) -> np.ndarray:
+    """Return loop indices of each robot, shape (C, R), with at most MOST_CHOICES rows."""
     if math.prod(n_offered) > MOST_LISTED:
         shape = MOST_CHOICES, len(n_offered)
         drawn = rng.integers(n_offered, size=shape)
-        # robots share some of the loops drawn, or all have one: any overlap is among such sets
+        # robots share some of the drawn loops, so the sets cover the range of overlaps
         n_taken = rng.integers(1, len(n_offered), size=MOST_CHOICES, endpoint=True)
         taken = rng.integers(n_taken[:, None], size=shape)
         return np.take_along_axis(drawn, taken, axis=1) % n_offered
@@ -354,16 +349,8 @@ def _choices(n_offered: list[int], rng: np.random.Generator) -> np.ndarray:
     return choices[rng.permutation(len(choices))[:MOST_CHOICES]]
 
 
-def _mean_pair(shared: Float, rows: np.ndarray) -> Float:
-    """Overlap (C,) of sets of paths (C, R): the mean over the pairs in a set, 1 without any."""
-    pairs = [
-        shared[rows[:, a], rows[:, b]] for a, b in itertools.combinations(range(rows.shape[1]), 2)
-    ]
-    return np.mean(pairs, axis=0) if pairs else np.ones(len(rows))
-
-
 def _loops(wing: Wing, parameters: RouteParameters, westward: bool) -> list[Float]:
-    """All loops (4, 2) of allowed length, from the corridor to the corridor."""
+    """Return all loops (4, 2) of allowed length through a row of a wing and its corridor."""
     loops = []
     for row in wing.rows:
         for west, east in itertools.combinations(row.doors_m.tolist(), 2):
@@ -382,12 +369,14 @@ def _loops(wing: Wing, parameters: RouteParameters, westward: bool) -> list[Floa
 
 
 def length_m(loop: Float) -> float:
-    """Length of a closed polyline (K, 2)."""
+    """Return the length of a closed polyline (K, 2)."""
     return float(np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1).sum())
 
 
-def _starts(loops: Sequence[Float], rng: np.random.Generator) -> tuple[PlannedRoute, ...] | None:
-    """Starts at random in the middle of legs; None where they cannot be apart from each other."""
+def _draw_starts(
+    loops: Sequence[Float], rng: np.random.Generator
+) -> tuple[PlannedRoute, ...] | None:
+    """Draw starts in the middle of legs; return None if some would be too near to each other."""
     taken: list[Float] = []
     routes = []
     for loop in loops:
@@ -409,39 +398,36 @@ def _starts(loops: Sequence[Float], rng: np.random.Generator) -> tuple[PlannedRo
 
 
 def ground_overlap(path_a_m: Float, path_b_m: Float) -> float:
-    """Ground that two paths (N, 2), (M, 2) both cover over the ground that either covers."""
-    return float(_pairwise([path_a_m, path_b_m])[0, 1])
+    """Return intersection over union of the ground along two paths, shape (N, 2) and (M, 2)."""
+    return float(_pairwise_overlap([path_a_m, path_b_m])[0, 1])
 
 
-def _pairwise(paths: Sequence[Float]) -> Float:
-    """`ground_overlap` of all pairs (P, P)."""
-    # Here, so that a command that draws no routes does not pay for it.
+def _pairwise_overlap(paths: Sequence[Float]) -> Float:
+    """Return `ground_overlap` of all pairs of paths, shape (P, P)."""
+    # imported here, because most commands draw no routes
     from scipy.sparse import csr_array
 
     points = np.concatenate(paths)
     low, high = points.min(axis=0) - GROUND_HALF_WIDTH_M, points.max(axis=0) + GROUND_HALF_WIDTH_M
     x, y = (np.arange(low[i] + CELL_M / 2, high[i], CELL_M) for i in (0, 1))
-    visited = [_visited(x, y, path) for path in paths]
+    # cells whose centres lie near a path, ascending
+    visited, reach_m = list[np.ndarray](), GROUND_HALF_WIDTH_M + CELL_M
+    for path in paths:
+        near_legs = []
+        for start, end in itertools.pairwise(path):
+            first, last = np.minimum(start, end) - reach_m, np.maximum(start, end) + reach_m
+            columns = np.arange(*np.searchsorted(x, [first[0], last[0]]))
+            rows = np.arange(*np.searchsorted(y, [first[1], last[1]]))
+            column, row = (index.ravel() for index in np.meshgrid(columns, rows))
+            centres = np.stack([x[column], y[row]], -1)
+            near = segment_distance_m(centres, start, end) <= GROUND_HALF_WIDTH_M
+            near_legs.append((row * len(x) + column)[near])
+        visited.append(np.unique(np.concatenate(near_legs)))
     size = np.array([len(cells) for cells in visited])
     starts = np.concatenate([[0], np.cumsum(size)])
-    # a path visits some thousandths of a large building, so the table is kept sparse
+    # sparse, because a path visits a small part of a large building
     table = csr_array(
         (np.ones(starts[-1]), np.concatenate(visited), starts), shape=(len(paths), len(x) * len(y))
     )
     both = (table @ table.T).toarray()
     return both / (size[:, None] + size - both)
-
-
-def _visited(x: Float, y: Float, path_m: Float) -> np.ndarray:
-    """Cells of a grid, ascending, whose middles lie near a path (N, 2)."""
-    visited = []
-    reach_m = GROUND_HALF_WIDTH_M + CELL_M
-    for start, end in itertools.pairwise(path_m):
-        low, high = np.minimum(start, end) - reach_m, np.maximum(start, end) + reach_m
-        across = np.arange(*np.searchsorted(x, [low[0], high[0]]))
-        along = np.arange(*np.searchsorted(y, [low[1], high[1]]))
-        column, row = (index.ravel() for index in np.meshgrid(across, along))
-        cells = np.stack([x[column], y[row]], -1)
-        near = segment_distance_m(cells, start, end) <= GROUND_HALF_WIDTH_M
-        visited.append((row * len(x) + column)[near])
-    return np.unique(np.concatenate(visited))

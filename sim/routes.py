@@ -1,12 +1,12 @@
 """Routes of the robots: checks of free space, and right of way between robots.
 
-Robots follow their routes and stop for each other, so two that meet head-on in a door would stand
-there for ever. `sim.driver` then drives anew from the start, with one more constraint: a robot of
-the circle holds on its way, before it comes into the way of the others, until these have passed.
-This is repeated for each further circle, as conflict-based search does for planned paths (Sharon,
-Stern, Felner and Sturtevant, 2015, Artificial Intelligence 219); the drive itself tells the
-conflicts. Of a circle the robot that is listed last holds if its way so far has a place for that,
-else the one listed before it, and so on.
+Robots follow their routes and stop for each other, so two robots that meet head-on in a door are
+deadlocked. `sim.driver` then drives again from the start with one more constraint, a hold: one of
+the deadlocked robots waits on its way, before it blocks the others, until these have passed. Each
+further deadlock adds a hold, as conflict-based search does for planned paths (Sharon, Stern, Felner
+and Sturtevant, 2015, Artificial Intelligence 219); here the conflicts are found by driving. The
+robot that is listed last holds if its past way has a suitable position, else the one listed before
+it, and so on.
 """
 
 import itertools
@@ -16,25 +16,24 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import require_finite, require_shape
-from sim.floorplan import FloorPlan, segment_distance_m
+from sim.floorplan import FloorPlan, format_point, segment_distance_m
 from sim.p3at import OUTER_RADIUS_M, TIRE_FRICTION, WIDTH_M, Pose
 
 
 @dataclass(frozen=True)
 class Route:
-    """Where a robot starts and what it is to visit.
+    """Start and waypoints of one robot.
 
     Attributes:
         robot: its name.
-        T_world_start: (3,).
-        waypoints_m: (K, 2), visited in order.
-        loop: whether it begins again with the first waypoint after the last; else it stands still.
-        tire_friction: of the robot's wheels against the ground; low, and they slip.
+        T_world_start: start pose, shape (3,).
+        waypoints_m: waypoints in order, shape (K, 2).
+        loop: True if the first waypoint follows the last one; else the robot stops there.
+        tire_friction: friction of the wheels against the ground; wheels slip if it is low.
     """
 
     robot: str
@@ -58,29 +57,30 @@ class Route:
 
 
 def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
-    """Refuse routes that cannot be driven; raises InputError that names robot and place."""
+    """Raise InputError, naming robot and position, if a route cannot be driven."""
     names = [route.robot for route in routes]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"robot {name}: two robots have this name")
     for route in routes:
-        _check_route(plan, route)
+        _check_free_space(plan, route)
     for i, first in enumerate(routes):
         for second in routes[i + 1 :]:
             gap = np.hypot(*(first.T_world_start - second.T_world_start)[:2])
             if gap < 2 * OUTER_RADIUS_M:
                 raise InputError(
                     f"robots {first.robot} and {second.robot}: they start {gap:.2f} m apart, "
-                    f"at {place(first.T_world_start)}; {2 * OUTER_RADIUS_M:.2f} m are needed"
+                    f"at {format_point(first.T_world_start)}; {2 * OUTER_RADIUS_M:.2f} m are needed"
                 )
 
 
-def _check_route(plan: FloorPlan, route: Route) -> None:
+def _check_free_space(plan: FloorPlan, route: Route) -> None:
+    """Raise InputError if a robot has not enough room at its waypoints or between them."""
     points = np.concatenate([route.T_world_start[None, :2], route.waypoints_m])
     labels = ["start", *(f"waypoint {i}" for i in range(1, len(points)))]
     on_floor, clearance = plan.contains(points), plan.clearance_m(points)
     for label, point, inside, room in zip(labels, points, on_floor, clearance, strict=True):
-        where = f"robot {route.robot}: {label} {place(point)}"
+        where = f"robot {route.robot}: {label} {format_point(point)}"
         if not inside:
             raise InputError(f"{where} lies outside the world")
         if room < 0:
@@ -94,8 +94,8 @@ def _check_route(plan: FloorPlan, route: Route) -> None:
     for start, end in zip(starts, ends, strict=True):
         room = plan.leg_clearance_m(points[start], points[end])
         where = (
-            f"robot {route.robot}: the way from {labels[start]} {place(points[start])} "
-            f"to {labels[end]} {place(points[end])}"
+            f"robot {route.robot}: the way from {labels[start]} {format_point(points[start])} "
+            f"to {labels[end]} {format_point(points[end])}"
         )
         if room < 0:
             raise InputError(f"{where} leads through a wall")
@@ -105,21 +105,15 @@ def _check_route(plan: FloorPlan, route: Route) -> None:
             )
 
 
-def place(point: ArrayLike) -> str:
-    """A point (2,) or pose (3,) as people read it: `(x, y)` in metres."""
-    x, y = np.asarray(point)[:2]
-    return f"({x:.2f}, {y:.2f})"
-
-
-# An earlier place to hold at is so far before the one that was tried: less changes nothing.
+# Least distance between two tried positions of a hold; a smaller step has no effect.
 _STEP_BACK_M = 0.25
-# Nearer than this to the way of another robot, one that holds would be touched by its circle.
+# Least distance of a holding robot from another robot's way: their circles must not touch.
 _LEAST_CLEARANCE_M = 2 * OUTER_RADIUS_M
-_MOST_LEGS = 8  # of a way that leads past the others; a rectangle's loop has four
+_MOST_LEGS = 8  # legs of a way past the other robots; a rectangular loop has four
 
 
 class Progress(NamedTuple):
-    """Progress of a robot: waypoints visited since the start, and minus the metres to go."""
+    """Progress of a robot: visited waypoints, and the negated distance to the next waypoint."""
 
     visited: int
     minus_left_m: float
@@ -129,9 +123,10 @@ class Passage(NamedTuple):
     """Condition that a holding robot waits for.
 
     Attributes:
-        robot: the one that is to pass, by its place in the list.
-        beyond: where it stood when all waited for each other; it has passed once it is farther.
-        from_m: (x, y) where the holding robot stood then; and once it is away from there.
+        robot: index of the robot that has to pass.
+        beyond: its progress in the deadlock; a robot with more progress has passed.
+        from_m: position (x, y) of the holding robot in the deadlock; a robot that has passed is
+            also away from it.
     """
 
     robot: int
@@ -140,12 +135,12 @@ class Passage(NamedTuple):
 
 
 class Hold(NamedTuple):
-    """A robot stands from a place on its way on until others have passed.
+    """Constraint: a robot stands at a position on its way until others have passed.
 
     Attributes:
-        robot: by its place in the list.
-        at: from there on.
-        passages: of the others.
+        robot: index of the robot.
+        at: its progress at the position.
+        passages: one per robot that has to pass.
     """
 
     robot: int
@@ -154,13 +149,13 @@ class Hold(NamedTuple):
 
 
 @dataclass
-class Driven:
-    """Record of one robot's drive so far, frame by frame.
+class DriveRecord:
+    """Record of one robot's drive, frame by frame.
 
     Attributes:
-        position_m: (x, y).
-        progress: how far it had come.
-        stopping_m: how far it would have rolled on if told to stop.
+        position_m: positions (x, y).
+        progress: progress along the route.
+        stopping_m: stopping distances.
     """
 
     position_m: list[tuple[float, float]] = field(default_factory=list)
@@ -174,8 +169,8 @@ class Driven:
         self.stopping_m.append(stopping_m)
 
 
-class Holding:
-    """A hold as one drive keeps it: once begun it lasts until all have passed, and only once."""
+class ActiveHold:
+    """State of a hold during one drive; it begins once and ends when all robots have passed."""
 
     def __init__(self, hold: Hold) -> None:
         self._hold, self._to_pass, self._begun = hold, list(hold.passages), False
@@ -183,10 +178,10 @@ class Holding:
     def waits_for(
         self, came: Sequence[Progress], now: Sequence[Pose], clearance_m: float
     ) -> set[int]:
-        """The robots that it has its own wait for, given how far all have come and where they are.
+        """Return the robots that the hold waits for, given progress and pose of all robots.
 
-        One has passed that is farther than it stood in the circle, and away from where the holding
-        robot stood.
+        A robot has passed if its progress is above that in the deadlock, and if it is away from the
+        position of the holding robot in the deadlock.
         """
         self._to_pass = [
             each
@@ -198,105 +193,88 @@ class Holding:
         return {each.robot for each in self._to_pass} if self._begun else set()
 
 
-def circle_among(waits_for: Mapping[int, Iterable[int]]) -> tuple[int, ...]:
-    """The robots of a circle in which each waits for the next, sorted; empty if there is none.
+def find_deadlock(waits_for: Mapping[int, Iterable[int]]) -> tuple[int, ...]:
+    """Return the robots of a cycle in the wait-for graph, sorted; empty without a cycle.
 
     Args:
-        waits_for: by robot, those that it waits for, of which each alone keeps it from going on.
+        waits_for: robots that block each robot.
     """
     done: set[int] = set()
     for first in waits_for:
         path: list[int] = []
-        if found := _circle_from(first, waits_for, path, done):
+        if found := _find_cycle(first, waits_for, path, done):
             return tuple(sorted(found))
     return ()
 
 
-def _circle_from(
+def _find_cycle(
     robot: int, waits_for: Mapping[int, Iterable[int]], path: list[int], done: set[int]
 ) -> Sequence[int]:
-    """Depth-first search: a robot that is on the path already closes a circle."""
+    """Return a cycle reached from a robot by depth-first search; empty without a cycle."""
     if robot in path:
         return path[path.index(robot) :]
     if robot in done:
         return ()
     path.append(robot)
     for other in waits_for.get(robot, ()):
-        if found := _circle_from(other, waits_for, path, done):
+        if found := _find_cycle(other, waits_for, path, done):
             return found
     path.pop()
     done.add(robot)
     return ()
 
 
-def hold_for(
-    circle: Sequence[int],
-    driven: Sequence[Driven],
+def resolve_deadlock(
+    deadlock: Sequence[int],
+    records: Sequence[DriveRecord],
     ahead_m: Sequence[Iterable[Float]],
     clearance_m: float,
     known: Iterable[Hold] = (),
 ) -> Hold | None:
-    """Find a hold with which a circle does not come about; None if no robot has a place for it.
+    """Return a hold that avoids a deadlock; None if no robot has a suitable position.
 
     Args:
-        circle: the robots in it, sorted.
-        driven: by robot, until they stood there.
-        ahead_m: by robot, the waypoints (2,) that it would visit next.
-        clearance_m: from the others' ways; a robot that stands so far off is in nobody's way.
-        known: holds with which the circle came about. Of those found for it before, the place is
-            to be an earlier one.
+        deadlock: the robots in it, sorted.
+        records: drives of all robots up to the deadlock.
+        ahead_m: next waypoints of each robot, shape (2,) each.
+        clearance_m: distance to the ways of other robots at which a robot does not block them.
+        known: holds of the present drive. A new hold for the same deadlock is at an earlier
+            position than the known ones.
     """
-    ways = {k: _way_past(k, circle, driven, ahead_m[k], clearance_m) for k in circle}
-    for robot in sorted(circle, reverse=True):
-        from_m = driven[robot].position_m[-1]
-        others = [k for k in circle if k != robot]
-        passages = tuple(Passage(k, driven[k].progress[-1], from_m) for k in others)
-        tried = [each.at for each in known if _is_of(each, robot, passages)]
-        legs = np.concatenate([ways[k] for k in others])
-        at = _place(driven[robot], legs, clearance_m, tried)
-        if at is not None:
-            return Hold(robot, at, passages)
+    # legs (L, 2, 2) that each robot drives next, until it is away from the others
+    legs_m = {}
+    for robot in deadlock:
+        others_m = np.array([records[k].position_m[-1] for k in deadlock if k != robot])
+        points = [np.array(records[robot].position_m[-1])]
+        for waypoint in itertools.islice(ahead_m[robot], _MOST_LEGS):
+            points.append(waypoint)
+            if np.linalg.norm(others_m - waypoint, axis=1).min() > 2 * clearance_m:
+                break
+        legs_m[robot] = np.stack([points[:-1], points[1:]], axis=1)
+    for robot in sorted(deadlock, reverse=True):
+        driven = records[robot]
+        others = [k for k in deadlock if k != robot]
+        passages = tuple(Passage(k, records[k].progress[-1], driven.position_m[-1]) for k in others)
+        # free distance at each past position, without the stopping distance
+        legs = np.concatenate([legs_m[k] for k in others])
+        positions = np.array(driven.position_m)[:, None]
+        distance_m = segment_distance_m(positions, legs[:, 0], legs[:, 1]).min(axis=1)
+        free_m = distance_m - np.array(driven.stopping_m)
+        # only positions before the known holds of the same deadlock
+        for hold in known:
+            if hold.robot != robot or _next_waypoints(hold.passages) != _next_waypoints(passages):
+                continue
+            latest = hold.at._replace(minus_left_m=hold.at.minus_left_m - _STEP_BACK_M)
+            earlier = [own < latest for own in driven.progress]
+            free_m = np.where(earlier, free_m, -np.inf)
+        # the last clear position, else the clearest one
+        clear = np.flatnonzero(free_m >= clearance_m)
+        k = int(clear[-1]) if len(clear) else int(free_m.argmax())
+        if free_m[k] >= _LEAST_CLEARANCE_M:
+            return Hold(robot, driven.progress[k], passages)
     return None
 
 
-def _is_of(hold: Hold, robot: int, passages: tuple[Passage, ...]) -> bool:
-    """Return True if a hold is of the same circle: robots on the way to the same waypoints."""
-    asked, found = (
-        {(p.robot, p.beyond.visited) for p in each} for each in (passages, hold.passages)
-    )
-    return hold.robot == robot and asked == found
-
-
-def _way_past(
-    robot: int,
-    circle: Sequence[int],
-    driven: Sequence[Driven],
-    ahead_m: Iterable[Float],
-    clearance_m: float,
-) -> Float:
-    """Legs (L, 2, 2) that a robot would drive next, until it is away from the others."""
-    others = np.array([driven[k].position_m[-1] for k in circle if k != robot])
-    points = [np.array(driven[robot].position_m[-1])]
-    for waypoint in itertools.islice(ahead_m, _MOST_LEGS):
-        points.append(waypoint)
-        if np.linalg.norm(others - waypoint, axis=1).min() > 2 * clearance_m:
-            break
-    return np.stack([points[:-1], points[1:]], axis=1)
-
-
-def _place(
-    driven: Driven, legs_m: Float, clearance_m: float, tried: Sequence[Progress]
-) -> Progress | None:
-    """The last place before `tried` that is clear of legs (L, 2, 2); else the one most so."""
-    there = np.array(driven.position_m)[:, None]
-    distance_m = segment_distance_m(there, legs_m[:, 0], legs_m[:, 1]).min(axis=1)
-    free_m = distance_m - np.array(driven.stopping_m)
-    for at in tried:
-        earlier = [
-            own < at._replace(minus_left_m=at.minus_left_m - _STEP_BACK_M)
-            for own in driven.progress
-        ]
-        free_m = np.where(earlier, free_m, -np.inf)
-    clear = np.flatnonzero(free_m >= clearance_m)
-    k = int(clear[-1]) if len(clear) else int(free_m.argmax())
-    return driven.progress[k] if free_m[k] >= _LEAST_CLEARANCE_M else None
+def _next_waypoints(passages: Iterable[Passage]) -> set[tuple[int, int]]:
+    """Return robots and their next waypoints, which identify a deadlock."""
+    return {(each.robot, each.beyond.visited) for each in passages}

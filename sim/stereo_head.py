@@ -1,9 +1,8 @@
 """Stereo head: rectified pinhole cameras, their exposure and noise, and depth images.
 
-A picture takes as many normal numbers as it has pixels, and to draw them takes longer than to draw
-the picture. Sixteen random bits a pixel choose one of the equally likely values of a table instead:
-it ends at 4.3 standard deviations, and between them differs from the normal law by less than
-pixels are rounded.
+Image noise needs a normal number per pixel, which takes longer than rendering. Instead 16 random
+bits per pixel select one of the equally likely values of a table. The table ends at 4.3 standard
+deviations; within these its error is below the rounding of pixels.
 """
 
 import functools
@@ -28,11 +27,11 @@ class RadiometricNoise:
 
     Attributes:
         sigma_gray: standard deviation of each pixel's additive noise, in gray levels of 255.
-        gain: mean gain; below 1 the pictures are dark, and the noise is not.
+        gain: mean gain; below 1 the images are dark, while the noise stays the same.
         sigma_gain: standard deviation of an image's gain, relative to the mean gain.
         sigma_offset_gray: standard deviation of an image's offset, in gray levels.
-        gamma: power of the light, over the full range, that the gain is applied to: other than 1
-            it takes contrast from the dark (above) or from the bright (below).
+        gamma: exponent of the light, over the full range, before the gain: above 1 it reduces the
+            contrast of dark regions, below 1 that of bright ones.
     """
 
     sigma_gray: Annotated[float, Range(0, 255, "grey levels")] = 2.0
@@ -51,42 +50,36 @@ HALF = np.float32(0.5)  # keeps the sum in single precision
 
 @functools.cache
 def normal_values() -> np.ndarray:
-    """Equally likely values (VALUES,) float32, ascending: normal, of mean 0 and variance 1."""
+    """Return equally likely values of a standard normal variable, ascending, shape (VALUES,)."""
     quantiles = ndtri((np.arange(VALUES) + 0.5) / VALUES)
     return (quantiles / quantiles.std()).astype(np.float32)
 
 
 def expose(gray: np.ndarray, noise: RadiometricNoise, rng: np.random.Generator) -> np.ndarray:
-    """A noisy copy of a gray image (H, W) uint8."""
+    """Return a noisy copy of a gray image, shape (H, W) uint8."""
     gain = noise.gain * (1 + noise.sigma_gain * rng.standard_normal())
     offset = noise.sigma_offset_gray * rng.standard_normal()
     light = 255.0 ** (1 - noise.gamma) * np.arange(256.0) ** noise.gamma
     levels = (gain * light + offset).astype(np.float32)
     bits = draw_bits(gray.size, rng).reshape(gray.shape)
-    return _exposed(gray, levels, bits, _deviations(noise.sigma_gray))
-
-
-@functools.lru_cache(maxsize=1)
-def _deviations(sigma_gray: float) -> np.ndarray:
-    """Equally likely deviations (VALUES,) float32 of a pixel's grey level."""
-    return np.float32(sigma_gray) * normal_values()
+    return _add_noise(gray, levels, bits, np.float32(noise.sigma_gray) * normal_values())
 
 
 def draw_bits(n: int, rng: np.random.Generator) -> np.ndarray:
-    """Numbers (n,) uint16, all equally likely; four from each of the generator's own words."""
+    """Return random numbers (n,) uint16; four from each 64-bit word of the generator."""
     words = rng.integers(0, 2**64, -(-n // 4), dtype=np.uint64)
     return words.astype("<u8", copy=False).view("<u2")[:n]
 
 
 @kernel
-def _exposed(
+def _add_noise(
     gray: np.ndarray, levels: np.ndarray, bits: np.ndarray, deviations: np.ndarray
 ) -> np.ndarray:
-    """`levels` (256,) of what is seen plus `deviations` (VALUES,) that bits choose, rounded."""
+    """Return `levels` (256,) at gray values plus `deviations` (VALUES,) at bits, rounded."""
     exposed = np.empty(gray.shape, dtype=np.uint8)
     seen = np.empty(gray.shape[1], dtype=np.float32)
     for v in range(gray.shape[0]):
-        # what looks up and what reckons are apart, so that the latter runs in vectors
+        # separate loops for look-up and arithmetic, so that the arithmetic is vectorised
         for u in range(len(seen)):
             seen[u] = levels[gray[v, u]] + deviations[bits[v, u]]
         for u in range(len(seen)):
@@ -95,14 +88,14 @@ def _exposed(
     return exposed
 
 
-SAME_SURFACE = 0.02  # neighbouring pixels whose depths differ by more belong to two surfaces
+SAME_SURFACE = 0.02  # larger relative depth differences separate two surfaces
 
 
 def depth_at(depth_m: np.ndarray, uv_px: Float) -> Float:
-    """Depths (N,) of an image (H, W) at pixels (N, 2); NaN where nothing is.
+    """Return depths (N,) of an image (H, W) at pixels (N, 2); NaN for the background.
 
-    Between pixels of one surface the inverse depth is interpolated (it is linear in the image for a
-    plane); at the edge of a surface the nearest pixel's depth counts.
+    Between pixels of one surface the inverse depth is interpolated, which is linear in the image of
+    a plane. At the edge of a surface the depth of the nearest pixel is returned.
     """
     height, width = depth_m.shape
     u, v = np.clip(np.asarray(uv_px, dtype=np.float64), 0, [width - 1.0, height - 1.0]).T
@@ -119,21 +112,22 @@ def depth_at(depth_m: np.ndarray, uv_px: Float) -> Float:
         return np.where(is_inside, 1 / (p + q + r + s), nearest)
 
 
-NEAR_M = 0.1  # nearer than any wall can come to the lens
+NEAR_M = 0.1  # below the distance from the lens to any wall
 FAR_M = 100.0  # beyond the largest building's diagonal
-LAMP_M = (0.0, 0.0, 1000.0)  # so far above that its light is parallel
+LAMP_M = (0.0, 0.0, 1000.0)  # high enough for parallel light
 BACKGROUND_M = 0.99 * FAR_M  # an untouched depth buffer is not exactly 1
 
 
 @dataclass(frozen=True)
 class StereoFrame:
-    """What one robot sees at one moment.
+    """Images of one robot at one time.
 
     Attributes:
-        left: (H, W) uint8 gray.
-        right: (H, W) uint8 gray.
-        depth_m: (H, W) float32 along the optical axis of the left camera; NaN where nothing is.
-        left_rgb: (H, W, 3) uint8 without noise, for people; None where nobody asked for it.
+        left: gray image, shape (H, W) uint8.
+        right: gray image, shape (H, W) uint8.
+        depth_m: depth along the optical axis of the left camera, shape (H, W) float32; NaN for the
+            background.
+        left_rgb: colour image without noise, shape (H, W, 3) uint8; None if not requested.
     """
 
     left: np.ndarray
@@ -149,32 +143,37 @@ def render_stereo(
     noise: RadiometricNoise,
     rng: np.random.Generator,
 ) -> StereoFrame:
-    """Render both images and the left one's depth for a robot.
-
-    Its pose is (3,), or (4, 4) where its body tilts.
-    """
+    """Render both images and the left depth of a robot at a pose (3,), or (4, 4) if it tilts."""
     left_rgba, buffer = _render(world, camera, T_world_robot, camera.baseline_m / 2)
     right_rgba, _ = _render(world, camera, T_world_robot, -camera.baseline_m / 2)
     left, right = (cv2.cvtColor(rgba, cv2.COLOR_RGBA2GRAY) for rgba in (left_rgba, right_rgba))
     left_rgb = cv2.cvtColor(left_rgba, cv2.COLOR_RGBA2RGB)
-    depth_m = _metric_depth(buffer)
+    depth = FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * buffer.astype(np.float64))
+    depth[depth > BACKGROUND_M] = np.nan
+    depth_m = depth.astype(np.float32)
     return StereoFrame(expose(left, noise, rng), expose(right, noise, rng), depth_m, left_rgb)
 
 
 def _render(
     world: World, camera: StereoCamera, T_world_robot: ArrayLike, y_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """RGBA (H, W, 4) uint8 and the depth buffer (H, W) of a camera beside the robot's middle."""
+    """Return RGBA (H, W, 4) uint8 and the depth buffer (H, W) of a camera at lateral offset y."""
     p, tiny = world.bullet, world.renderer == "tiny"
-    # EGL takes no coefficients; a lamp along all meshes' normals shows the texture as painted
+    # EGL ignores light coefficients; a lamp along all normals shows the texture as painted
     lamp = {} if tiny else {"lightDirection": LAMP_M}
+    # world to OpenGL's camera: x right, y up, z backwards
+    T = camera_pose(camera, T_world_robot, y_m)
+    ahead, left, up = T[:3, :3].T
+    view = np.eye(4)
+    view[:3, :3] = [-left, up, -ahead]
+    view[:3, 3] = -view[:3, :3] @ T[:3, 3]
     _, _, rgba, buffer, _ = p.getCameraImage(
         camera.width_px,
         camera.height_px,
-        viewMatrix=_view_matrix(camera_pose(camera, T_world_robot, y_m)),
+        viewMatrix=view.T.ravel().tolist(),  # column by column
         projectionMatrix=_projection_matrix(camera, sampled_at_px=0.0 if tiny else 0.5),
         shadow=0,
-        # the texture as painted: a wall looks the same from everywhere
+        # ambient light only: a wall looks the same from all sides
         lightAmbientCoeff=1.0,
         lightDiffuseCoeff=0.0,
         lightSpecularCoeff=0.0,
@@ -188,43 +187,34 @@ def _render(
 
 
 def camera_pose(camera: StereoCamera, T_world_robot: ArrayLike, y_m: float) -> Float:
-    """T_world_camera (4, 4): x along the optical axis, y left, z up.
+    """Return T_world_camera (4, 4): x along the optical axis, y left, z up.
 
     Args:
-        camera: how the pair is mounted.
-        T_world_robot: (3,), or (4, 4) of a body that tilts.
-        y_m: of the camera, to the left of the middle of the pair.
+        camera: stereo pair and its mounting.
+        T_world_robot: robot pose, shape (3,), or (4, 4) for a tilted body.
+        y_m: offset of the camera to the left of the centre of the pair.
     """
-    return body_pose(T_world_robot) @ _mounted(camera, y_m)
+    return body_pose(T_world_robot) @ _mounting(camera, y_m)
 
 
 def body_pose(T_world_robot: ArrayLike) -> Float:
-    """T_world_robot (4, 4) of a body at a pose (3,), or (4, 4) where it tilts."""
+    """Return T_world_robot (4, 4) of a body at a pose (3,), or (4, 4) if it tilts."""
     T = np.asarray(T_world_robot, dtype=np.float64)
     return T if T.shape == (4, 4) else from_planar(T)
 
 
 @functools.lru_cache(maxsize=4)
-def _mounted(camera: StereoCamera, y_m: float) -> Float:
-    """T_robot_camera (4, 4)."""
+def _mounting(camera: StereoCamera, y_m: float) -> Float:
+    """Return T_robot_camera (4, 4)."""
     return pose(camera.camera_axes, camera.p_robot_eye(y_m))
 
 
-def _view_matrix(T_world_camera: Float) -> list[float]:
-    """World to OpenGL's camera (x right, y up, z backwards), column by column."""
-    ahead, left, up = T_world_camera[:3, :3].T
-    matrix = np.eye(4)
-    matrix[:3, :3] = [-left, up, -ahead]
-    matrix[:3, 3] = -matrix[:3, :3] @ T_world_camera[:3, 3]
-    return matrix.T.ravel().tolist()
-
-
 def _projection_matrix(camera: StereoCamera, sampled_at_px: float) -> list[float]:
-    """Exact pinhole, column by column.
+    """Return the projection matrix of an exact pinhole camera, column by column.
 
-    The principal point belongs on pixel (width - 1) / 2. TinyRenderer samples pixel i at the
-    coordinate i of a viewport that is `width` wide, so there the middle of its frustum falls on
-    width / 2, half a pixel off; OpenGL samples at i + 1/2, where nothing is to be mended.
+    The principal point is at pixel (width - 1) / 2. OpenGL samples pixel i at the coordinate
+    i + 1/2 of a viewport with size `width`. TinyRenderer samples it at i, so the centre of its
+    frustum would be at width / 2; the matrix corrects this offset of half a pixel.
     """
     off_px = 1 - 2 * sampled_at_px
     width, height, f = camera.width_px, camera.height_px, camera.focal_px
@@ -235,9 +225,3 @@ def _projection_matrix(camera: StereoCamera, sampled_at_px: float) -> list[float
     matrix[2, 3] = -2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
     matrix[3, 2] = -1
     return matrix.T.ravel().tolist()
-
-
-def _metric_depth(buffer: np.ndarray) -> np.ndarray:
-    depth = FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * buffer.astype(np.float64))
-    depth[depth > BACKGROUND_M] = np.nan
-    return depth.astype(np.float32)

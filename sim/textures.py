@@ -1,9 +1,9 @@
-"""Procedural textures: no two alike, rich in corners at every scale, fit for nearest sampling.
+"""Procedural textures: random shapes with corners at every scale, suited to nearest sampling.
 
-The renderer takes the nearest texel without any filter, so detail finer than a pixel's footprint
-turns into noise that differs between the left and the right image; texels larger than a pixel show
-as steps. So there are about as many texels as pixels seen from 2 to 3 m (577 px / 2.3 m = 250 per
-metre), and the picture is low-passed to what a pixel resolves at 5 m and beyond.
+PyBullet's renderer takes the nearest texel without a filter. Detail finer than a pixel's footprint
+becomes noise that differs between the left and the right image, and texels larger than a pixel are
+visible as steps. So the density matches the pixels at 2 to 3 m (577 px / 2.3 m = 250 per metre),
+and a low pass removes detail that a pixel at 5 m does not resolve.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,14 @@ _PosterSide = Annotated[float, Range(0.05, 10, "m")]
 
 @dataclass(frozen=True)
 class TextureStyle:
-    """How one kind of face is painted.
+    """Texture statistics of one kind of face.
 
     Attributes:
         texels_per_m: density.
         scales_m: sizes of the shapes, painted from large to small.
         coverage: area painted at each scale over the face's area.
         contrast: range of gray levels at each scale, over the 8-bit range.
-        low_pass_m: standard deviation of the Gaussian that smooths the picture.
+        low_pass_m: standard deviation of the Gaussian low pass.
     """
 
     texels_per_m: float
@@ -41,18 +41,18 @@ class TextureStyle:
 
 @dataclass(frozen=True)
 class Texture:
-    """How a world is painted, against the styles below.
+    """Texture settings of a world, relative to `STYLES`.
 
     Attributes:
-        contrast: of the shapes against the face's plain colour, as a factor; 0 leaves it plain.
-        coverage: factor on how many shapes there are.
-        bare: share of the walls' faces that are left plain.
-        posters: how many different posters there are; each wall has them side by side, drawn at
-            random, so the same picture hangs in many places. 0: no posters.
-        poster_m: a poster's width and height.
-        poster_width_m: smallest and largest width, from which the seed draws that of all posters of
-            the world, in place of `poster_m`'s; evenly on a logarithmic scale.
-        poster_gap_m: between two posters.
+        contrast: factor on the contrast of the shapes; 0 leaves faces plain.
+        coverage: factor on the number of shapes.
+        bare: share of the wall faces that are left plain.
+        posters: number of different posters. Each wall has posters side by side, drawn at random,
+            so the same poster hangs in many places.
+        poster_m: width and height of a poster.
+        poster_width_m: range of the posters' width, in place of the width in `poster_m`; the seed
+            draws one width for the world, uniformly on a logarithmic scale.
+        poster_gap_m: gap between two posters.
     """
 
     contrast: Annotated[float, Range(0, 1, "1")] = 1.0
@@ -71,10 +71,10 @@ class Texture:
             raise OutOfRangeError("poster_width_m", said)
 
 
-AS_PAINTED = Texture()
+DEFAULT_TEXTURE = Texture()
 
-# Smallest wall shapes: 4 px at 8 m, 30 px at 1 m. Floor and ceiling are seen at a grazing angle,
-# where a pixel covers centimetres to decimetres: coarse shapes only.
+# Smallest wall shapes: 4 px at 8 m, 30 px at 1 m. Floor and ceiling are visible at grazing angles,
+# where a pixel covers centimetres to decimetres, so they have coarse shapes only.
 STYLES = {
     "wall": TextureStyle(
         texels_per_m=250,
@@ -87,67 +87,63 @@ STYLES = {
     "ceiling": TextureStyle(60, (1.6, 0.8, 0.4), (0.7, 0.5, 0.3), (0.3, 0.4, 0.4), 0.016),
 }
 
-POSTER_FOOT_M = 0.2  # lower edge above the floor: the camera looks from 0.45 m, level
-TINT_LEVELS = 35  # colour is for the eye; the cameras are gray
+POSTER_FOOT_M = 0.2  # height of the lower edge; the level camera is at 0.45 m
+TINT_LEVELS = 35  # colour serves people only; the cameras are gray
 _SUBTEXEL_BITS = 4
-_MOST_CORNERS = 6  # of a shape
+_MOST_CORNERS = 6  # corners of a shape
 
 
 def paint(
     face: Face,
     rng: np.random.Generator,
-    texture: Texture = AS_PAINTED,
+    texture: Texture = DEFAULT_TEXTURE,
     posters: Sequence[np.ndarray] = (),
 ) -> np.ndarray:
-    """An RGB picture (H, W, 3) uint8 of a face, its first row along the upper edge.
+    """Return an RGB texture (H, W, 3) uint8 of a face, its first row along the upper edge.
 
     Args:
-        face: what is painted.
-        rng: decides all that is on it.
-        texture: how rich it is.
-        posters: pictures (from `paint_posters`) that hang on it if it is a wall.
+        face: the face.
+        rng: random generator.
+        texture: texture settings.
+        posters: posters (from `paint_posters`), pasted if the face is a wall.
     """
     picture = _paint_shapes(face.kind, face.size_m, rng, texture)
-    if face.kind == "wall" and len(posters):
-        _hang(picture, posters, texture, rng)
-    return picture
-
-
-def paint_posters(texture: Texture, rng: np.random.Generator) -> list[np.ndarray]:
-    """The world's posters, as rich as a wall is by default."""
-    size_m = texture.poster_m
-    if texture.poster_width_m is not None:
-        size_m = float(np.exp(rng.uniform(*np.log(texture.poster_width_m)))), size_m[1]
-    return [_paint_shapes("wall", size_m, rng, AS_PAINTED) for _ in range(texture.posters)]
-
-
-def _hang(
-    picture: np.ndarray, posters: Sequence[np.ndarray], texture: Texture, rng: np.random.Generator
-) -> None:
-    """Paste as many posters, drawn at random, as fit side by side in the middle of a wall."""
+    if face.kind != "wall" or not len(posters):
+        return picture
+    # as many posters, drawn at random, as fit side by side in the middle of the wall
     density = STYLES["wall"].texels_per_m
     height, width = posters[0].shape[:2]
     gap, foot = round(texture.poster_gap_m * density), round(POSTER_FOOT_M * density)
     n = (picture.shape[1] - gap) // (width + gap)
     if n < 1 or picture.shape[0] < foot + height:
-        return
+        return picture
     left = (picture.shape[1] - n * (width + gap) + gap) // 2
     top = picture.shape[0] - foot - height
     for i, kind in enumerate(rng.integers(0, len(posters), n)):
         u = left + i * (width + gap)
         picture[top : top + height, u : u + width] = posters[kind]
+    return picture
+
+
+def paint_posters(texture: Texture, rng: np.random.Generator) -> list[np.ndarray]:
+    """Return the posters of a world, painted like a wall with default settings."""
+    size_m = texture.poster_m
+    if texture.poster_width_m is not None:
+        size_m = float(np.exp(rng.uniform(*np.log(texture.poster_width_m)))), size_m[1]
+    return [_paint_shapes("wall", size_m, rng, DEFAULT_TEXTURE) for _ in range(texture.posters)]
 
 
 def _paint_shapes(
     kind: str, size_m: tuple[float, float], rng: np.random.Generator, texture: Texture
 ) -> np.ndarray:
+    """Return an RGB texture (H, W, 3) uint8 of random shapes, painted from large to small."""
     style = STYLES[kind]
     width = max(8, round(size_m[0] * style.texels_per_m))
     height = max(8, round(size_m[1] * style.texels_per_m))
     picture = np.empty((height, width, 3), dtype=np.uint8)
     plain = _colours(1, 0.4, rng)[0].astype(np.uint8)
     picture[:] = plain
-    # no draw where nothing can be bare, so that worlds without bare walls stay as they were
+    # no random number without bare walls: the other settings keep their random sequence
     if texture.bare and kind == "wall" and rng.random() < texture.bare:
         return picture
     for scale_m, coverage, contrast in zip(
@@ -155,17 +151,17 @@ def _paint_shapes(
     ):
         scale = scale_m * style.texels_per_m
         n = rng.poisson(coverage * texture.coverage * width * height / scale**2)
-        _scatter(picture, scale, n, contrast, rng)
+        _paint_polygons(picture, scale, n, contrast, rng)
     if texture.contrast < 1:
         above = picture.astype(np.float32) - plain
         picture = np.rint(plain + texture.contrast * above).astype(np.uint8)
     return cv2.GaussianBlur(picture, (0, 0), style.low_pass_m * style.texels_per_m)
 
 
-def _scatter(
+def _paint_polygons(
     picture: np.ndarray, scale: float, n: int, contrast: float, rng: np.random.Generator
 ) -> None:
-    """Paint n convex polygons of about `scale` texels across."""
+    """Paint n convex polygons with a size of about `scale` texels at random positions."""
     height, width = picture.shape[:2]
     center = rng.uniform((0, 0), (width, height), (n, 2))
     corners = rng.integers(3, _MOST_CORNERS + 1, n)
@@ -174,7 +170,7 @@ def _scatter(
     turn = rng.uniform(0, 2 * np.pi, (n, 2))
     jitter = rng.uniform(-0.3, 0.3, (n, _MOST_CORNERS))
     colour = _colours(n, contrast, rng).tolist()
-    # as if all had most corners; the first of each are its own
+    # all polygons have `_MOST_CORNERS` corners here; only the first `corners` of each are painted
     share = (np.arange(_MOST_CORNERS) + jitter) / corners[:, None]
     angle = turn[:, :1] + 2 * np.pi * share
     x, y = np.cos(angle), stretch[:, None] * np.sin(angle)
@@ -187,5 +183,6 @@ def _scatter(
 
 
 def _colours(n: int, contrast: float, rng: np.random.Generator) -> np.ndarray:
+    """Return random colours (n, 3) with a slight tint."""
     gray = 127.5 + 127.5 * contrast * rng.uniform(-1, 1, (n, 1))
     return np.clip(gray + rng.normal(0, TINT_LEVELS, (n, 3)), 10, 245)

@@ -1,11 +1,13 @@
-"""Trajectory: where robots truly were and what their wheel encoders read, as arrays and a file.
+"""Trajectory: true poses, wheel angles and tilts of the robots, as arrays and as a file.
 
-Any other source of poses may stand in for the driver: a Parquet table with one row per robot and
-iteration, ordered by robot, then iteration, readable and writable with plain pandas.
+The file is a Parquet table with one row per robot and iteration, ordered by robot, then iteration.
+Any source of poses can write such a table in place of the driver. A model of body sway adds roll
+and pitch, and a noise model measures them.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +27,7 @@ from mapfusion.files import (
 )
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se3 import in_space
-from mapfusion.parameters import require_finite, require_shape
+from mapfusion.parameters import Range, require_finite, require_in_range, require_shape
 
 _WHEEL_FIELDS = ["left_wheel_rad", "right_wheel_rad"]
 _TILT_FIELDS = ["roll_rad", "pitch_rad"]
@@ -34,24 +36,23 @@ _LEVEL_FIELDS = [
     pa.field("iteration", pa.int32()),
     pa.field("time_s", pa.float64()),
     *float_fields(POSE_FIELDS),  # T_world_robot
-    *float_fields(_WHEEL_FIELDS),  # encoders since the start, mean of the wheels of a side
+    *float_fields(_WHEEL_FIELDS),  # encoder angles since the start, mean over the wheels of a side
 ]
-_BEFORE = schema("trajectory", 1, _LEVEL_FIELDS)  # bodies were level
-# and with roll and pitch of the bodies
+_VERSION_1 = schema("trajectory", 1, _LEVEL_FIELDS)  # level bodies
 TRAJECTORY = schema("trajectory", 2, [*_LEVEL_FIELDS, *float_fields(_TILT_FIELDS)])
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """R robots at T moments.
+    """Motion of R robots at T times.
 
     Attributes:
         robots: R names.
-        time_s: (T,) since the start, increasing.
-        T_world_robot: (R, T, 3) true poses.
-        wheel_rad: (R, T, 2) left and right encoder angles since the start.
-        tilt_rad: (R, T, 2) roll (right side down) and pitch (looking down) of the bodies; None:
-            they are level.
+        time_s: time since the start, increasing, shape (T,).
+        T_world_robot: true poses, shape (R, T, 3).
+        wheel_rad: left and right encoder angles since the start, shape (R, T, 2).
+        tilt_rad: roll (right side down) and pitch (front down) of the bodies, shape (R, T, 2);
+            None for level bodies.
     """
 
     robots: tuple[str, ...]
@@ -75,17 +76,17 @@ class Trajectory:
             raise ValueError("time_s: must increase")
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.time_s)
 
     def index(self, robot: str) -> int:
-        """Row of a robot; raises InputError that lists the known names."""
+        """Return the row of a robot; raises InputError that lists the known names."""
         if robot not in self.robots:
             raise InputError(f"robot {robot}: unknown, there are {', '.join(self.robots)}")
         return self.robots.index(robot)
 
     def bodies(self, iteration: int) -> Float:
-        """All robots' bodies in the world at a moment: (R, 3) of level ones, else (R, 4, 4)."""
+        """Return the body poses of all robots: shape (R, 3) if level, else (R, 4, 4)."""
         poses = self.T_world_robot[:, iteration]
         return poses if self.tilt_rad is None else in_space(poses, self.tilt_rad[:, iteration])
 
@@ -109,22 +110,16 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     )
 
 
-def _table(path: Path) -> pa.Table:
-    """The table, with tilts of 0 where it is of the version that had none."""
-    table = read_parquet(path, "trajectory table")
-    attributes = text_attributes(path, table)
-    if attributes.get("schema_version") == "1":
-        require_kind(path, table, attributes, _BEFORE)
-        for name in _TILT_FIELDS:
-            table = table.append_column(name, pa.array(np.zeros(table.num_rows)))
-        return table
-    require_kind(path, table, attributes, TRAJECTORY)
-    return table
-
-
 def read_trajectory(path: Path) -> Trajectory:
     """Read a trajectory; raises InputError that names the file."""
-    table = _table(path)
+    table = read_parquet(path, "trajectory table")
+    attributes = text_attributes(path, table)
+    if attributes.get("schema_version") == "1":  # of level bodies
+        require_kind(path, table, attributes, _VERSION_1)
+        for name in _TILT_FIELDS:
+            table = table.append_column(name, pa.array(np.zeros(table.num_rows)))
+    else:
+        require_kind(path, table, attributes, TRAJECTORY)
     names = column(table, "robot")
     robots = tuple(dict.fromkeys(names.tolist()))
     if not robots:
@@ -154,3 +149,53 @@ def read_trajectory(path: Path) -> Trajectory:
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+_IMU_TILT_RAD = 0.0052  # 0.3 degrees: inclinometer of a small IMU on a moving robot
+
+
+@dataclass(frozen=True)
+class BodySway:
+    """Roll and pitch of a body on its suspension, about its origin on the floor.
+
+    Both are Ornstein-Uhlenbeck processes.
+
+    Attributes:
+        sigma_rad: standard deviation of each angle; 0 for a rigid body.
+        correlation_s: time after which the autocorrelation is 1/e.
+    """
+
+    sigma_rad: Annotated[float, Range(0, 0.15, "rad")] = 0.0
+    correlation_s: Annotated[float, Range(1e-3, 3600, "s")] = 0.5
+
+    def __post_init__(self) -> None:
+        require_in_range(self)
+
+    def tilts(self, time_s: Float, rng: np.random.Generator) -> Float:
+        """Draw roll and pitch (T, 2) at times (T,)."""
+        drawn = rng.standard_normal((len(time_s), 2))
+        left = np.exp(-np.diff(time_s) / self.correlation_s)
+        tilt = np.array(drawn)
+        for k, share in enumerate(left.tolist(), start=1):
+            tilt[k] = share * tilt[k - 1] + np.sqrt(1 - share**2) * drawn[k]
+        return self.sigma_rad * tilt
+
+
+@dataclass(frozen=True)
+class AttitudeNoise:
+    """Measurement noise of roll and pitch of a robot whose body sways.
+
+    Attributes:
+        measured: True if the robot measures its attitude; else it assumes a level body.
+        sigma_rad: standard deviation of each angle, independent between frames.
+    """
+
+    measured: bool = True
+    sigma_rad: Annotated[float, Range(0, 1, "rad")] = _IMU_TILT_RAD
+
+    def __post_init__(self) -> None:
+        require_in_range(self)
+
+    def applied(self, tilt_rad: Float, rng: np.random.Generator) -> Float:
+        """Return measured roll and pitch, shape (T, 2)."""
+        return tilt_rad + self.sigma_rad * rng.standard_normal(tilt_rad.shape)

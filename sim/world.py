@@ -1,4 +1,4 @@
-"""The PyBullet world: one client, walls to bump into, or painted faces to look at."""
+"""PyBullet world: one client with collision walls for driving or painted faces for rendering."""
 
 import atexit
 import contextlib
@@ -17,70 +17,65 @@ import numpy as np
 from mapfusion.errors import DamagedFileError
 from mapfusion.files import name_in_text, require_file, write_whole
 from mapfusion.geometry.numerics import Float
-from sim.floorplan import Face, FloorPlan
+from sim.floorplan import FloorPlan
 from sim.renderer import BulletRenderer, egl_driver, load_egl
-from sim.textures import AS_PAINTED, Texture, paint, paint_posters
+from sim.textures import DEFAULT_TEXTURE, Texture, paint, paint_posters
 
 GRAVITY_M_S2 = 9.81
-PHYSICS_HZ = 240  # PyBullet's own default; contacts and motors are tuned for it
+PHYSICS_HZ = 240  # PyBullet's default, for which contacts and motors are tuned
 CORNERS = "corners.npy"  # of all faces, beside their meshes and textures
-# Each process that draws reads all pictures, and takes ten times as long for compressed ones; the
-# room they take is small beside that of the features found in them.
+# Uncompressed: each rendering process reads all textures, and decompression takes ten times as
+# long. Their size is small compared to that of the features.
 PICTURE = ".bmp"
-OUT_OF_SIGHT_M = -100.0  # below the floor, where what must not be seen waits
+OUT_OF_SIGHT_M = -100.0  # height below the floor at which hidden bodies are kept
 
 GL_ROW_TEXELS = 4  # OpenGL's default row alignment
-# Who collides with whom (bit masks): wheels with the ground alone.
+# Bit masks of collisions; wheels collide with the ground only.
 GROUND, WHEEL, BODY = 1, 2, 4
 
 
 @contextlib.contextmanager
 def silence() -> Iterator[None]:
-    """Keep what C code prints off the user's screen: stdout and stderr lead nowhere meanwhile.
+    """Suppress output of C code: redirect the file descriptors of stdout and stderr.
 
-    PyBullet writes with C's printf, past `sys.stdout`, so the file descriptors are redirected.
+    PyBullet writes with C's printf, which bypasses `sys.stdout`.
     """
     sys.stdout.flush()
     sys.stderr.flush()
     libc = ctypes.CDLL(None)
     libc.fflush(None)
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    saved = {fd: os.dup(fd) for fd in (1, 2) if _is_open(fd)}
+    saved = {}
+    for fd in (1, 2):
+        with contextlib.suppress(OSError):  # a closed descriptor
+            saved[fd] = os.dup(fd)
     try:
         for fd in saved:
             os.dup2(nowhere, fd)
         yield
     finally:
-        libc.fflush(None)  # what C still buffers must not reach the screen later
+        libc.fflush(None)  # discard output that C still buffers
         for fd, copy in saved.items():
             os.dup2(copy, fd)
             os.close(copy)
         os.close(nowhere)
 
 
-def _is_open(fd: int) -> bool:
-    try:
-        os.fstat(fd)
-    except OSError:
-        return False
-    return True
-
-
 class World:
-    """Owns a PyBullet client without a screen; use it in a `with` block.
+    """PyBullet client without a screen, for a `with` block.
 
     Args:
-        renderer: what draws; raises InputError where it cannot.
+        renderer: renderer of the client; raises InputError if it does not work.
 
     Attributes:
-        renderer: what draws.
+        renderer: renderer of the client.
         bullet: the `pybullet` module.
         client: id to pass as `physicsClientId`.
     """
 
     def __init__(self, renderer: BulletRenderer = "tiny") -> None:
         if renderer == "egl":
-            egl_driver()  # raises where there is none
+            egl_driver()  # raises InputError without a driver
         self.renderer = renderer
         with silence():
             import pybullet
@@ -89,10 +84,10 @@ class World:
             self.client = pybullet.connect(pybullet.DIRECT)
             if renderer == "egl":
                 load_egl(pybullet, self.client)
-                atexit.register(self.close)  # a world left open would take its leave on stdout
+                atexit.register(self.close)  # an open client would write to stdout at exit
         self._faces: list[int] = []
         self._shown = np.zeros(0, dtype=bool)
-        # else a mesh written anew under an old name would still look as it did before
+        # otherwise a mesh file that was rewritten would be shown in its old state
         pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
 
     def __enter__(self) -> "World":
@@ -107,7 +102,7 @@ class World:
         self.close()
 
     def close(self) -> None:
-        """Disconnect; a second call does nothing."""
+        """Disconnect; a second call has no effect."""
         if self.client >= 0:
             with silence():
                 self.bullet.disconnect(physicsClientId=self.client)
@@ -115,14 +110,14 @@ class World:
             atexit.unregister(self.close)
 
     def start_physics(self) -> int:
-        """Gravity, time step and a flat ground; returns the ground's body id."""
+        """Set gravity and time step and add a flat ground; return the ground's body id."""
         p, client = self.bullet, self.client
         p.setGravity(0, 0, -GRAVITY_M_S2, physicsClientId=client)
         p.setPhysicsEngineParameter(
             fixedTimeStep=1 / PHYSICS_HZ,
             deterministicOverlappingPairs=1,
-            # PyBullet's friction cone is aligned with the world's axes: with it the track of a
-            # turning robot varies fourfold with its heading, without it by a fifth
+            # PyBullet's friction cone is aligned with the world's axes. With the cone the effective
+            # track of a turning robot varies by a factor of 4 with its heading, else by 20 %.
             enableConeFriction=0,
             physicsClientId=client,
         )
@@ -133,12 +128,12 @@ class World:
         return ground
 
     def step(self, n: int) -> None:
-        """Let 1/240 s pass, n times."""
+        """Simulate n steps of 1/240 s."""
         for _ in range(n):
             self.bullet.stepSimulation(physicsClientId=self.client)
 
     def add_solid_wall(self, start: Float, end: Float, thickness_m: float, height_m: float) -> None:
-        """A wall from `start` to `end` (2,), (2,) as a box to bump into."""
+        """Add a wall from `start` to `end`, shape (2,) each, as a collision box."""
         p, client = self.bullet, self.client
         along = end - start
         half = [float(np.linalg.norm(along)) / 2, thickness_m / 2, height_m / 2]
@@ -148,16 +143,16 @@ class World:
             shape,
             basePosition=[*((start + end) / 2), height_m / 2],
             baseOrientation=p.getQuaternionFromEuler([0, 0, np.arctan2(along[1], along[0])]),
-            useMaximalCoordinates=1,  # of other bodies that stand still each pair is looked at
+            useMaximalCoordinates=1,  # PyBullet checks every pair of other static bodies
             physicsClientId=client,
         )
         p.setCollisionFilterGroupMask(wall, -1, BODY, BODY, physicsClientId=client)
 
     def add_painted_faces(self, folder: Path) -> Float:
-        """Load the faces that `write_faces` left in `folder`, to be seen and not touched.
+        """Load the faces that `write_faces` wrote to `folder`, without collision shapes.
 
         Returns:
-            Their corners (F, 4, 3).
+            Corners of the faces, shape (F, 4, 3).
 
         Raises:
             DamagedFileError: a file of the folder is missing or damaged.
@@ -167,7 +162,7 @@ class World:
         with silence():
             for i in range(len(corners_m)):
                 mesh, picture = face_files(folder, i)
-                require_file(mesh, "mesh")  # which Bullet reads by itself
+                require_file(mesh, "mesh")  # PyBullet would not name a missing file
                 shape = p.createVisualShape(
                     p.GEOM_MESH, fileName=name_in_text(str(mesh)), physicsClientId=client
                 )
@@ -179,10 +174,10 @@ class World:
         return corners_m
 
     def _load_texture(self, picture: Path) -> int:
-        """Load a picture; for EGL as one whose rows the plug-in reads right.
+        """Load a texture; for EGL its width is made a multiple of four.
 
-        It hands rows of 3 bytes a texel to OpenGL, which takes each to begin at a multiple of 4
-        bytes: of any other width a picture comes out sheared.
+        The EGL plug-in passes rows of 3 bytes per texel to OpenGL, which expects rows that are
+        aligned to 4 bytes. A texture of another width would be sheared.
         """
         p, client = self.bullet, self.client
         image = read_picture(picture)
@@ -196,7 +191,7 @@ class World:
             return p.loadTexture(fitting, physicsClientId=client)
 
     def show_faces(self, shown: np.ndarray) -> None:
-        """Show some of the painted faces (mask) and put the others out of sight."""
+        """Show the painted faces selected by a mask (F,) and hide the others."""
         for i in np.flatnonzero(shown != self._shown):
             height_m = 0.0 if shown[i] else OUT_OF_SIGHT_M
             self.bullet.resetBasePositionAndOrientation(
@@ -206,11 +201,12 @@ class World:
 
 
 def write_faces(
-    folder: Path, plan: FloorPlan, rng: np.random.Generator, texture: Texture = AS_PAINTED
+    folder: Path, plan: FloorPlan, rng: np.random.Generator, texture: Texture = DEFAULT_TEXTURE
 ) -> None:
-    """Write each face's mesh and texture into `folder`; each texture has a child generator.
+    """Write mesh and texture of each face to `folder`.
 
-    Faces of one look have the picture that the first of them has.
+    Each texture is drawn from a child generator of its own. Faces of the same look have the texture
+    of the first of them.
     """
     faces = plan.faces()
     *children, of_posters = rng.spawn(len(faces) + 1)
@@ -224,24 +220,31 @@ def write_faces(
         shown = np.ascontiguousarray(painted[:, ::-1]) if face.mirrored else painted
         picture = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
         encoded = cv2.imencode(PICTURE, picture)[1].tobytes()
-        # whole: another run may be painting, or looking at, the same walls
+        # files are written whole: another run may write or read the same faces
         write_whole(path, lambda file, data=encoded: file.write_bytes(data))
-        write_whole(mesh, lambda file, face=face: file.write_text(_mesh(face), "ascii"))
+        # OBJ text, with the normals and texture coordinates that PyBullet needs. All normals point
+        # up: they only affect the lighting, and the lamp of EGL is above.
+        lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in face.corners_m]
+        lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
+        lines += ["vn 0 0 1"]
+        lines += ["f 1/1/1 2/2/1 3/3/1", "f 1/1/1 3/3/1 4/4/1"]
+        text = "\n".join(lines) + "\n"
+        write_whole(mesh, lambda file, text=text: file.write_text(text, "ascii"))
     corners = io.BytesIO()
     np.save(corners, np.stack([face.corners_m for face in faces]))
     write_whole(folder / CORNERS, lambda file: file.write_bytes(corners.getvalue()))
 
 
 def read_corners(path: Path) -> Float:
-    """The corners (F, 4, 3) of all faces, as `write_faces` left them.
+    """Read the corners (F, 4, 3) of all faces that `write_faces` wrote.
 
     Raises:
-        DamagedFileError: they are missing or damaged.
+        DamagedFileError: the file is missing or damaged.
     """
     require_file(path, "array of faces' corners")
     try:
         corners_m = np.asarray(np.load(io.BytesIO(path.read_bytes())), dtype=np.float64)
-    except Exception as error:  # numpy has Python parse the header, which may raise anything
+    except Exception as error:  # parsing the header may raise any error
         reason = " ".join(str(error).split())
         raise DamagedFileError(path, f"is no array ({reason})") from error
     if corners_m.shape[1:] != (4, 3) or not np.isfinite(corners_m).all():
@@ -250,10 +253,10 @@ def read_corners(path: Path) -> Float:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Return the picture of a face, (H, W, 3) uint8 in the order of OpenCV: blue, green, red.
+    """Read the texture of a face, shape (H, W, 3) uint8 in the order blue, green, red.
 
     Raises:
-        DamagedFileError: it is missing or damaged.
+        DamagedFileError: the file is missing or damaged.
     """
     require_file(path, "picture")
     image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
@@ -263,18 +266,5 @@ def read_picture(path: Path) -> np.ndarray:
 
 
 def face_files(folder: Path, i: int) -> tuple[Path, Path]:
-    """A face's mesh and its picture."""
+    """Return the paths of a face's mesh and texture."""
     return folder / f"face_{i:04d}.obj", folder / f"face_{i:04d}{PICTURE}"
-
-
-def _mesh(face: Face) -> str:
-    """One quad as OBJ; with normals and texture coordinates, or the renderer draws nothing.
-
-    The normals all point up. They only serve the light: TinyRenderer is told to use none, and EGL,
-    which takes no such order, has its lamp above, so that it too shows each texture as painted.
-    """
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in face.corners_m]
-    lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"]
-    lines += ["vn 0 0 1"]
-    lines += ["f 1/1/1 2/2/1 3/3/1", "f 1/1/1 3/3/1 4/4/1"]
-    return "\n".join(lines) + "\n"

@@ -24,7 +24,7 @@ single_threaded()
 _TESTS = Path(__file__).parent
 # Who comes first compiles: of two workers one the aligners' kernels, one all others. Whole runs,
 # which take both, find them there.
-_COMPILE = (("mapfusion/align",), ("mapfusion/fastslam", "mapfusion/vision", "sim/raycast"))
+_COMPILE = (("mapfusion/align",), ("mapfusion/fastslam", "mapfusion/vision", "sim/rendering"))
 
 
 def _place(path: Path) -> int:

@@ -57,7 +57,7 @@ def _options(version: _Version = False) -> None:
 def main() -> None:
     """Run the command; print one line and set the exit code for errors that users can cause."""
     from experiments.pipeline.code_version import use_kernel_cache
-    from experiments.pipeline.workers import saved_defect
+    from experiments.pipeline.workers import save_defect
 
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # None without a terminal
@@ -91,7 +91,7 @@ def main() -> None:
         # The classes of Typer's usage errors are private; all have `format_message`.
         message = getattr(error, "format_message", None)
         if message is None:
-            print_to_stderr(saved_defect(error))
+            print_to_stderr(save_defect(error))
             code = EXIT_DEFECT
         else:
             if message():  # empty if the help was shown

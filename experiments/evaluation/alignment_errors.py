@@ -16,7 +16,7 @@ from experiments.evaluation.truth import (
     squared_mahalanobis,
     true_pairs,
 )
-from experiments.pipeline.stages.match import known_at
+from experiments.pipeline.stages.match import latest_at
 from experiments.pipeline.tables import (
     MOTION,
     alignment_of,
@@ -59,7 +59,7 @@ class EvaluatedRobot:
 
     def at(self, iteration: int) -> tuple[LandmarkMap, Float]:
         """Return map and true points at an iteration; the last ones if the log ended earlier."""
-        return known_at(self.maps, iteration), known_at(self.points_world_m, iteration)
+        return latest_at(self.maps, iteration), latest_at(self.points_world_m, iteration)
 
     def in_map_frame(self, points_world_m: Float) -> Float:
         """Transform world points (..., 3) into the frame of this robot's maps."""

@@ -24,14 +24,13 @@ from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.pair_evaluation import ALIGNED, EvaluationSettings
 from experiments.evaluation.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.evaluation.truth import why_no_truth
-from experiments.pipeline.memory import require_memory
-from experiments.pipeline.pipeline import PairStages, Pipeline, RobotStages, lay_out
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.fuse import read_fusions
-from experiments.pipeline.stages.match import known_at
-from experiments.pipeline.stages.slam import RobotFolders, read_findings
-from experiments.pipeline.stages.snapshots import stored_maps
-from experiments.pipeline.store import StageFolder, Store, require_sound
+from experiments.pipeline.stages.match import latest_at
+from experiments.pipeline.stages.memory import require_memory
+from experiments.pipeline.stages.pipeline import PairStages, Pipeline, RobotStages, build_pipeline
+from experiments.pipeline.stages.slam import RobotFolders, read_findings, stored_maps
+from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
 from experiments.scenario.settings import AnyScenario, Recording
@@ -70,7 +69,7 @@ class EvaluatedRun:
     @classmethod
     def of(cls, scenario: AnyScenario, store: Store) -> "EvaluatedRun":
         """Lay out the stages of a scenario, without any computation."""
-        pipeline = lay_out(scenario)
+        pipeline = build_pipeline(scenario)
         merge = MergeSettings(scenario.merge.aligner, scenario.merge.parameters)
         radius_m = scenario.evaluate.true_pair_radius_m
         settings = EvaluationSettings(scenario.align.judge, merge, radius_m)
@@ -119,7 +118,7 @@ class EvaluatedRun:
     def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
         """Return the stored maps of all robots at an iteration, by robot."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
-        return {name: known_at(stored_maps(each), iteration) for name, each in folders.items()}
+        return {name: latest_at(stored_maps(each), iteration) for name, each in folders.items()}
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
         """Load the smoothed maps and paths of all robots with the truth."""
@@ -236,7 +235,7 @@ class EvaluatedRun:
         collected += [each for robot in simulated for each in (robot.observed, robot.log)]
         collected += [*estimates, *self.evaluations, *fusers]
         for stage in only or collected:
-            require_sound(self.store.path(stage))
+            require_undamaged(self.store.path(stage))
 
 
 def finding_rows(run: EvaluatedRun) -> list[dict[str, Any]]:

@@ -10,8 +10,7 @@ from experiments.evaluation.alignment_errors import EvaluatedRobot, error_rows, 
 from experiments.evaluation.fused_landmarks import MergeSettings, fusion_rows
 from experiments.evaluation.truth import PathTruth, landmark_truth, truth_or_unknown
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.slam import RobotFolders, folders_of_both
-from experiments.pipeline.stages.snapshots import ROBOTS_KEPT, stored_maps
+from experiments.pipeline.stages.slam import ROBOTS_KEPT, RobotFolders, folders_of_both, stored_maps
 from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log
 from mapfusion.verification.verdict import Judge

@@ -36,7 +36,13 @@ from experiments.pipeline.code_version import library_versions
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
 from experiments.pipeline.stages.smooth import map_files, read_smoothed_path
-from experiments.pipeline.store import Store, file_entries, link_or_copy, mending, require_sound
+from experiments.pipeline.store import (
+    Store,
+    file_entries,
+    link_or_copy,
+    require_undamaged,
+    retry_damaged,
+)
 from experiments.pipeline.tables import read_rows, records
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import find_method
@@ -261,7 +267,7 @@ def run_scenario(
         write_result(run, folder, on_written)
         on_progress(_LABEL, 1, 1)
 
-    mending(run.store, make)
+    retry_damaged(run.store, make)
     return folder
 
 
@@ -290,7 +296,7 @@ def write_result(
             shutil.rmtree(folder / outdated, ignore_errors=True)
         for robot in run.pipeline.simulated:
             features = run.store.path(robot.features)
-            require_sound(features, "image_*.png")
+            require_undamaged(features, "image_*.png")
             for path in sorted(features.glob("image_*.png")):
                 iteration = int(path.stem.removeprefix("image_"))
                 link_or_copy(path, folder / "keyframes" / f"{robot.name}_{iteration:05d}.png")

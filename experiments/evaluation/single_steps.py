@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.evaluation.evaluated_run import EvaluatedRun, finding_of_truth
-from experiments.pipeline.pipeline import SimulatedRobotStages
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
-from experiments.pipeline.stages.features import rendered
+from experiments.pipeline.stages.features import render_frame
 from experiments.pipeline.stages.log import measured_odometry
 from experiments.pipeline.stages.observed import told_tilt
-from experiments.pipeline.store import Store, link_or_copy, mending
+from experiments.pipeline.stages.pipeline import SimulatedRobotStages
+from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tables import estimate_row
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import callable_aligner
@@ -37,7 +37,7 @@ from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.registration import Registration
 from mapfusion.robot_log import read_log, read_odometry_covariance, read_true_poses
-from sim.recorder import FrameSource
+from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
 
 
@@ -61,7 +61,7 @@ def record(
             for path in sorted(run.store.path(robot.log).glob("*.parquet")):
                 link_or_copy(path, output / robot.name / path.name)
 
-    mending(run.store, make)
+    retry_damaged(run.store, make)
     return [output / robot.name for robot in run.pipeline.robots]
 
 
@@ -286,7 +286,7 @@ def write_drives(
     drive, faces = (robots[0].features.before[name] for name in ("drive", "faces"))
     assert isinstance(drive, Stage)
     assert isinstance(faces, Stage)
-    mending(run.store, lambda: run.execute(jobs, on_progress, [drive, faces]))
+    retry_damaged(run.store, lambda: run.execute(jobs, on_progress, [drive, faces]))
     trajectory = read_trajectory(run.store.path(drive) / TRAJECTORY_FILE)
     settings = robots[0].features.settings  # all robots have the same camera and renderer
     world = (run.store.path(faces), settings.camera, trajectory.robots, settings.renderer)
@@ -304,7 +304,7 @@ def _stereo_drive(
     robot: SimulatedRobotStages, trajectory: Trajectory, source: FrameSource
 ) -> StereoDrive:
     def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
-        frame = rendered(robot.features.settings, source, trajectory.bodies(k), k)
+        frame = render_frame(robot.features.settings, source, trajectory.bodies(k), k)
         return frame.left, frame.right
 
     index, tilts = trajectory.index(robot.name), trajectory.tilt_rad

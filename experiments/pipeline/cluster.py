@@ -1,9 +1,9 @@
-"""Dask cluster of a sweep: local processes, or a cluster that is running already.
+"""Dask cluster of a sweep: local processes, or a running cluster.
 
 Dask executes any code that its clients send. Local processes listen on the loopback interface,
 which all users of the machine can reach. So they accept only the credentials of this sweep: a TLS
-key that is created for it and kept in memory. Their web servers do not check credentials and
-therefore have no pages.
+key that is created for the sweep and kept in memory. Their web servers do not check credentials, so
+all pages are switched off.
 """
 
 import functools
@@ -22,11 +22,11 @@ from distributed import Client, LocalCluster
 from distributed.security import Security
 
 from experiments.pipeline.code_version import library_versions, source_hash, use_kernel_cache
-from experiments.pipeline.workers import described, held_back_interrupts
+from experiments.pipeline.workers import blocked_interrupts, describe_defect
 from mapfusion.errors import DamagedFileError, InputError
 
-# Tasks use state of their process (the open PyBullet world, OpenCV's threads). So a worker that was
-# started with several threads runs one task at a time.
+# Tasks use state of their process (the open PyBullet world, OpenCV's threads), so a worker with
+# several threads runs one task at a time.
 _one_at_a_time = threading.Lock()
 
 
@@ -44,17 +44,17 @@ class TaskFailedError(Exception):
 
 
 class UnfitWorkerError(Exception):
-    """Reason why a worker cannot take part; its results would be useless."""
+    """Reason why a worker cannot take part in a sweep."""
 
 
 @dataclass(frozen=True)
-class Terms:
+class SweepTerms:
     """Terms that all tasks of a sweep share.
 
     Attributes:
-        attempts: folder with a file for each task that runs; one byte for each start of the task.
+        attempts: folder with a file for each running task, which has one byte per start.
         retries: number of restarts of a task whose worker was killed.
-        code: `code_version()` of the machine that plans.
+        code: `code_version()` of the machine that plans the sweep.
     """
 
     attempts: Path
@@ -64,32 +64,35 @@ class Terms:
 
 @functools.cache
 def code_version() -> str:
-    """Return a text that identifies source and libraries.
-
-    Where it differs, results would be kept under wrong keys.
-    """
+    """Return a text that identifies sources and libraries, on which the keys of results depend."""
     return f"{source_hash()} {sorted(library_versions().items())} {platform.machine()}"
 
 
 @functools.cache
 def _prepare() -> None:
-    """Prepare the process, once, before modules that compute are imported."""
+    """Prepare the process once, before the import of modules with kernels."""
     use_kernel_cache()
     from experiments.pipeline.workers import single_threaded
 
     single_threaded()
 
 
-def perform(name: str, task: bytes, terms: Terms, *needs: None) -> object:
-    """Run a task. It comes pickled, because it is unpacked only after the process is prepared.
+def perform(name: str, task: bytes, terms: SweepTerms, *needs: None) -> object:
+    """Run a task.
 
-    `needs` are the results of the tasks before it (all None); they tell Dask the order.
+    A file marks the task as started; only a killed process leaves the file behind.
+
+    Args:
+        name: name of the task.
+        task: pickled task, which is unpickled after the process is prepared.
+        terms: terms of the sweep.
+        needs: results of the tasks before it (all None), which tell Dask the order.
 
     Returns:
-        The value of the task's function; None if the task was done before.
+        The value of the task's function; None if the task was finished before.
 
     Raises:
-        TaskFailedError: the task raised, or its workers were killed too often.
+        TaskFailedError: the task raised an error, or its workers were killed too often.
         UnfitWorkerError: this machine does not see the folder, or has another version installed.
     """
     if not terms.attempts.is_dir():
@@ -104,50 +107,46 @@ def perform(name: str, task: bytes, terms: Terms, *needs: None) -> object:
         )
     with _one_at_a_time:
         _prepare()
-        return _attempt(name, task, terms)
-
-
-def _attempt(name: str, task: bytes, terms: Terms) -> object:
-    """Run a task while a file marks it as begun: only a killed process leaves the file behind."""
-    stage = name.partition("/")[0]
-    mark = terms.attempts / name.replace("/", "_")
-    if mark.exists() and mark.stat().st_size > terms.retries:
-        killed = f"its worker was killed {terms.retries + 1} times (out of memory?)"
-        raise TaskFailedError(name, f"{stage}: {killed}")
-    with mark.open("ab") as file:
-        file.write(b".")
-    try:
-        begun = pickle.loads(task)  # noqa: S301 (our own client's)
-        return None if begun.finished else begun.function(*begun.arguments)
-    except InputError as error:
-        damage = error if isinstance(error, DamagedFileError) else None
-        raise TaskFailedError(name, " ".join(str(error).split()), damage=damage) from None
-    except (OSError, MemoryError) as error:  # the disk is full, or the folder is write-protected
-        reason = " ".join(f"{stage}: {type(error).__name__} {error}".split())
-        raise TaskFailedError(name, reason) from None
-    except Exception as error:
-        details = traceback.format_exc()
-        raise TaskFailedError(name, f"{stage}: {described(error, details)}", details) from None
-    finally:
-        mark.unlink(missing_ok=True)
+        stage = name.partition("/")[0]
+        mark = terms.attempts / name.replace("/", "_")
+        if mark.exists() and mark.stat().st_size > terms.retries:
+            killed = f"its worker was killed {terms.retries + 1} times (out of memory?)"
+            raise TaskFailedError(name, f"{stage}: {killed}")
+        with mark.open("ab") as file:
+            file.write(b".")
+        try:
+            begun = pickle.loads(task)  # noqa: S301 (our own client's)
+            return None if begun.finished else begun.function(*begun.arguments)
+        except InputError as error:
+            damage = error if isinstance(error, DamagedFileError) else None
+            raise TaskFailedError(name, " ".join(str(error).split()), damage=damage) from None
+        except (OSError, MemoryError) as error:  # full disk or write-protected folder
+            reason = " ".join(f"{stage}: {type(error).__name__} {error}".split())
+            raise TaskFailedError(name, reason) from None
+        except Exception as error:
+            details = traceback.format_exc()
+            reason = f"{stage}: {describe_defect(error, details)}"
+            raise TaskFailedError(name, reason, details) from None
+        finally:
+            mark.unlink(missing_ok=True)
 
 
 CONNECT_TIMEOUT_S = 30
-_STARTS = 3  # attempts to start a cluster: a worker may be killed while it starts
+_STARTS = 3  # attempts to start a cluster, because a worker may be killed during its start
 
 _LOCAL_SETTINGS = {
-    # Dask blames every task that was assigned to a killed worker, not only the one that ran. So
-    # the sweep counts by itself (`dask_worker.Terms.retries`).
+    # Dask counts a failure of every task that was assigned to a killed worker, not only of the one
+    # that ran. So the sweep counts by itself (`SweepTerms.retries`).
     "distributed.scheduler.allowed-failures": 1_000_000,
-    # A killed worker is started again, which takes long on a busy machine: Dask must not give up.
+    # A killed worker is restarted, which takes long on a busy machine.
     "distributed.deploy.lost-worker-timeout": "1 day",
-    # Dask keeps only rows of tables in memory, and only for a moment. So there is nothing to spill,
-    # and a paused worker would wait for ever. A worker that fills 95 % of its share is killed.
+    # Dask keeps only a few rows of tables in memory, so there is nothing to spill, and a paused
+    # worker would never continue. A worker that fills 95 % of its share is killed.
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
-    # Dask keeps the last tasks and events for developers, which take tens of MB by default.
+    # Logs of tasks and events for developers take tens of MB by default.
     "distributed.admin.low-level-log-length": 100,
     "distributed.admin.log-length": 100,
     "distributed.admin.system-monitor.log-length": 100,
@@ -156,16 +155,16 @@ _LOCAL_SETTINGS = {
 }
 
 
-def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client]:
-    """Return a client for a `with` block: of the scheduler at an address, or of `jobs` processes.
+def dask_client(jobs: int, scheduler: str | None) -> AbstractContextManager[Client]:
+    """Return a client for a `with` block, of the scheduler at an address or of `jobs` processes.
 
-    Credentials for an address `tls://...` are those of Dask's configuration.
+    Credentials for an address `tls://...` are taken from Dask's configuration.
 
     Raises:
-        InputError: no scheduler answers there, or it refuses these credentials.
+        InputError: no scheduler answers at the address, or it refuses the credentials.
     """
     if scheduler is None:
-        return _local(jobs)
+        return _local_client(jobs)
     try:
         return Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except TypeError as error:  # Dask's reaction to missing credentials
@@ -179,15 +178,16 @@ def connected(jobs: int, scheduler: str | None) -> AbstractContextManager[Client
 
 
 @contextmanager
-def _local(jobs: int) -> Iterator[Client]:
+def _local_client(jobs: int) -> Iterator[Client]:
+    """Provide a client of local processes, which are killed after an error."""
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the sweep reports failures
-    with dask.config.set(_LOCAL_SETTINGS), held_back_interrupts() as let_them_come:
-        cluster = _started(jobs)
+    with dask.config.set(_LOCAL_SETTINGS), blocked_interrupts() as unblock_interrupts:
+        cluster = _start_cluster(jobs)
         try:
-            let_them_come()
+            unblock_interrupts()
             with Client(cluster, set_as_default=False) as client:
                 yield client
-        except BaseException:  # end workers at once: the next sweep repeats their tasks
+        except BaseException:  # kill workers at once; the next sweep repeats their tasks
             for nanny in cluster.workers.values():
                 process = getattr(nanny.process, "process", None)
                 if process is not None and process.is_alive():
@@ -197,7 +197,7 @@ def _local(jobs: int) -> Iterator[Client]:
             cluster.close()
 
 
-def _started(jobs: int) -> LocalCluster:
+def _start_cluster(jobs: int) -> LocalCluster:
     """Start a cluster; try again if a worker was killed before it answered."""
     credentials = Security.temporary()
     for attempt in range(_STARTS):
@@ -208,7 +208,7 @@ def _started(jobs: int) -> LocalCluster:
                 processes=True,
                 host="127.0.0.1",
                 security=credentials,
-                dashboard_address="127.0.0.1:0",  # any port that is free
+                dashboard_address="127.0.0.1:0",  # any free port
                 silence_logs=logging.CRITICAL,
             )
         except RuntimeError as error:  # "Nanny failed to start."

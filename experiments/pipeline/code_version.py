@@ -1,10 +1,11 @@
 """Version of the code behind a result, and the folder of its compiled kernels.
 
-Read from the import statements, without importing anything. A process reads each file once.
+The sources of a module are found from import statements, without importing anything. A process
+reads each file once.
 
 Numba recompiles a kernel when its own file changes, but not when a kernel or a constant of another
-file changes. The folder is named by a hash of all sources, so it never holds an outdated kernel.
-All processes share it. Numba writes whole files, so processes need no lock: at worst two of them
+file changes. So the folder of compiled kernels is named by a hash of all sources. All processes
+share the folder. Numba writes whole files, so processes need no lock: at worst two processes
 compile the same kernel at the same time.
 """
 
@@ -18,26 +19,26 @@ from pathlib import Path
 
 SOURCE_ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("mapfusion", "sim", "experiments")
-# These find methods by name, so their imports reach every method there is. What a name stands for
-# is in a stage's settings, and its source in `Stage.loads`.
+# These modules find methods by name and import all methods. The method is in a stage's settings,
+# and its source in `Stage.loads`.
 _FINDS_BY_NAME = frozenset({"mapfusion/align/aligners.py"})
-_DATA = ".urdf"  # files that a module reads from its own folder
+_DATA = ".urdf"  # suffix of files that a module reads from its own folder
 _KEPT = (".py", _DATA)
 _NUMERICAL_LIBRARIES = ("numba", "numpy", "opencv-python-headless", "pyarrow", "pybullet", "scipy")
-# An import statement as our formatter writes it; Python's parser would take ten times as long.
+# Import statement as written by the formatter; Python's parser takes ten times as long.
 _IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) )?import (\([^)]*\)|.+)$", re.MULTILINE)
 _NO_NAME = re.compile(r"#.*|[()]")
 
 
 @functools.cache
 def library_versions() -> dict[str, str]:
-    """Installed versions of the libraries whose arithmetic ends up in the results."""
+    """Return installed versions of the libraries that the results depend on."""
     return {name: importlib.metadata.version(name) for name in _NUMERICAL_LIBRARIES}
 
 
 @functools.cache
 def source_hash(parts: tuple[str, ...] = PACKAGES) -> str:
-    """Hash of source files; of packages, all files in them. Paths below the project's root."""
+    """Return a hash of source files and packages, given by paths below the project's root."""
     digest = hashlib.sha256()
     for part in parts:
         for file in _files_below(SOURCE_ROOT, part):
@@ -48,15 +49,15 @@ def source_hash(parts: tuple[str, ...] = PACKAGES) -> str:
 
 @functools.cache
 def imported_sources(*modules: str) -> tuple[str, ...]:
-    """Files of these modules of ours and of all they import of ours, directly or not.
+    """Return the files of modules of this project and of all their direct and indirect imports.
 
-    A package stands for all that is in it.
+    A package stands for all its modules.
 
     Returns:
-        Paths below the project's root, sorted, data files of the modules' folders among them.
+        Paths below the project's root, sorted, with the data files of the modules' folders.
 
     Raises:
-        ValueError: a name that is no module of ours.
+        ValueError: a name is not a module of this project.
     """
     reached: set[str] = set()
     todo: list[str] = []
@@ -84,16 +85,13 @@ def imported_sources(*modules: str) -> tuple[str, ...]:
 
 @functools.cache
 def imports_of(root: Path, path: str) -> tuple[str, ...]:
-    """Files of ours that a file imports, those imported inside of functions too.
-
-    All paths are below `root`.
-    """
+    """Return the project files that a file imports, also inside functions; paths below `root`."""
     if path in _FINDS_BY_NAME:
         return ()
     found: list[str | None] = []
     for package, listed in _IMPORT.findall(_content(root, path).decode()):
         names = [name.split()[0] for name in _NO_NAME.sub(" ", listed).split(",") if name.strip()]
-        if package:  # what is imported from a package may be a module in it
+        if package:  # an imported name may be a module of the package
             whole = _file_of(root, package)
             found += [_file_of(root, f"{package}.{name}") or whole for name in names]
         else:
@@ -103,22 +101,18 @@ def imports_of(root: Path, path: str) -> tuple[str, ...]:
 
 @functools.cache
 def _file_of(root: Path, module: str) -> str | None:
+    """Return the file of a module of this project, else None."""
     package, *_ = module.split(".")
     if package not in PACKAGES:
         return None
     path = module.replace(".", "/")
-    known = _known_files(root, package)
+    known = _files_below(root, package)
     return next((name for name in (f"{path}.py", f"{path}/__init__.py") if name in known), None)
 
 
 @functools.cache
-def _known_files(root: Path, part: str) -> frozenset[str]:
-    return frozenset(_files_below(root, part))
-
-
-@functools.cache
 def _files_below(root: Path, part: str) -> tuple[str, ...]:
-    """A file that is source or data; of a folder, all of them in it, sorted folder by folder."""
+    """Return the source and data files of a folder, sorted by folder, or the file itself."""
     if not (root / part).is_dir():
         return (part,) if part.endswith(_KEPT) else ()
     found = []
@@ -133,16 +127,16 @@ def _content(root: Path, path: str) -> bytes:
     return (root / path).read_bytes()
 
 
-# Kernels of `experiments` use kernels of these alone, and Numba notices changes of their own files.
+# Packages with kernels that other files use.
 _SOURCES = ("mapfusion", "sim")
-_VERSIONS_KEPT = 8  # so that a change between branches need not compile everything again
+_VERSIONS_KEPT = 8  # a change between branches then needs no new compilation
 _HASH_DIGITS = 16
 
 
 def use_kernel_cache() -> None:
-    """Tell Numba where to keep compiled kernels; call this before Numba is imported.
+    """Set Numba's folder of compiled kernels; call this before the import of Numba.
 
-    Worker processes inherit the setting. A `NUMBA_CACHE_DIR` set by the user is left alone.
+    Worker processes inherit the setting. A `NUMBA_CACHE_DIR` set by the user is kept.
     """
     if "NUMBA_CACHE_DIR" in os.environ:
         return
@@ -153,7 +147,7 @@ def use_kernel_cache() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
         outdated = sorted(root.iterdir(), key=_last_used, reverse=True)[_VERSIONS_KEPT:]
-    except OSError:  # a home that cannot be written to: Numba finds a place of its own
+    except OSError:  # a home without write permission: Numba chooses another folder
         return
     for each in outdated:
         shutil.rmtree(each, ignore_errors=True)
@@ -161,6 +155,7 @@ def use_kernel_cache() -> None:
 
 
 def _last_used(folder: Path) -> float:
+    """Return the time of the last use of a folder."""
     try:
         return folder.stat().st_mtime
     except OSError:  # another process has just removed it

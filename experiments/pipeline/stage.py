@@ -1,9 +1,9 @@
-"""Stage of a run: a declared value, from which its key and its sources follow.
+"""Stage of a run: settings, work and inputs, with a key that identifies the results.
 
-A key covers: the stage's settings, the keys of the stages before it, the source that its function
-runs (from the imports), and the versions of the libraries behind it. Changed code or settings give
-a new key, so a result can be reused but never be stale. The function is handed its settings and
-its job, nothing else: what is not in the key it cannot read.
+A key is a hash of the stage's settings, the keys of the stages before it, the sources that its
+function imports, and the versions of the libraries. Changed code or settings give a new key, so
+stored results are never outdated. The function only receives its settings and its job, so it cannot
+read anything that is not in the key.
 """
 
 import hashlib
@@ -21,12 +21,12 @@ from experiments.pipeline.code_version import imported_sources, library_versions
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of a stage's work.
+    """Part of a stage's work.
 
     Attributes:
         inputs: folders of the stages before it, by the names that the stage gives them.
-        output: the stage's own folder.
-        part: which of its parts to make; empty for a stage made in one piece.
+        output: folder of the stage.
+        part: name of the part; empty for a stage with one part.
     """
 
     inputs: Mapping[str, Path]
@@ -35,28 +35,28 @@ class Job:
 
 
 _KEY_LENGTH = 16  # hexadecimal digits: 64 bits, no collision in any store one disk can hold
-WHOLE = ("",)  # the parts of a stage that is made in one piece
+WHOLE = ("",)  # parts of a stage that is computed as a whole
 
-# Returns further figures about the work (times; never results), if there are any.
+# Function of a stage; returns further figures about the work (times; never results) or None.
 Work = Callable[[Any, Job], Mapping[str, float] | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One declared step from inputs to files.
+    """Step from inputs to files.
 
     Attributes:
-        name: of the kind of stage, and of its folder in the store.
-        label: what the screen calls it.
-        settings: a frozen value, all of which is in the key.
-        work: a function of a module, `work(settings, job)`; the module's imports are its source.
-        writes: names of files that are there once a part is made, `{part}` in place of its name.
-        before: stages whose folders it reads, by the names it knows them by.
-        parts: made apart from each other, in any order; each needs all of the stages before it,
-            but of one with the same parts its own counterpart alone.
-        loads: modules that it finds by name, which no import shows.
-        shares: a name for what it reads or makes ready in memory; stages of one name have it in
-            common, part by part. It has no say in what they make.
+        name: name of the kind of stage, and of its folder in the store.
+        label: name in the progress display.
+        settings: frozen settings, which are part of the key.
+        work: function `work(settings, job)` of a module, whose imports are the sources.
+        writes: names of the files of a finished part, with `{part}` in place of its name.
+        before: stages whose folders it reads, by the names that it gives them.
+        parts: names of the parts, which are independent of each other. A part needs all parts of
+            the stages before it, but only the same part of a stage with the same parts.
+        loads: modules that it imports by name.
+        shares: name of data that it keeps in memory; stages with the same name share the data of
+            a part. It does not affect the results.
     """
 
     name: str
@@ -71,12 +71,12 @@ class Stage:
 
     @cached_property
     def sources(self) -> tuple[str, ...]:
-        """Files of ours whose content is in the key."""
+        """Source files whose content is part of the key."""
         return imported_sources(self.work.__module__, *self.loads)
 
     @cached_property
     def key(self) -> str:
-        """Names the results among all of the same stage."""
+        """Key that identifies the results among those of the same stage."""
         content = {
             "stage": self.name,
             "settings": to_jsonable_python(self.settings),
@@ -90,7 +90,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class RecordedLog:
-    """A robot log that was there before: a stage that is finished; its key is what it holds."""
+    """Recorded robot log: a finished stage, whose key is a hash of its content."""
 
     path: Path
 
@@ -105,10 +105,10 @@ class RecordedLog:
         return digest.hexdigest()[:_KEY_LENGTH]
 
 
-def with_those_before(goals: "Iterable[Stage | RecordedLog]") -> list[Stage]:
-    """Stages and all that come before them, each once and after those before it."""
+def in_dependency_order(goals: "Iterable[Stage | RecordedLog]") -> list[Stage]:
+    """Return stages and all stages before them, each once and after the stages that it needs."""
     found: dict[Stage, None] = {}
     for goal in goals:
         if isinstance(goal, Stage):
-            found |= dict.fromkeys([*with_those_before(goal.before.values()), goal])
+            found |= dict.fromkeys([*in_dependency_order(goal.before.values()), goal])
     return list(found)

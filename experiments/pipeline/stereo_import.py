@@ -24,23 +24,23 @@ from mapfusion.errors import InputError
 from mapfusion.geometry.camera import CalibrationError
 from mapfusion.vision.front_end import FrontEndParameters
 
-BY_IMAGES = "images"  # in place of a file of odometry
+BY_IMAGES = "images"  # visual odometry, in place of an odometry file
 
 
 @dataclass(frozen=True)
 class Source:
-    """A stereo recording, and what a user says of it.
+    """Stereo recording with the user's settings.
 
     Attributes:
-        format_name: of `mapfusion.datasets.formats.IMPORTERS`.
-        folder: of the recording.
-        settings: of the format.
-        odometry: a file, or `images`: of the pictures, in place of the recording's own.
-        truth: a file in place of the recording's own.
-        vision: settings of the front end; None: what follows from the camera.
-        vision_overrides: what of them is replaced: `KEY=VALUE`.
-        calibration: what is replaced of what is left open of the camera: `KEY=VALUE`.
-        level: where the robots' attitudes are known from.
+        format_name: name in `mapfusion.datasets.formats.IMPORTERS`.
+        folder: folder of the recording.
+        settings: settings of the format.
+        odometry: file in place of the recording's odometry, or `images` for visual odometry.
+        truth: file in place of the recording's truth.
+        vision: settings of the front end; None: settings derived from the camera.
+        vision_overrides: replaced settings of the front end, `KEY=VALUE`.
+        calibration: replaced values of the calibration error, `KEY=VALUE`.
+        level: source of the robots' attitudes.
     """
 
     format_name: str
@@ -54,7 +54,7 @@ class Source:
     level: AttitudeSource = "auto"
 
     def read(self) -> StereoRecording:
-        """The recording with the trajectories that are given; raises InputError."""
+        """Read the recording with the user's trajectories; raises InputError."""
         recording = read_recording(self.format_name, self.folder, self.settings, read_calibration)
         if self.odometry is not None:
             recorded = None if self.odometry == BY_IMAGES else read_odometry(Path(self.odometry))
@@ -64,23 +64,23 @@ class Source:
         return recording
 
     def adjusted(self, derived: FrontEndParameters) -> FrontEndParameters:
-        """Settings of the front end, given those that follow from the camera."""
+        """Return the settings of the front end, given the derived ones."""
         base = asdict(derived if self.vision is None else self.vision)
         return made_settings("--vision", FrontEndParameters, self.vision_overrides, base)
 
     def known(self, usual: CalibrationError) -> CalibrationError:
-        """What calibration leaves open, given what it usually does."""
+        """Return the calibration error, given the usual one."""
         return made_settings("--calibration", CalibrationError, self.calibration, asdict(usual))
 
 
 @dataclass(frozen=True)
 class ImportedRecording:
-    """What was made of a recording.
+    """Imported logs of a recording.
 
     Attributes:
-        about: the recording and its rectified pair, as a line for people.
-        dropped: pictures without a partner, and why.
-        robots: their logs.
+        about: description of the recording and its rectified pair in one line.
+        dropped: dropped images, each with the reason.
+        robots: imported robots.
     """
 
     about: str
@@ -89,17 +89,17 @@ class ImportedRecording:
 
     @property
     def too_little(self) -> list[str]:
-        """Of each robot that carries too little to map, a line that says so."""
+        """Messages about robots whose data do not suffice for a map."""
         return [one.too_little for one in self.robots if one.too_little]
 
 
-def imported(
+def import_recording(
     source: Source,
     recording: StereoRecording,
     cuts: Sequence[RecordingPart],
     on_progress: OnProgress,
 ) -> ImportedRecording:
-    """Make the logs of some robots of a recording that `source` read; raises InputError."""
+    """Import the logs of some robots of a recording; raises InputError."""
     work = StereoImport(recording, source.adjusted, source.known)
     robots = [work.log_of(cut, on_progress, source.level) for cut in cuts]
     camera, left = work.camera, work.calibration_error
@@ -119,20 +119,21 @@ def import_stereo(
     jobs: int,
     on_progress: OnProgress,
 ) -> tuple[list[ImportedRecording], list[Path]]:
-    """Make and write the logs of the robots of some recordings.
+    """Import the robots of some recordings and write their logs.
 
     Args:
-        sources: the recordings.
-        destination: each robot's folder goes there.
-        cuts_of: the robots of a recording.
-        jobs: processes, which share out the robots.
-        on_progress: told what is done.
+        sources: recordings.
+        destination: folder for the folders of the robots.
+        cuts_of: function that returns the robots of a recording.
+        jobs: number of processes.
+        on_progress: called with the progress.
 
     Returns:
-        What was made of each recording, and the folders of the logs.
+        Imported recordings, and the folders of the logs.
 
     Raises:
-        InputError: names file or setting, or a name that two robots have; nothing is written then.
+        InputError: a file or setting is invalid, or two robots have the same name; nothing is
+            written then.
     """
     recordings = [source.read() for source in sources]
     robots = [cuts_of(recording) for recording in recordings]
@@ -141,39 +142,30 @@ def import_stereo(
         raise InputError(f"two robots are named {twice[0]}; name them by --frames NAME=FROM:TO")
     if jobs == 1 or len(names) == 1:
         each = zip(sources, recordings, robots, strict=True)
-        done = [imported(*one, on_progress) for one in each]
-    else:
-        done = _shared_out(sources, robots, jobs, on_progress)
+        done = [import_recording(*one, on_progress) for one in each]
+    else:  # each robot in a process, which reads its recording
+        tags = [(n, k) for n, cuts in enumerate(robots) for k in range(len(cuts))]
+        found: dict[tuple[int, int], ImportedRecording] = {}
+        with workers(min(jobs, len(tags))) as pool:
+            for n, k in tags:
+                pool.submit((n, k), _import_robot, sources[n], robots[n][k])
+            for tag, one in pool.completed():
+                found[tag] = one
+                on_progress("import robots", len(found), len(tags))
+        done = [
+            replace(found[n, 0], robots=[found[n, k].robots[0] for k in range(len(cuts))])
+            for n, cuts in enumerate(robots)
+        ]
     return done, write_imported(destination, [log for one in done for log in one.robots])
 
 
-def _shared_out(
-    sources: Sequence[Source],
-    robots: Sequence[list[RecordingPart]],
-    jobs: int,
-    on_progress: OnProgress,
-) -> list[ImportedRecording]:
-    """Each robot by a process, which reads its recording for itself."""
-    tags = [(n, k) for n, cuts in enumerate(robots) for k in range(len(cuts))]
-    found: dict[tuple[int, int], ImportedRecording] = {}
-    with workers(min(jobs, len(tags))) as pool:
-        for n, k in tags:
-            pool.submit((n, k), _one_robot, sources[n], robots[n][k])
-        for tag, one in pool.completed():
-            found[tag] = one
-            on_progress("import robots", len(found), len(tags))
-    return [
-        replace(found[n, 0], robots=[found[n, k].robots[0] for k in range(len(cuts))])
-        for n, cuts in enumerate(robots)
-    ]
-
-
-def _one_robot(source: Source, cut: RecordingPart) -> ImportedRecording:
-    return imported(source, source.read(), [cut], lambda *_: None)
+def _import_robot(source: Source, cut: RecordingPart) -> ImportedRecording:
+    """Import one robot in a worker process."""
+    return import_recording(source, source.read(), [cut], lambda *_: None)
 
 
 def vision_of(scenario: str) -> FrontEndParameters:
-    """The settings of the front end of a simulation, by file or name; raises InputError."""
+    """Return the front end's settings of a simulation, by file or name; raises InputError."""
     settings = settings_of(scenario)
     if not isinstance(settings, SimulatedScenario):
         raise InputError(f"--scenario {scenario}: is no simulation, and has no section vision")

@@ -1,7 +1,7 @@
 """Store of finished stages, so that nothing is computed twice.
 
 A stage has a folder. When a part of the stage is finished, a file `done.json`, or `done_PART.json`,
-lists the files of the part with their sizes and digests. What reads the stage checks them first.
+lists the files of the part with their sizes and digests. Readers of the stage check them first.
 """
 
 import shutil
@@ -21,15 +21,15 @@ from experiments.pipeline.stage import RecordedLog, Stage
 from mapfusion.errors import DamagedFileError, StoreRepairWarning
 from mapfusion.files import PART, digest_of, read_json, require_file, write_json, write_whole
 
-# A process keeps the digests of so many files, those of some thousand stages.
+# Number of digests that a process keeps in memory: those of some thousand stages.
 _DIGESTS_KEPT = 100_000
-# A file may change again without another time of change: clocks of file systems have coarse ticks,
-# up to 2 s (FAT).
+# A file that is newer than this may change without a new modification time: clocks of file systems
+# have a resolution of up to 2 s (FAT).
 _NEW_NS = 2_000_000_000
 
 
 class FileEntry(BaseModel):
-    """A file as it was written: its size in bytes and its SHA-256 in hexadecimal digits."""
+    """Size in bytes and SHA-256 (hexadecimal digits) of a file when it was written."""
 
     size: int
     sha256: str
@@ -48,12 +48,12 @@ def require_unchanged(folder: Path, entries: Mapping[str, FileEntry], pattern: s
     """Check the files of a folder against their entries.
 
     Args:
-        folder: which the entries are of.
-        entries: by path within the folder.
-        pattern: of the paths to check.
+        folder: folder of the files.
+        entries: entries by path within the folder.
+        pattern: pattern of the paths to check.
 
     Raises:
-        DamagedFileError: a file is missing, or is not as its entry says.
+        DamagedFileError: a file is missing, or differs from its entry.
     """
     for name, entry in entries.items():
         if not fnmatch(name, pattern):
@@ -69,11 +69,12 @@ def require_unchanged(folder: Path, entries: Mapping[str, FileEntry], pattern: s
 
 @lru_cache(maxsize=_DIGESTS_KEPT)
 def _known_digest(path: Path, changed_ns: int) -> str:
+    """Return the digest of a file that was last changed at a time."""
     return digest_of(path)
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Put a finished file at a second place, without a second copy where the disk allows it.
+    """Place a finished file at a second path, by a hard link if the file system allows it.
 
     Raises:
         DamagedFileError: there is no such file.
@@ -92,14 +93,14 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 _MARK = "done"
 _DEPTH = 3  # the file of a stage is STAGE/KEY/FILE
-# A file is made again this often in one command; a disk that damages it each time needs a person.
+# Number of times that a file is computed again in one command; more damage needs a person.
 _MENDED_AT_MOST = 2
-_TOLD_LATE_AT_MOST = 1000  # more tasks than a sweep has at work at one time
+_TOLD_LATE_AT_MOST = 1000  # bound on late reports of one damage; more than the tasks at work
 T = TypeVar("T")
 
 
 class _Mark(BaseModel):
-    """What the mark of a finished part holds."""
+    """Content of the mark of a finished part."""
 
     figures: dict[str, float]
     files: dict[str, FileEntry]
@@ -107,7 +108,7 @@ class _Mark(BaseModel):
 
 @dataclass(frozen=True)
 class StageFolder:
-    """The folder of one stage."""
+    """Folder of one stage."""
 
     path: Path
     name: str
@@ -116,25 +117,23 @@ class StageFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether all files are there."""
+        """True if all files exist."""
         return all(file.is_file() for files in self.outputs.values() for file in files)
 
     def finish(self, part: str, figures: Mapping[str, float]) -> None:
         """Mark a part as finished, with figures about the work (times; never results).
 
-        The mark lists all files that are there, except the outputs of other parts.
+        The mark lists all files in the folder, except the outputs of other parts.
         """
-        mark, others = (
-            self.outputs[part][-1],
-            {file for each, files in self.outputs.items() if each != part for file in files},
-        )
+        mark = self.outputs[part][-1]
+        others = {file for each, files in self.outputs.items() if each != part for file in files}
         made = set(self.path.iterdir()) - others - {mark}
         entries = file_entries(self.path, (file for file in made if file.suffix != PART))
         known = {"stage": self.name, "key": self.key}
         write_json(mark, {**known, "figures": dict(figures), "files": entries})
 
     def figures(self) -> dict[str, Any]:
-        """Return what `finish` was given, summed over the finished parts.
+        """Return the figures of `finish`, summed over the finished parts.
 
         Raises:
             DamagedFileError: a mark is damaged.
@@ -150,14 +149,14 @@ class StageFolder:
         shutil.rmtree(self.path, ignore_errors=True)
 
 
-def require_sound(stage: Path, pattern: str = "*") -> None:
+def require_undamaged(stage: Path, pattern: str = "*") -> None:
     """Check the files in the folder of a stage against the marks of its finished parts.
 
-    A folder without marks, such as a log of the user's, is not checked.
+    A folder without marks, such as a recorded log, is not checked.
 
     Args:
-        stage: its folder.
-        pattern: of the names of the files to check.
+        stage: folder of the stage.
+        pattern: pattern of the names of the files to check.
 
     Raises:
         DamagedFileError: a file or a mark is missing or damaged.
@@ -168,13 +167,13 @@ def require_sound(stage: Path, pattern: str = "*") -> None:
 
 @dataclass(frozen=True)
 class Store:
-    """The folders of all stages, below one root."""
+    """Folders of all stages, below one root."""
 
     root: Path
 
     @classmethod
     def of(cls, results: Path) -> "Store":
-        """The store in a folder of results."""
+        """Return the store in a folder of results."""
         return cls(results / "store")
 
     def path(self, stage: Stage | RecordedLog) -> Path:
@@ -184,22 +183,22 @@ class Store:
     def discard_damaged(self, error: DamagedFileError, mended: Counter[Path]) -> bool:
         """Remove the stage that a damaged file belongs to, and warn.
 
-        Nothing is done if another task has reported the same damage before, and the stage has been
-        made again since.
+        Nothing is done if another task has reported the same damage before and the stage has been
+        computed again since.
 
         Args:
-            error: names the damaged file.
-            mended: how often each file has been made again in this command; it is updated.
+            error: error that names the damaged file.
+            mended: number of times that each file has been computed again in this command; changed.
 
         Returns:
-            False if no stage made the file, or if it has been damaged too often.
+            False if the file belongs to no stage, or if it has been damaged too often.
         """
         path, root = error.path.resolve(), self.root.resolve()
         parts = path.relative_to(root).parts if path.is_relative_to(root) else ()
         if len(parts) < _DEPTH:
             return False
         stage = root.joinpath(*parts[:2])
-        if mended[path] and (not path.is_file() or _is_sound(stage)):
+        if mended[path] and (not path.is_file() or _is_undamaged(stage)):
             mended[stage] += 1
             return mended[stage] <= _TOLD_LATE_AT_MOST
         mended[path] += 1
@@ -222,27 +221,29 @@ class Store:
 
 
 def _read_mark(path: Path) -> _Mark:
+    """Read a mark; raises DamagedFileError."""
     try:
         return _Mark.model_validate(read_json(path, "mark of a finished stage"))
     except ValidationError as error:
         raise DamagedFileError(path, "is not the mark of a finished stage") from error
 
 
-def _is_sound(stage: Path) -> bool:
+def _is_undamaged(stage: Path) -> bool:
+    """Return True if no file of a stage is damaged."""
     try:
-        require_sound(stage)
+        require_undamaged(stage)
     except DamagedFileError:
         return False
     return True
 
 
-def mending(store: Store, work: Callable[[], T]) -> T:
+def retry_damaged(store: Store, work: Callable[[], T]) -> T:
     """Return the result of `work`; call it again if it has read a damaged stage of the store.
 
-    The stage is removed with a warning, and `work` has to make it again.
+    The stage is removed with a warning, and `work` has to compute it again.
 
     Raises:
-        DamagedFileError: a file outside the store is damaged, or one that was damaged too often.
+        DamagedFileError: a damaged file is outside the store or has been damaged too often.
     """
     mended = Counter[Path]()
     while True:

@@ -1,4 +1,4 @@
-"""Tables that stages write, with their schemas; none of them contains the truth."""
+"""Tables of stages and their schemas, without the truth."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TEXT, INT, FLOAT, BOOL = pa.string(), pa.int32(), pa.float64(), pa.bool_()
 
 
 def fields(**types: pa.DataType) -> list[pa.Field]:
-    """Schema fields by name."""
+    """Return schema fields from names and types."""
     return [pa.field(name, kind) for name, kind in types.items()]
 
 
@@ -39,7 +39,7 @@ def write_rows(
     rows: pd.DataFrame | list[dict[str, Any]],
     attributes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write rows as a table of that schema, with further text attributes."""
+    """Write rows as a table with a schema and further text attributes."""
     import pandas as pd
 
     frame = pd.DataFrame(rows, columns=pd.Index(table_schema.names))
@@ -48,18 +48,18 @@ def write_rows(
 
 
 def read_rows(path: Path, table_schema: pa.Schema) -> pd.DataFrame:
-    """Read a table of that schema; raises InputError that names the file."""
+    """Read a table with a schema; raises InputError that names the file."""
     table, _ = read_table(path, table_schema)
     return table.to_pandas(use_threads=False)
 
 
 def at_iteration(rows: pd.DataFrame, iteration: int) -> pd.DataFrame:
-    """The rows of one iteration, of a table that is ordered by it."""
+    """Return the rows of one iteration from a table that is sorted by iteration."""
     return rows.iloc[slice(*rows["iteration"].searchsorted([iteration, iteration + 1]))]
 
 
 def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows by column; pandas' own takes ten times as long for a few rows of many columns."""
+    """Return the rows as dicts, for few rows and many columns faster than pandas."""
     names = rows.columns.tolist()
     columns = (rows[name].tolist() for name in names)
     return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
@@ -70,7 +70,7 @@ COVARIANCE = ("cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt")  # m2,
 _MAPS = {"robot_a": TEXT, "robot_b": TEXT, "iteration": INT}
 _ANSWER = {"status": TEXT, "reason": TEXT} | dict.fromkeys(MOTION, FLOAT)
 
-# What the aligners said, without any truth: the align stage writes it.
+# Estimates of the aligners, written by the align stage.
 ESTIMATES = schema(
     "result.estimates",
     3,
@@ -81,7 +81,7 @@ ESTIMATES = schema(
         n_correspondences=INT,
         **_ANSWER,
         **{f"refined_{name}": kind for name, kind in _ANSWER.items()},
-        # of the refined alignment; NaN where there was none to judge, or no evidence to be sought
+        # of the refined alignment; NaN without an alignment or without evidence
         verdict=TEXT,
         accepted=BOOL,
         log10_false_alarms=FLOAT,
@@ -93,20 +93,20 @@ ESTIMATES = schema(
         drift_sigma_m=FLOAT,
         # upper triangle of the refined alignment's covariance
         **dict.fromkeys(COVARIANCE, FLOAT),
-        # one bit a correspondence, most significant first (numpy.packbits)
+        # one bit per correspondence, most significant first (numpy.packbits)
         inliers=pa.binary(),
         refined_inliers=pa.binary(),
     ),
 )
 
-# The pairs offered to the aligners; rows of the two maps at that iteration.
+# Correspondences given to the aligners: rows of the two maps at the iteration.
 _OFFERED = fields(**_MAPS, index_a=INT, index_b=INT, descriptor_distance=FLOAT)
 CORRESPONDENCES = schema("result.correspondences", 1, _OFFERED)
 
-# What was found once for each two maps: the best distinct motions between them (of: "a b"), and of
-# each map onto itself ("a", "b"). log10_evidence: of the first, as of estimates; own_share,
-# copied_share: of what a wrong motion lays on its like, where no other motion does and where one
-# does; region_m: side of a region; copied_a, copied_b: the landmarks that it lays on their like, a
+# Best distinct motions between two maps (of: "a b"), and of each map onto itself ("a", "b").
+# log10_evidence: evidence of the first motion, as in the estimates; own_share, copied_share: shares
+# of landmarks that a wrong motion maps to similar ones, in regions without and with another motion;
+# region_m: side of a region; copied_a, copied_b: landmarks that a motion maps to similar ones, one
 # bit each.
 RIVALS = schema(
     "result.rivals",
@@ -141,7 +141,7 @@ _UPPER = np.triu_indices(3)
 def estimate_row(
     n_correspondences: int, estimated: Alignment, refined: Alignment, verdict: Verdict
 ) -> dict[str, Any]:
-    """One estimate, its refinement and the verdict on it as columns of the table `estimates`."""
+    """Return an estimate, its refinement and their verdict as a row of the table `estimates`."""
     row = {
         "n_correspondences": n_correspondences,
         "verdict": str(verdict.status),
@@ -163,18 +163,18 @@ def estimate_row(
 
 
 def unpacked(bits: bytes, n: int) -> np.ndarray:
-    """The mask (n,) that `numpy.packbits` made these of."""
+    """Return the mask (n,) that was packed by `numpy.packbits`."""
     return np.unpackbits(np.frombuffer(bits, np.uint8), count=n).astype(bool)
 
 
 def covariances_of(rows: pd.DataFrame) -> Float:
-    """(n, 3, 3) of motions, from the columns COVARIANCE that hold their upper halves."""
+    """Return covariances (n, 3, 3) of motions from the columns COVARIANCE."""
     columns = {name: rows[name].to_numpy(dtype=np.float64) for name in COVARIANCE}
     return covariances_from(pa.table(columns), COVARIANCE)
 
 
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
-    """The refined alignment a row of `estimates` tells of, with the status of the verdict."""
+    """Return the refined alignment of a row of `estimates`, with the status of the verdict."""
     covariance = np.empty((3, 3))
     covariance[_UPPER] = covariance.T[_UPPER] = [row[name] for name in COVARIANCE]
     sureness, reason = row["log10_false_alarms"], row["acceptance_reason"]
@@ -186,7 +186,7 @@ def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
 
 
 def rival_rows(names: Mapping[str, Any], evidence: PairEvidence) -> list[dict[str, Any]]:
-    """Rows of the table `rivals` of one pair of maps."""
+    """Return rows of the table `rivals` for one pair of maps."""
     own, copied = evidence.shares
     both = {"own_share": own, "copied_share": copied, "region_m": evidence.region_m}
     return [
@@ -208,7 +208,7 @@ def rival_rows(names: Mapping[str, Any], evidence: PairEvidence) -> list[dict[st
 def evidence_of(
     rows: pd.DataFrame, maps: Sequence[LandmarkMap], parameters: EvidenceParameters
 ) -> PairEvidence:
-    """What rows of `rivals` of one pair and iteration hold: nothing, where no motion was found."""
+    """Return the evidence in rows of `rivals` of one pair and iteration; empty without rows."""
     n_a, n_b = map(len, maps)
     motions = tuple(
         RivalMotion(
@@ -231,7 +231,7 @@ def evidence_of(
 
 
 def correspondences_of(rows: pd.DataFrame) -> Correspondences:
-    """The correspondences that rows of one pair and iteration hold."""
+    """Return the correspondences in rows of one pair and iteration."""
     return Correspondences(
         rows["index_a"].to_numpy(dtype=np.int64),
         rows["index_b"].to_numpy(dtype=np.int64),

@@ -43,7 +43,7 @@ from mapfusion.verification.verdict import Judge
 from mapfusion.vision.front_end import FrontEndParameters
 from sim.odometry import OdometryNoise
 from sim.stereo_head import RadiometricNoise
-from sim.sway import AttitudeNoise
+from sim.trajectory import AttitudeNoise
 
 # Metrics of a whole run.
 RUN_METRICS = ("path_rmse_m", "odometry_rmse_m", "path_over_odometry")

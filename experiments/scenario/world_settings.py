@@ -20,8 +20,8 @@ from sim.p3at import TIRE_FRICTION
 from sim.plan_generator import PlanParameters, RouteParameters, generate_world
 from sim.renderer import Renderer
 from sim.stereo_head import RadiometricNoise
-from sim.sway import BodySway
 from sim.textures import Texture
+from sim.trajectory import BodySway
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))

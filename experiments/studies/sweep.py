@@ -21,9 +21,9 @@ from distributed.scheduler import KilledWorker
 from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import all_tables, measure_aligners, renderer
 from experiments.pipeline import cluster
-from experiments.pipeline.cluster import connected
-from experiments.pipeline.memory import require_memory
-from experiments.pipeline.store import Store, mending
+from experiments.pipeline.cluster import dask_client
+from experiments.pipeline.stages.memory import require_memory
+from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded
 from experiments.scenario.suite import scenarios_of
@@ -224,7 +224,7 @@ class SweepDriver:
         client: Client,
         sweep: Sweep,
         tables: JoinedTables,
-        terms: cluster.Terms,
+        terms: cluster.SweepTerms,
         on_progress: OnSweepProgress,
         jobs: int | None = None,
     ) -> None:
@@ -418,8 +418,8 @@ def execute(
                 shutil.rmtree(abandoned, ignore_errors=True)
         named = PART, temporary_prefix(_ATTEMPTS)
         own = tempfile.TemporaryDirectory(*named, folder, ignore_cleanup_errors=True)
-        with own as attempts, connected(jobs, scheduler) as client:
-            terms = cluster.Terms(Path(attempts), RETRIES, cluster.code_version())
+        with own as attempts, dask_client(jobs, scheduler) as client:
+            terms = cluster.SweepTerms(Path(attempts), RETRIES, cluster.code_version())
             local = None if scheduler else jobs
             driver = SweepDriver(client, sweep, tables, terms, on_progress, local)
             driver.execute()
@@ -445,7 +445,7 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
                 on_progress(label, done, len(runs))
                 done += 1
                 if run.run_id not in timed:
-                    measured = mending(sweep.store, partial(_measured, sweep, run))
+                    measured = retry_damaged(sweep.store, partial(_measured, sweep, run))
                     rows[run.run_id] = sweep.dataset.rows(ALIGNER_TIMINGS, run, measured)
             if rows:
                 tables.replace(ALIGNER_TIMINGS, number, rows)

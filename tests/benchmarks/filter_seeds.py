@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.evaluation.smoothed_robots import path_rmse_m
 from experiments.evaluation.truth import PathTruth
-from experiments.pipeline.pipeline import smoother_parameters
+from experiments.pipeline.stages.pipeline import smoother_parameters
 from experiments.pipeline.stages.smooth import log_until
 from experiments.pipeline.workers import single_threaded
 from experiments.scenario.loading import load_scenario

@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import cast
 from unittest.mock import patch
 
-from experiments.pipeline.pipeline import lay_out
 from experiments.pipeline.stages import drive
+from experiments.pipeline.stages.pipeline import build_pipeline
 from experiments.pipeline.workers import single_threaded
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.seeds import parse_seeds
 from mapfusion.errors import InputError
-from sim.routes import hold_for
+from sim.routes import resolve_deadlock
 from tests.benchmarks.generated_runs import REPOSITORY, generated_scenarios
 from tests.helpers.wheels_alone import wheels_alone
 
@@ -44,14 +44,14 @@ def outcome(
         scenario = load_scenario(REPOSITORY / path, overrides, seed)
     except InputError:
         return REFUSED, 0
-    (stage,) = (each for each in lay_out(scenario).stages() if each.name == "drive")
+    (stage,) = (each for each in build_pipeline(scenario).stages() if each.name == "drive")
     settings = cast(drive.DriveSettings, stage.settings)
     with (
         wheels_alone() if without_physics else nullcontext(),
-        patch("sim.driver.hold_for", side_effect=hold_for) as asked_for,
+        patch("sim.driver.resolve_deadlock", side_effect=resolve_deadlock) as asked_for,
     ):
         try:
-            drive.driven(settings)
+            drive.drive_robots(settings)
         except InputError as error:
             return str(error), asked_for.call_count
     return DRIVEN, asked_for.call_count

@@ -8,7 +8,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from experiments.evaluation import tables
 from experiments.pipeline import cluster
-from experiments.pipeline.cluster import connected
+from experiments.pipeline.cluster import dask_client
 from experiments.pipeline.tables import TEXT
 from experiments.pipeline.tasks import Task
 from experiments.studies.sweep_combinations import SweepRun
@@ -18,13 +18,13 @@ N_TASKS, N_RUNS = 200, 500
 
 
 def test_handing_out_200_tasks_that_do_nothing(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
-    terms = cluster.Terms(tmp_path, 3, cluster.code_version())
-    with connected(1, None) as client:
+    terms = cluster.SweepTerms(tmp_path, 3, cluster.code_version())
+    with dask_client(1, None) as client:
         _hand_out(client, terms)  # the worker imports what it needs
         benchmark.pedantic(_hand_out, (client, terms), rounds=5)
 
 
-def _hand_out(client: Client, terms: cluster.Terms) -> None:
+def _hand_out(client: Client, terms: cluster.SweepTerms) -> None:
     tasks = [Task(f"nothing/{number}", "nothing", int, (), ()) for number in range(N_TASKS)]
     futures = [
         client.submit(cluster.perform, task.name, pickle.dumps(task), terms, pure=False)

@@ -17,7 +17,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from scipy.ndimage import map_coordinates
 
-from experiments.pipeline.stages.walls import Walls
+from experiments.pipeline.stages.faces import Walls
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from mapfusion.errors import InputError
@@ -25,8 +25,8 @@ from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import compose
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, observable
 from mapfusion.vision.tracking import Tracker
-from sim.recorder import FrameSource
 from sim.renderer import Renderer
+from sim.rendering.frame_source import FrameSource
 from sim.stereo_head import RadiometricNoise
 from sim.world import write_faces
 

@@ -9,7 +9,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from mapfusion.geometry.camera import StereoCamera
 from sim.driver import DriverSettings, drive
 from sim.floorplan import FloorPlan, Wall
-from sim.recorder import FrameSource
+from sim.rendering.frame_source import FrameSource
 from sim.routes import Route
 from sim.stereo_head import RadiometricNoise, expose
 from sim.world import write_faces

@@ -20,7 +20,7 @@ from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.stereo_noise import estimate_noise
 from mapfusion.vision.tracking import Tracker, TrackParameters
 from sim.floorplan import FloorPlan, Wall
-from sim.raycast.caster import RayCaster
+from sim.rendering.ray_caster import RayCaster
 from sim.stereo_head import RadiometricNoise, depth_at, expose
 from sim.world import write_faces
 from tests.experiments.studies.refusal.test_refusal import (

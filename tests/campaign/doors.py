@@ -11,7 +11,7 @@ import pandas as pd
 
 from experiments.evaluation import tables
 from experiments.evaluation.result_files import read_provenance
-from experiments.pipeline.store import StageFolder, require_sound
+from experiments.pipeline.store import StageFolder, require_undamaged
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.studies.run_tables import find_runs
 from experiments.studies.sweep_combinations import SweepRun
@@ -141,7 +141,7 @@ def _of_the_store(folder: Path, rng: np.random.Generator) -> list[Door]:
 
     def read() -> Any:
         """Read a stage as the one after it does."""
-        require_sound(faces)
+        require_undamaged(faces)
         meshes = [file.read_bytes() for file in sorted(faces.glob("*.obj"))]
         pictures = [read_picture(file) for file in sorted(faces.glob("*.bmp"))]
         return made.figures(), read_corners(faces / CORNERS), pictures, meshes

@@ -4,7 +4,7 @@ import os
 import signal
 from pathlib import Path
 
-from experiments.pipeline.store import StageFolder, require_sound
+from experiments.pipeline.store import StageFolder, require_undamaged
 from mapfusion.errors import InputError
 from mapfusion.files import require_file
 from tests.helpers.waiting import wait_until
@@ -66,6 +66,6 @@ def write_stage(path: Path, text: str = "made") -> None:
 
 
 def read_stage(path: Path, output: Path) -> None:
-    require_sound(path.parent)
+    require_undamaged(path.parent)
     require_file(path, "test")  # the stage may have been discarded meanwhile
     write(output, path.read_text())

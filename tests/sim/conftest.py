@@ -11,7 +11,7 @@ from sim.world import write_faces
 
 @pytest.fixture(scope="session")
 def texture_seed() -> int:
-    """Of the room's textures."""
+    """Seed of the room's textures."""
     return 11
 
 

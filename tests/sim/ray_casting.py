@@ -1,4 +1,4 @@
-"""What an exact pinhole camera sees of the painted room, computed the slow way."""
+"""Slow reference: image of the painted room in an exact pinhole camera."""
 
 from pathlib import Path
 

@@ -218,7 +218,7 @@ def test_of_two_that_stand_before_each_other_the_one_that_came_so_far_goes_on() 
 
 
 def test_robots_that_are_not_looked_at_are_in_nobodys_way() -> None:
-    """Whether they are skipped as too far or asked for one by one."""
+    """Skipping distant robots gives the same result as checking each one."""
     rng = np.random.default_rng(0)
     for give_way_m in (0.05, 1.6, 3.0):
         settings = DriverSettings(give_way_m=give_way_m)
@@ -226,14 +226,14 @@ def test_robots_that_are_not_looked_at_are_in_nobodys_way() -> None:
         near, asks_all = (
             _Driver(route("a", [1, 3, 0], (7, 3)), nobody, settings) for _ in range(2)
         )
-        asks_all._looks_m = np.inf
+        asks_all._range_m = np.inf
         found = set()
         for _ in range(300):
             pose, *there = map(tuple, rng.uniform([-2, -2, -4], [2, 2, 4], (3, 3)).tolist())
             flags = rng.random((2, 2)) < 0.5
             others = [_Other(T, k, *flags[k].tolist()) for k, T in enumerate(there)]
-            found.add(asks_all._first_in_the_way(pose, others))
-            assert near._first_in_the_way(pose, others) == asks_all._first_in_the_way(pose, others)
+            found.add(asks_all._blocking_robot(pose, others))
+            assert near._blocking_robot(pose, others) == asks_all._blocking_robot(pose, others)
         assert found == {None, 0, 1}
 
 
@@ -267,7 +267,7 @@ MIDDLES: list[Place] = [
 
 
 def standing(world: World) -> set[Place]:
-    """Where the walls' middles are."""
+    """Return the positions of the walls in a world."""
     p, client = world.bullet, world.client
     bodies = range(p.getNumBodies(physicsClientId=client))
     places = [p.getBasePositionAndOrientation(body, physicsClientId=client)[0] for body in bodies]

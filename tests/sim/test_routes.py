@@ -13,7 +13,16 @@ from mapfusion.errors import InputError
 from sim.driver import DriverSettings, _Driver, _others, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.p3at import OUTER_RADIUS_M, P3at
-from sim.routes import Driven, Hold, Holding, Passage, Progress, Route, circle_among, hold_for
+from sim.routes import (
+    ActiveHold,
+    DriveRecord,
+    Hold,
+    Passage,
+    Progress,
+    Route,
+    find_deadlock,
+    resolve_deadlock,
+)
 from sim.trajectory import Trajectory
 from tests.helpers.wheels_alone import wheels_alone
 
@@ -44,7 +53,8 @@ def arrived(trajectory: Trajectory, routes: list[Route]) -> list[bool]:
 @pytest.mark.parametrize("first", ["south", "north"])
 def test_two_that_come_head_on_get_through(first: str) -> None:
     routes = joining(first)
-    with patch("sim.driver.hold_for", return_value=None), pytest.raises(InputError, match="waits"):
+    never = patch("sim.driver.resolve_deadlock", return_value=None)
+    with never, pytest.raises(InputError, match="waits"):
         driven(routes)
     both = driven(routes)
     assert arrived(both, routes) == [True, True]
@@ -56,7 +66,7 @@ def test_two_that_come_head_on_get_through(first: str) -> None:
 
 
 def test_a_robot_that_holds_lets_the_others_by() -> None:
-    """So that these do not give way to it, though it is listed first."""
+    """The other robots do not give way to a holding robot, although it is listed first."""
     here, there = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)
     hold = Hold(0, Progress(0, -9.0), (Passage(1, Progress(0, -1.0), (0.0, 0.0)),))
     drivers = [
@@ -66,13 +76,13 @@ def test_a_robot_that_holds_lets_the_others_by() -> None:
     came = [driver.progress(here) for driver in drivers]
     drivers[0].hold(came, [here, there], 1.0)
     (seen,) = _others(1, [here, there], [False, False], drivers)
-    assert (seen.goes_first, seen.lets_by) == (True, True)
+    assert (seen.goes_first, seen.yields) == (True, True)
 
 
 def test_a_circle_of_three_is_found() -> None:
-    assert circle_among({0: [1], 1: [2], 2: [0]}) == (0, 1, 2)
-    assert circle_among({0: [1], 1: [2]}) == ()
-    assert circle_among({3: [0, 1], 0: [2], 1: [3]}) == (1, 3)
+    assert find_deadlock({0: [1], 1: [2], 2: [0]}) == (0, 1, 2)
+    assert find_deadlock({0: [1], 1: [2]}) == ()
+    assert find_deadlock({3: [0, 1], 0: [2], 1: [3]}) == (1, 3)
 
 
 def test_circles_are_those_of_strongly_connected_robots() -> None:
@@ -84,7 +94,7 @@ def test_circles_are_those_of_strongly_connected_robots() -> None:
         _, component = connected_components(csr_array(waits), directed=True, connection="strong")
         tangled = np.bincount(component)[component] > 1
         circle = list(
-            circle_among({i: np.flatnonzero(row).tolist() for i, row in enumerate(waits)})
+            find_deadlock({i: np.flatnonzero(row).tolist() for i, row in enumerate(waits)})
         )
         assert bool(circle) == tangled.any()
         n_found += bool(circle)
@@ -94,9 +104,9 @@ def test_circles_are_those_of_strongly_connected_robots() -> None:
     assert 50 < n_found < 250
 
 
-def straight(*x_m: float, y_m: float = 0.0) -> Driven:
+def straight(*x_m: float, y_m: float = 0.0) -> DriveRecord:
     """A robot on its way along x to a waypoint at x = 10."""
-    own = Driven()
+    own = DriveRecord()
     for x in x_m:
         own.add((x, y_m, 0.0), Progress(0, x - 10), stopping_m=0.1)
     return own
@@ -106,14 +116,14 @@ def test_the_place_is_the_last_one_clear_of_the_other_s_way() -> None:
     """The other goes along y at x = 5: 1.25 m and the way to stop are kept from there."""
     mine, other = straight(*np.arange(0, 4.3, 0.1)), straight(5.0, y_m=-1.0)
     ahead = [np.array([[10.0, 0.0]]), np.array([[5.0, 6.0]])]
-    hold = hold_for((0, 1), [other, mine], ahead[::-1], 1.25)
+    hold = resolve_deadlock((0, 1), [other, mine], ahead[::-1], 1.25)
     assert hold is not None
     assert (hold.robot, hold.at.visited) == (1, 0)
     assert hold.at.minus_left_m == pytest.approx(3.6 - 10)
     (passage,) = hold.passages
     assert passage[:2] == (0, Progress(0, -5.0))
     assert passage.from_m == pytest.approx((4.2, 0.0))
-    again = hold_for((0, 1), [other, mine], ahead[::-1], 1.25, [hold])
+    again = resolve_deadlock((0, 1), [other, mine], ahead[::-1], 1.25, [hold])
     assert again is not None
     assert again.at.minus_left_m == pytest.approx(3.3 - 10)
 
@@ -121,22 +131,22 @@ def test_the_place_is_the_last_one_clear_of_the_other_s_way() -> None:
 def test_the_one_listed_before_holds_where_the_last_has_no_place() -> None:
     mine, other = straight(*np.arange(0, 4.3, 0.1)), straight(5.0, y_m=-0.5)
     ahead = [np.array([[10.0, 0.0]]), np.array([[5.0, 6.0]])]
-    hold = hold_for((0, 1), [mine, other], ahead, 1.25)
+    hold = resolve_deadlock((0, 1), [mine, other], ahead, 1.25)
     assert hold is not None
     assert hold.robot == 0
     assert [passage.robot for passage in hold.passages] == [1]
 
 
 def test_nobody_holds_where_all_stand_on_the_others_ways() -> None:
-    towards = Driven()
+    towards = DriveRecord()
     for x in (7.0, 6.0, 5.0):
         towards.add((x, 0.0, math.pi), Progress(0, -x), 0.0)
     ahead = [np.array([[10.0, 0.0]]), np.array([[0.0, 0.0]])]
-    assert hold_for((0, 1), [straight(2.0, 3.0, 4.0), towards], ahead, 1.2) is None
+    assert resolve_deadlock((0, 1), [straight(2.0, 3.0, 4.0), towards], ahead, 1.2) is None
 
 
 def test_a_hold_begins_at_its_place_and_ends_once_the_other_is_past() -> None:
-    holding = Holding(Hold(1, Progress(2, -3.0), (Passage(0, Progress(5, -1.0), (4.0, 0.0)),)))
+    holding = ActiveHold(Hold(1, Progress(2, -3.0), (Passage(0, Progress(5, -1.0), (4.0, 0.0)),)))
 
     def waits(own: Progress, other: Progress, x_m: float) -> set[int]:
         return holding.waits_for([other, own], [(x_m, 0.0, 0.0), (0.0, 0.0, 0.0)], 1.0)

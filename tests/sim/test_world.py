@@ -18,7 +18,7 @@ import numpy as np
 from mapfusion.geometry.camera import StereoCamera
 from sim.driver import DriverSettings, drive
 from sim.floorplan import FloorPlan, Wall
-from sim.recorder import FrameSource
+from sim.rendering.frame_source import FrameSource
 from sim.routes import Route
 from sim.stereo_head import RadiometricNoise
 

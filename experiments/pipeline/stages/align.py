@@ -1,4 +1,4 @@
-"""Stage: the estimates of all aligners for one pair of robots, joined in order of iteration."""
+"""Stage: estimates of all aligners for one pair of robots, joined in order of iteration."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ WRITES = ("estimates.parquet", "correspondences.parquet", "rivals.parquet")
 
 @dataclass(frozen=True)
 class JoinSettings:
-    """The batches there are."""
+    """Batches of the aligners' stages."""
 
     batches: tuple[str, ...]
 
@@ -31,6 +31,6 @@ def run(settings: JoinSettings, job: Job) -> None:
     for file, (schema, path_of, folders) in zip(WRITES, tables, strict=True):
         paths = [path_of(folder, part) for part in settings.batches for folder in folders]
         joined = pd.concat([read_rows(path, schema) for path in paths], ignore_index=True)
-        # within an iteration the aligners stay in their order
+        # a stable sort keeps the order of the aligners within an iteration
         joined = joined.sort_values("iteration", kind="stable", ignore_index=True)
         write_rows(job.output / file, schema, joined)

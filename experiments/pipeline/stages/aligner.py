@@ -1,6 +1,6 @@
-"""Stage: one aligner's estimates for one pair of robots, refined and held against chance.
+"""Stage: estimates of one aligner for one pair of robots, refined and tested against chance.
 
-Each aligner apart, so a run in which one has changed takes all others' estimates as they are.
+Each aligner has a stage, so a changed aligner does not affect the stored estimates of the others.
 """
 
 import functools
@@ -32,19 +32,19 @@ from mapfusion.verification.regions import EvidenceParameters
 from mapfusion.verification.verdict import Judge
 
 LABEL, WRITES = match.LABEL, match.WRITES[:1]
-_BATCHES_KEPT = 2  # by a process: that of the aligners that go on, and of those that begin
+_BATCHES_KEPT = 2  # batches in memory of a process: the present one and the next one
 
 
 @dataclass(frozen=True)
 class AlignerSettings:
-    """All that an aligner's estimates depend on, beside the maps and the correspondences."""
+    """Settings of an aligner's estimates, in addition to maps and correspondences."""
 
     seed: int
     name: str
     method: str
     parameters: dict[str, Any]
     time_limit_s: float
-    origin: dict[str, str]  # package, version and files of a method that is not ours
+    origin: dict[str, str]  # package, version and files of a plug-in method
     repetitions: int
     refinement: Refinement
     acceptance: Acceptance
@@ -53,7 +53,7 @@ class AlignerSettings:
 
 
 def run(settings: AlignerSettings, job: Job) -> None:
-    """Let the aligner estimate at one batch of iterations, on what the match stage offers."""
+    """Run the aligner at one batch of iterations on the correspondences of the match stage."""
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
     judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
     inputs = tuple(job.inputs.items())
@@ -72,10 +72,10 @@ def run(settings: AlignerSettings, job: Job) -> None:
 def _verifiers(
     inputs: tuple[tuple[str, Path], ...], part: str, judge: Judge, iterations: tuple[int, ...]
 ) -> Sequence[tuple[int, EstimateVerifier]]:
-    """Iterations of a batch, and what completes an estimate there, whichever aligner made it.
+    """Return iterations of a batch with the data that complete an estimate of any aligner.
 
-    One aligner's task follows on another's, so the last ones stay in memory. What is in a folder
-    follows from its name.
+    Tasks of several aligners follow each other, so the last batches stay in memory. The name of a
+    folder determines its content.
     """
     job = Job(dict(inputs), Path(), part)
     offered = read_rows(match.batch_path(job.inputs["match"], part), CORRESPONDENCES)

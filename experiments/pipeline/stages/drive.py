@@ -1,4 +1,4 @@
-"""Stage: physics, all robots in one world, once. Writes the trajectory."""
+"""Stage: drive all robots in one physical world and write the trajectory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.walls import Walls
+from experiments.pipeline.stages.faces import Walls
 from experiments.scenario.seeds import generator
 from sim.driver import DriverSettings, Route, drive
-from sim.sway import BodySway
-from sim.trajectory import Trajectory, write_trajectory
+from sim.trajectory import BodySway, Trajectory, write_trajectory
 
 LABEL = "drive the robots"
 TRAJECTORY_FILE = "trajectory.parquet"
@@ -19,7 +18,7 @@ WRITES = (TRAJECTORY_FILE,)
 
 @dataclass(frozen=True)
 class DrivenRobot:
-    """Where a robot starts (x_m, y_m, theta_rad in the world) and which points it visits."""
+    """Start pose (x_m, y_m, theta_rad in the world) and waypoints of a robot."""
 
     name: str
     start: tuple[float, float, float]
@@ -30,7 +29,7 @@ class DrivenRobot:
 
 @dataclass(frozen=True)
 class DriveSettings:
-    """All that the robots' ways depend on; sensors are no part of it."""
+    """Settings of the robots' motion, without sensors."""
 
     seed: int
     walls: Walls
@@ -44,15 +43,15 @@ class DriveSettings:
 
 
 def run(settings: DriveSettings, job: Job) -> None:
-    """Drive, and write the trajectory."""
-    write_trajectory(job.output / TRAJECTORY_FILE, driven(settings))
+    """Drive the robots and write the trajectory."""
+    write_trajectory(job.output / TRAJECTORY_FILE, drive_robots(settings))
 
 
-def driven(settings: DriveSettings) -> Trajectory:
-    """Drive, from the scenario's starts moved by the seed within the jitter; bodies sway on top.
+def drive_robots(settings: DriveSettings) -> Trajectory:
+    """Drive the robots from starts with random jitter, and add body sway.
 
     Raises:
-        InputError: a route that fails.
+        InputError: a robot cannot follow its route.
     """
     span = np.array([settings.start_jitter_m] * 2 + [settings.start_jitter_rad])
     routes = []

@@ -1,12 +1,35 @@
-"""Stage: the world's walls, painted once for all robots and processes."""
+"""Stage: meshes and painted textures of the world's walls, once for all robots and processes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.walls import Look, Walls
 from experiments.scenario.seeds import generator
+from sim.floorplan import FloorPlan, Wall
 from sim.textures import Texture
 from sim.world import write_faces
+
+Look = tuple[str, bool]  # look of a wall, and True if the wall is mirrored
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Walls as polylines in world metres, all of the same height and thickness."""
+
+    polylines_m: tuple[tuple[tuple[float, float], ...], ...]
+    height_m: float
+    thickness_m: float
+
+    def floor_plan(self, looks: Sequence[Look] | None = None) -> FloorPlan:
+        """Return the simulator's floor plan, with looks if the walls are rendered."""
+        lines = [np.array(line) for line in self.polylines_m]
+        looks = [("", False)] * len(lines) if looks is None else looks
+        size = self.height_m, self.thickness_m
+        each = zip(lines, looks, strict=True)
+        return FloorPlan(tuple(Wall(line, *size, *look) for line, look in each))
+
 
 LABEL = "paint the walls"
 WRITES = ()
@@ -14,7 +37,7 @@ WRITES = ()
 
 @dataclass(frozen=True)
 class FacesSettings:
-    """All that the painted walls depend on."""
+    """Settings of the painted faces."""
 
     seed: int
     walls: Walls
@@ -23,7 +46,7 @@ class FacesSettings:
 
 
 def run(settings: FacesSettings, job: Job) -> None:
-    """Write meshes and pictures."""
+    """Write meshes and textures."""
     rng = generator(settings.seed, "textures")
     plan = settings.walls.floor_plan(settings.looks)
     write_faces(job.output, plan, rng, settings.texture)

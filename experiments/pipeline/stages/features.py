@@ -1,7 +1,7 @@
-"""Stage: one robot's stereo images, rendered and turned into features, frame by frame.
+"""Stage: stereo images of one robot are rendered and their features extracted, frame by frame.
 
-Frames do not depend on each other, so they are made in parallel, in chunks; a chunk on disk is
-never made again. Images are kept for a few frames only (for figure 1).
+Frames are independent, so chunks of frames are computed in parallel. Images of a few frames only
+are stored (for figure 1).
 """
 
 import itertools
@@ -36,31 +36,31 @@ from mapfusion.robot_log import with_rows
 from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
 from mapfusion.vision.tracking import PATCH_SIDE_PX, Features
-from sim.recorder import FrameSource, truth_behind
 from sim.renderer import Renderer
+from sim.rendering.frame_source import FrameSource, truth_behind
 from sim.stereo_head import RadiometricNoise, StereoFrame
 from sim.trajectory import read_trajectory
 
-# Frames a task: about two seconds of work, so little is lost when a run is interrupted.
+# Frames per task: about two seconds of work, so an interrupted run loses little.
 FRAMES_PER_CHUNK = 20
 
 _PIXEL = ["u_px", "v_px"]
 _ONE_EACH = ["disparity_px", "sigma_disparity_px"]
 _SLOPE = ["disparity_per_u", "disparity_per_v"]
-_NUMBER = np.dtype("<f4")  # of a descriptor
+_NUMBER = np.dtype("<f4")  # number of a descriptor
 FEATURES = schema(
     "features",
     3,
     [
         pa.field("iteration", pa.int32()),
         *float_fields([*_PIXEL, "disparity_px", "sigma_disparity_px", *_SLOPE]),
-        # as bytes: lists are written, and read, number by number
+        # as bytes, because lists are written and read number by number
         pa.field("descriptor", pa.binary(_NUMBER.itemsize * DESCRIPTOR_LENGTH)),
         pa.field("patch", pa.binary(PATCH_SIDE_PX**2)),
     ],
 )
-# Row i is the world point behind row i of the features, and how it moves with the pixel. Kept
-# apart: estimators never read it.
+# Row i holds the true world point of row i of the features, and its derivative by the pixel. The
+# truth is a separate file, because estimators never read it.
 _POINT_SLOPE = [f"{name}_per_{axis}" for name in POSITION_FIELDS for axis in "uv"]
 TRUTH = schema("features.truth", 2, float_fields([*POSITION_FIELDS, *_POINT_SLOPE]))
 
@@ -70,54 +70,51 @@ WRITES = ("truth_{part}.parquet", "features_{part}.parquet")
 
 @dataclass(frozen=True)
 class FeatureSettings:
-    """All that a robot's features depend on, beside the way and the walls."""
+    """Settings of a robot's features, in addition to trajectory and walls."""
 
     seed: int
     robot: str
     camera: StereoCamera
     radiometry: RadiometricNoise
     renderer: Renderer
-    drawn_by: str  # what the renderer is on this machine
-    vision: FrontEndParameters  # corners, stereo and descriptors; the rest stays at its defaults
+    drawn_by: str  # name and version of the renderer on this machine
+    vision: FrontEndParameters  # corners, stereo and descriptors; the rest has default values
     images_at: int
     images: int
 
 
 def chunks(n_frames: int) -> tuple[str, ...]:
-    """The parts of the stage: each is named after its first frame."""
+    """Return the parts of the stage, named after their first frame."""
     return tuple(f"{start:06d}" for start in range(0, n_frames, FRAMES_PER_CHUNK))
 
 
 def _chunk(part: str, n_frames: int) -> range:
+    """Return the frames of a part."""
     return range(int(part), min(int(part) + FRAMES_PER_CHUNK, n_frames))
 
 
-# The world this process last rendered from: loading one takes seconds, so it stays open.
+# The last world that this process rendered; it stays open, because opening takes seconds.
 _open: dict[tuple[object, ...], FrameSource] = {}
 
 
-# The stage's tasks for one robot, and mostly those for all of them, read the same way.
+# Most tasks of the stage read the same trajectory.
 _trajectory = lru_cache(maxsize=1)(read_trajectory)
-
-
-def _world(settings: FeatureSettings, faces: Path, robots: tuple[str, ...]) -> FrameSource:
-    world = (faces, settings.camera, robots, settings.renderer)
-    if world not in _open:
-        while _open:
-            _open.popitem()[1].close()
-        _open[world] = FrameSource(*world)
-    return _open[world]
 
 
 def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     """Render and extract the frames of one chunk.
 
     Returns:
-        How long the rendering took, with the world opened for it.
+        Time of rendering, including the time to open the world.
     """
     trajectory = _trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
     started = time.perf_counter()
-    source = _world(settings, job.inputs["faces"], trajectory.robots)
+    world = (job.inputs["faces"], settings.camera, trajectory.robots, settings.renderer)
+    if world not in _open:
+        while _open:
+            _open.popitem()[1].close()
+        _open[world] = FrameSource(*world)
+    source = _open[world]
     rendering_s = time.perf_counter() - started
     front_end = FrontEnd(settings.camera, settings.vision)
     robot, features, truth = settings.robot, [], []
@@ -125,7 +122,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     for iteration in frames:
         poses = trajectory.bodies(iteration)
         started = time.perf_counter()
-        frame = rendered(settings, source, poses, iteration)
+        frame = render_frame(settings, source, poses, iteration)
         rendering_s += time.perf_counter() - started
         found = front_end.extract(frame.left, frame.right)
         own_pose = poses[trajectory.index(robot)]
@@ -149,22 +146,22 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     return {"rendering_s": rendering_s}
 
 
-def rendered(
+def render_frame(
     settings: FeatureSettings, source: FrameSource, poses: Float, iteration: int
 ) -> StereoFrame:
-    """One frame of a robot, without colour, with the robots at poses (R, 3) or (R, 4, 4)."""
+    """Render one frame of a robot, without colour, for robots at poses (R, 3) or (R, 4, 4)."""
     rng = generator(settings.seed, "radiometry", settings.robot, iteration)
     return source.render(poses, settings.robot, settings.radiometry, rng, colour=False)
 
 
 class TruePoints(NamedTuple):
-    """World points (N, 3) behind features, and their derivatives (N, 3, 2) by the pixel."""
+    """True world points (N, 3) of features, and their derivatives (N, 3, 2) by the pixel."""
 
     point_m: Float
     slope: Float
 
     def at(self, shift_px: Float) -> Float:
-        """World points (N, 3) behind pixels that are shifted by (N, 2) on the same surface."""
+        """Return world points (N, 3) of pixels shifted by (N, 2) on the same surface."""
         return self.point_m + np.einsum("nij,nj->ni", self.slope, shift_px)
 
 

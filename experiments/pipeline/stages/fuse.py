@@ -1,7 +1,7 @@
-"""Stage: one fuser's maps of all robots together, at each iteration that maps are fused at.
+"""Stage: maps of all robots fused by one fuser, at each iteration at which maps are fused.
 
-The maps, the alignments and what the team says of them are the same for all fusers; those that
-take smoothed maps are given these, where there are any.
+Maps, alignments and the team's decisions about them are the same for all fusers. Fusers of smoothed
+maps get smoothed maps if they exist.
 """
 
 import time
@@ -15,14 +15,13 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import match
-from experiments.pipeline.stages.slam import RobotFolders, log_as_filtered
+from experiments.pipeline.stages.slam import RobotFolders, log_as_filtered, stored_maps
 from experiments.pipeline.stages.smooth import (
     log_until,
     read_smoothed,
     read_smoothed_path,
     smoothed_owners,
 )
-from experiments.pipeline.stages.snapshots import stored_maps
 from experiments.pipeline.tables import (
     CORRESPONDENCES,
     COVARIANCE,
@@ -59,11 +58,11 @@ from mapfusion.smoother.smooth import SmootherParameters
 
 LABEL = "fuse the maps"
 WRITES = ("landmarks.parquet", "parents.parquet", "motions.parquet", "map.parquet")
-_OF = {"iteration": INT, "component": INT}  # the component of the most robots is 1
+_OF = {"iteration": INT, "component": INT}  # component 1 has the most robots
 LANDMARKS = schema("fuse.landmarks", 1, [*fields(**_OF, count=INT), *point_fields()])
-# Which landmarks of the robots' maps at that iteration went into the fused ones.
+# Landmarks of the robots' maps that were fused into each landmark.
 PARENTS = schema("fuse.parents", 1, fields(**_OF, landmark=INT, robot=TEXT, parent=INT))
-# How the robots' maps were moved; of robots that are in no component nothing is said.
+# Motions of the robots' maps; robots outside all components have no row.
 MOTIONS = schema(
     "fuse.motions",
     1,
@@ -77,9 +76,9 @@ MOTIONS = schema(
 
 @dataclass(frozen=True)
 class FuseSettings:
-    """All that a fuser's maps depend on, beside the robots' and their alignments.
+    """Settings of fused maps, in addition to the robots' maps and their alignments.
 
-    `origin` says where a fuser that is not ours comes from; empty for ours.
+    `origin` identifies a plug-in fuser; empty for ours.
     """
 
     fuser: str
@@ -93,13 +92,13 @@ class FuseSettings:
 
 @dataclass(frozen=True)
 class GivenTeam:
-    """What a team's robots have at an iteration, in their order, and how their maps were aligned.
+    """Maps and alignments of a team at an iteration, in the order of the robots.
 
     Attributes:
-        maps: the filter's.
-        pairs: the alignments of these.
-        smoothed: for fusers that take them; the filter's where there is none.
-        recordings: what those were smoothed from.
+        maps: maps of the filter.
+        pairs: alignments of these maps.
+        smoothed: smoothed maps for fusers that take them, else maps of the filter.
+        recordings: inputs of the smoothed maps; None for maps of the filter.
     """
 
     maps: Sequence[LandmarkMap]
@@ -108,21 +107,13 @@ class GivenTeam:
     recordings: Sequence[AssociatedLog | None]
 
     def connected(self, settings: FuseSettings) -> ConnectedMaps:
-        """The maps placed by the alignments that the team believes."""
+        """Connect the maps by the alignments that the team accepts."""
         return connect(self.maps, self.pairs, settings.parameters.team)
 
     def fused(self, connected: ConnectedMaps, settings: FuseSettings) -> Sequence[FusedMap]:
-        """All components made maps."""
+        """Fuse the maps of each component."""
         fuser, given = make_fuser(settings.fuser), (self.smoothed, self.recordings)
         return connected.fused_by(fuser, settings.parameters, *given).fused
-
-
-@dataclass(frozen=True)
-class _Robot:
-    """What is known of a robot at all iterations."""
-
-    filtered: Mapping[int, LandmarkMap]
-    smoothed: Mapping[int, LandmarkMap]  # none for a fuser that does not take them
 
 
 def run(settings: FuseSettings, job: Job) -> dict[str, float]:
@@ -138,43 +129,36 @@ def run(settings: FuseSettings, job: Job) -> dict[str, float]:
 
 
 def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTeam]]:
-    """What there is to be fused, at each iteration."""
-    takes, viewing = make_fuser(settings.fuser).smoothed, bool(settings.origin)
-    robots = {name: _read_robot(job, name, takes, viewing) for name in settings.robots}
-    alignments = _alignments(settings, job)
+    """Yield each iteration with the maps to be fused and their alignments."""
+    takes_smoothed = make_fuser(settings.fuser).smoothed
+    # our fusers do not use viewing evidence
+    viewing = bool(settings.origin)
+    filtered: dict[str, Mapping[int, LandmarkMap]] = {}
+    smoothed: dict[str, Mapping[int, LandmarkMap]] = {}
+    for name in settings.robots:
+        folders = RobotFolders(job.inputs[f"log {name}"], job.inputs[f"slam {name}"])
+        filtered[name] = stored_maps(folders, viewing)
+        smoothed[name] = read_smoothed(job.inputs[f"smooth {name}"]) if takes_smoothed else {}
+    asked = (name.split(" ") for name in job.inputs)
+    alignments = [_Alignments(settings, job, *both) for kind, *both in asked if kind == "aligner"]
     for k in settings.iterations:
         given, recordings = [], list[AssociatedLog | None]()
-        for name, robot in robots.items():
-            known = {i: own for i, own in robot.smoothed.items() if i <= k}
-            given.append(_at(known, k) if known else _at(robot.filtered, k))
-            recordings.append(_recording(settings, job, name, known))
-        maps = [_at(robot.filtered, k) for robot in robots.values()]
+        for name in settings.robots:
+            known = {i: own for i, own in smoothed[name].items() if i <= k}
+            given.append(_at(known or filtered[name], k))
+            recordings.append(_recording(settings, job, name, max(known)) if known else None)
+        maps = [_at(filtered[name], k) for name in settings.robots]
         pairs = [pair for each in alignments if (pair := each.at(k)) is not None]
         yield k, GivenTeam(maps, pairs, given, recordings)
 
 
-def _read_robot(job: Job, name: str, smoothed: bool, viewing: bool) -> _Robot:
-    """What there is of a robot; with viewing evidence, which none of our fusers looks at, if so."""
-    folders = RobotFolders(job.inputs[f"log {name}"], job.inputs[f"slam {name}"])
-    maps = read_smoothed(job.inputs[f"smooth {name}"]) if smoothed else {}
-    return _Robot(stored_maps(folders, viewing), maps)
-
-
 def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
-    """A robot's map at an iteration; its last one if its log ended earlier."""
+    """Return a robot's map at an iteration; its last one if its log ended earlier."""
     return maps[max(k for k in maps if k <= iteration)]
 
 
-def _recording(
-    settings: FuseSettings,
-    job: Job,
-    name: str,
-    smoothed: Mapping[int, LandmarkMap],
-) -> AssociatedLog | None:
-    """What the last smoothed map was made of, and the path that was found; None without a map."""
-    if not smoothed:
-        return None
-    k = max(smoothed)
+def _recording(settings: FuseSettings, job: Job, name: str, k: int) -> AssociatedLog:
+    """Return the inputs of the smoothed map at iteration k, and the smoothed path."""
     smooth, slam = (job.inputs[f"{stage} {name}"] for stage in ("smooth", "slam"))
     log, covariance = log_as_filtered(job.inputs[f"log {name}"], slam)
     log = log_until(log, k, settings.noise_floor_m)
@@ -185,7 +169,7 @@ def _recording(
 
 
 class _Alignments:
-    """What the aligner that maps are merged by said of two robots' maps, its first repetition."""
+    """Alignments of two robots' maps by the aligner that maps are merged by."""
 
     def __init__(self, settings: FuseSettings, job: Job, name_a: str, name_b: str) -> None:
         self._a, self._b = (settings.robots.index(name) for name in (name_a, name_b))
@@ -194,7 +178,7 @@ class _Alignments:
         self._rows = rows[rows["repetition"] == 0].sort_values("iteration")
 
     def at(self, iteration: int) -> AlignedPair | None:
-        """At an iteration; None before the aligner was first asked."""
+        """Return the alignment at an iteration; None before the first one."""
         known = self._rows[self._rows["iteration"] <= iteration]
         if known.empty:
             return None
@@ -204,21 +188,15 @@ class _Alignments:
         return AlignedPair(self._a, self._b, alignment, pairs, row["log10_false_alarms"])
 
 
-def _alignments(settings: FuseSettings, job: Job) -> list[_Alignments]:
-    """Of all pairs of robots that were aligned."""
-    asked = (name.split(" ") for name in job.inputs)
-    return [_Alignments(settings, job, *both) for kind, *both in asked if kind == "aligner"]
-
-
 def _map_path(folder: Path, component: int = 1) -> Path:
-    """Where the last map of a component is; those beyond the first have their number in it."""
+    """Return the path of the last map of a component."""
     return folder / ("map.parquet" if component == 1 else f"map.{component}.parquet")
 
 
 def write_fusions(
     folder: Path, fusions: Mapping[int, Sequence[FusedMap]], robots: Sequence[str]
 ) -> None:
-    """All components by iteration; those of the last also whole, with their joint covariances."""
+    """Write all components by iteration, and the last maps with their joint covariances."""
     names = np.array(robots, dtype=object)
     landmarks, parents, motions = [], [], []
     for k, fused in fusions.items():
@@ -229,7 +207,13 @@ def write_fusions(
             row, place = np.nonzero(each.parents != ABSENT)
             went = {"landmark": row, "robot": names[place], "parent": each.parents[row, place]}
             parents.append(pd.DataFrame(went).assign(**of))
-            motions.append(_motion_rows(each, robots).assign(**of))
+            members = each.members
+            motion = named_columns(POSE_FIELDS, each.T_first_map[members])
+            motion |= covariance_columns(COVARIANCE, each.motion_covariance[members])
+            motion |= {"robot": [robots[k] for k in members]}
+            motion["drift_sigma_m"] = each.drift_sigma_m[members]
+            about = {"duplicate_share": each.duplicate_share, "fallback": each.fallback}
+            motions.append(pd.DataFrame(motion).assign(**about, **of))
     for component, each in enumerate(fusions[max(fusions)], start=1):
         write_map(_map_path(folder, component), each.landmarks)
     tables = ((LANDMARKS, landmarks), (PARENTS, parents), (MOTIONS, motions))
@@ -237,20 +221,10 @@ def write_fusions(
         write_rows(folder / file, table, pd.concat(rows))
 
 
-def _motion_rows(fused: FusedMap, robots: Sequence[str]) -> pd.DataFrame:
-    members = fused.members
-    motion = named_columns(POSE_FIELDS, fused.T_first_map[members])
-    motion |= covariance_columns(COVARIANCE, fused.motion_covariance[members])
-    motion |= {"robot": [robots[k] for k in members]}
-    motion["drift_sigma_m"] = fused.drift_sigma_m[members]
-    about = {"duplicate_share": fused.duplicate_share, "fallback": fused.fallback}
-    return pd.DataFrame(motion).assign(**about)
-
-
 def read_fusions(folder: Path, robots: Sequence[str]) -> dict[int, FusedMap]:
-    """The map of the most robots at each iteration, without the reasons of those left out.
+    """Read the map of the most robots at each iteration, without reasons for excluded robots.
 
-    The last one is whole; earlier ones have neither descriptors nor joint covariances.
+    Maps before the last one have neither descriptors nor joint covariances.
     """
     last, place = read_map(_map_path(folder)), {name: k for k, name in enumerate(robots)}
     tables = (
@@ -262,19 +236,20 @@ def read_fusions(folder: Path, robots: Sequence[str]) -> dict[int, FusedMap]:
     found = {}
     for k in sorted(motions["iteration"].unique().tolist()):  # a map may have no landmarks
         own, of, moved = (rows[rows["iteration"] == k] for rows in (landmarks, parents, motions))
-        found[k] = _fused(own, of, moved, len(robots), last)
+        found[k] = _make_fused_map(own, of, moved, len(robots), last)
     if found:
         found[k] = replace(found[k], landmarks=last)
     return found
 
 
-def _fused(
+def _make_fused_map(
     landmarks: pd.DataFrame,
     parents: pd.DataFrame,
     motions: pd.DataFrame,
     n_robots: int,
     last: LandmarkMap,
 ) -> FusedMap:
+    """Return the fused map of one iteration from the rows of its tables."""
     columns = {name: landmarks[name].to_numpy() for name in POSITION_FIELDS + COVARIANCE_FIELDS}
     origin = np.full(len(landmarks), ABSENT, dtype=np.int64)
     count = landmarks["count"].to_numpy(np.int32)
@@ -294,7 +269,7 @@ def _fused(
 
 
 def fused_map_files(folder: Path) -> list[Path]:
-    """The files of the last maps of all components, that of the most robots first."""
+    """Return the files of the last maps of all components; the first has the most robots."""
     motions = read_rows(folder / WRITES[2], MOTIONS)
     of_last = motions[motions["iteration"] == motions["iteration"].max()]
     return [_map_path(folder, k) for k in range(1, 1 + int(of_last["component"].max()))]

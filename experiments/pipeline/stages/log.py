@@ -1,4 +1,4 @@
-"""Stage: one robot's log, from its observations and noisy odometry; the truth beside it."""
+"""Stage: log of one robot from its observations and noisy odometry, with the truth beside it."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ WRITES = ("frames.parquet", *_OBSERVED, "truth_poses.parquet")
 
 @dataclass(frozen=True)
 class LogSettings:
-    """All that a robot's log depends on, beside its way and its observations."""
+    """Settings of a robot's log, in addition to trajectory and observations."""
 
     seed: int
     robot: str
@@ -27,7 +27,7 @@ class LogSettings:
 
 
 def run(settings: LogSettings, job: Job) -> None:
-    """Add odometry to the observations: the log's folder, with the truth beside it."""
+    """Write odometry, observations and truth to the folder of the log."""
     trajectory = read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE)
     index = trajectory.index(settings.robot)
     odometry = measured_odometry(settings, trajectory)
@@ -35,13 +35,13 @@ def run(settings: LogSettings, job: Job) -> None:
     for name in _OBSERVED:
         link_or_copy(job.inputs["observed"] / name, job.output / name)
     attitude = job.inputs["observed"] / ATTITUDE_FILE
-    if attitude.exists():  # of a body that sways
+    if attitude.exists():  # for a body that sways
         link_or_copy(attitude, job.output / ATTITUDE_FILE)
     write_truth_poses(job.output, trajectory.T_world_robot[index])
 
 
 def measured_odometry(settings: LogSettings, trajectory: Trajectory) -> Float:
-    """What a robot's wheels tell it, increments (T, 3)."""
+    """Return the noisy wheel odometry of a robot as increments, shape (T, 3)."""
     wheel_rad = trajectory.wheel_rad[trajectory.index(settings.robot)]
     rng = generator(settings.seed, "odometry", settings.robot)
     increments = encoder_increments(wheel_rad, calibrated_track_m())

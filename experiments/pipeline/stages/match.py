@@ -1,7 +1,4 @@
-"""Stage: correspondences and rival motions of two robots' maps, a batch of iterations at a time.
-
-What matching and aligning read, they read here.
-"""
+"""Stage: correspondences and rival motions of two robots' maps, in batches of iterations."""
 
 import functools
 from collections.abc import Iterator, Mapping
@@ -13,8 +10,13 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.slam import RobotFolders, folders_of_both
-from experiments.pipeline.stages.snapshots import ROBOTS_KEPT, Snapshots, stored_maps
+from experiments.pipeline.stages.slam import (
+    ROBOTS_KEPT,
+    RobotFolders,
+    Snapshots,
+    folders_of_both,
+    stored_maps,
+)
 from experiments.pipeline.tables import CORRESPONDENCES, RIVALS, read_rows, rival_rows, write_rows
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import MatchParameters, match
@@ -24,8 +26,8 @@ from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters, ViewedMap
 from mapfusion.verification.verdict import Judge, why_not_sought
 
-# Evaluated iterations a part: small enough that an interruption loses little and two cores end
-# at about the same time, large enough that reading the maps costs little beside aligning them.
+# Evaluated iterations per part: small enough that an interruption loses little and all cores end at
+# about the same time, large enough that reading the maps is fast compared to their alignment.
 _ITERATIONS_PER_BATCH = 12
 _Known = TypeVar("_Known")
 LABEL = "align the maps"
@@ -34,7 +36,7 @@ WRITES = ("batch_{part}.parquet", "rivals_{part}.parquet")
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """All that correspondences and rivals depend on, beside the maps."""
+    """Settings of correspondences and rivals, in addition to the maps."""
 
     match: MatchParameters
     acceptance: Acceptance
@@ -44,7 +46,7 @@ class MatchSettings:
 
 
 def run(settings: MatchSettings, job: Job) -> None:
-    """Find the correspondences of one batch of iterations, and what they say of rival motions."""
+    """Find correspondences and rival motions of one batch of iterations."""
     made, rivals = [], []
     judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
     for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
@@ -64,46 +66,46 @@ def run(settings: MatchSettings, job: Job) -> None:
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
 def _viewed_map(folders: RobotFolders, iteration: int) -> ViewedMap:
-    """A robot's map, with what it was asked: it is in as many pairs as there are other robots."""
-    return ViewedMap(known_at(stored_maps(folders), iteration))
+    """Return a robot's map with its cached queries, which all pairs of the robot share."""
+    return ViewedMap(latest_at(stored_maps(folders), iteration))
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
-    """The parts of the stage and of the aligners', numbered."""
+    """Return the numbered parts of this stage and of the aligners' stages."""
     return tuple(f"{i:03d}" for i in range(-(-len(iterations) // _ITERATIONS_PER_BATCH)))
 
 
 def batch_path(folder: Path, part: str) -> Path:
-    """Where a stage keeps one batch."""
+    """Return the path of one batch of a stage."""
     return folder / WRITES[0].format(part=part)
 
 
 def read_batches(folder: Path, table_schema: pa.Schema) -> pd.DataFrame:
-    """All batches of this stage's or an aligner's folder, in their order."""
+    """Read all batches of a folder of this stage or of an aligner, in order."""
     paths = sorted(folder.glob(WRITES[0].format(part="*")))
     return pd.concat([read_rows(path, table_schema) for path in paths], ignore_index=True)
 
 
 def rivals_path(folder: Path, part: str) -> Path:
-    """Where the stage keeps the rivals of one batch."""
+    """Return the path of the rivals of one batch."""
     return folder / WRITES[1].format(part=part)
 
 
 def maps_of_both(job: Job) -> list[Snapshots]:
-    """All maps of the job's two robots, by iteration."""
+    """Return all maps of the job's two robots, by iteration."""
     return [stored_maps(folders) for folders in folders_of_both(job)]
 
 
 def pairs_of_maps(
     job: Job, iterations: tuple[int, ...]
 ) -> Iterator[tuple[int, LandmarkMap, LandmarkMap]]:
-    """(iteration, map a, map b) of the job's batch."""
+    """Yield (iteration, map a, map b) of the job's batch."""
     a, b = maps_of_both(job)
     start = int(job.part) * _ITERATIONS_PER_BATCH
     for k in iterations[start : start + _ITERATIONS_PER_BATCH]:
-        yield k, known_at(a, k), known_at(b, k)
+        yield k, latest_at(a, k), latest_at(b, k)
 
 
-def known_at(known: Mapping[int, _Known], iteration: int) -> _Known:
-    """A robot's map, or what belongs to it, at an iteration: the last of a log that ended."""
+def latest_at(known: Mapping[int, _Known], iteration: int) -> _Known:
+    """Return a robot's value at an iteration; the last one if the log ended earlier."""
     return known[max((k for k in known if k <= iteration), default=min(known))]

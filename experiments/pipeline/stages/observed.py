@@ -1,4 +1,4 @@
-"""Stage: one robot's features, tracked into observations; odometry plays no part in them."""
+"""Stage: features of one robot are tracked and become observations, without odometry."""
 
 from dataclasses import dataclass
 
@@ -16,8 +16,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import write_observations, write_truth_points
 from mapfusion.vision.attitude_filter import AttitudeEstimator, AttitudeMeasurement
 from mapfusion.vision.front_end import FrontEndParameters, Observer, concatenate_observations
-from sim.sway import AttitudeNoise
-from sim.trajectory import Trajectory, read_trajectory
+from sim.trajectory import AttitudeNoise, Trajectory, read_trajectory
 
 LABEL = "track features"
 WRITES = ("observations.parquet", "truth_points.parquet", "tracks.parquet")
@@ -25,14 +24,14 @@ WRITES = ("observations.parquet", "truth_points.parquet", "tracks.parquet")
 
 @dataclass(frozen=True)
 class ObservedSettings:
-    """All that a robot's observations depend on, beside its features."""
+    """Settings of a robot's observations, in addition to its features."""
 
     seed: int
     robot: str
     n_frames: int
     camera: StereoCamera
     attitude: AttitudeNoise
-    vision: FrontEndParameters  # tracks, noise and depths; the rest stays at its defaults
+    vision: FrontEndParameters  # tracks, noise and depths; the rest has default values
     images_at: int
     images: int
 
@@ -40,13 +39,12 @@ class ObservedSettings:
 def run(settings: ObservedSettings, job: Job) -> None:
     """Track features over the frames and write the observations and their truth.
 
-    Those of a robot whose body sways are levelled by the attitude that it measures, which is
-    written beside them.
+    If the robot's body sways, its measured attitude levels the observations and is written too.
     """
     observer = Observer.of(settings.camera, settings.vision)
     told = told_tilt(settings, read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE))
     levelling = None if told is None else AttitudeEstimator()
-    # robots drive on one level floor, so their heights are known
+    # the floor is level, so the height is known
     sigma = np.array([settings.attitude.sigma_rad, settings.attitude.sigma_rad, 0.0])
     observed, truth, tracks = [], [], []
     kept = range(settings.images_at, settings.images_at + settings.images)
@@ -74,8 +72,10 @@ def run(settings: ObservedSettings, job: Job) -> None:
 
 
 def told_tilt(settings: ObservedSettings, trajectory: Trajectory) -> Float | None:
-    """Roll and pitch (T, 2) as the robot measures them; None: it takes itself for level."""
+    """Return measured roll and pitch (T, 2); None if the robot assumes a level body."""
     if trajectory.tilt_rad is None or not settings.attitude.measured:
         return None
     rng = generator(settings.seed, "attitude", settings.robot)
-    return settings.attitude.applied(trajectory.tilt_rad[trajectory.index(settings.robot)], rng)
+    return settings.attitude.to_level_frame(
+        trajectory.tilt_rad[trajectory.index(settings.robot)], rng
+    )

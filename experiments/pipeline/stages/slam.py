@@ -1,7 +1,9 @@
-"""Stage: one robot's FastSLAM over its log, with its map at each evaluated iteration."""
+"""Stage: FastSLAM of one robot over its log, with its map at each evaluated iteration."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,19 +28,22 @@ from mapfusion.files import (
     named_columns,
     point_columns,
     point_fields,
+    points_from,
     read_table,
     schema,
     write_table,
 )
 from mapfusion.geometry.numerics import Float
-from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance, with_rows
+from mapfusion.viewing import LogSightings, Viewing
 
 _ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))
 _ITERATION = fields(iteration=INT)
 _SOURCES = fields(count=INT, source_observation=pa.int64())
 SNAPSHOTS = schema("slam.snapshots", 1, [*_ITERATION, *point_fields(), *_SOURCES])
-# From this iteration on, the observation counts for the landmark that came from source_observation
-# (-1: for none). Only changes are listed.
+# From this iteration on, the observation is assigned to the landmark that was created by
+# source_observation (-1: to none). The table lists changes only.
 ASSOCIATIONS = schema(
     "slam.associations", 1, fields(from_iteration=INT, observation=INT, source_observation=INT)
 )
@@ -46,9 +51,8 @@ _STEP = fields(effective_sample_size=FLOAT, resampled=BOOL, n_landmarks=INT, spr
 POSES = schema("slam.poses", 1, [*_ITERATION, *float_fields(_ONLINE + _FINAL), *_STEP])
 _PARTICLE = fields(iteration=INT, particle=INT)
 CLOUDS = schema("slam.clouds", 1, [*_PARTICLE, *float_fields([*POSE_FIELDS, "log_weight"])])
-# The most probable particle's path at each evaluated iteration, which its map was made along.
-# What a log says against itself (datasets/log_consistency.py): a line each, the iteration of a
-# jump or -1, and of jumps the motion that the observations show in place of the odometry.
+# Inconsistencies of a log (mapfusion.datasets.log_consistency), one per row: the iteration of a
+# jump or -1, and for jumps the motion that the observations imply in place of the odometry.
 _OBSERVED = [f"observed_{name}" for name in POSE_FIELDS]
 _OBSERVED_COVARIANCE = ["cov_xx", "cov_xy", "cov_xt", "cov_yy", "cov_yt", "cov_tt"]
 FINDINGS = schema(
@@ -59,6 +63,7 @@ FINDINGS = schema(
         *float_fields([*_OBSERVED, *_OBSERVED_COVARIANCE]),
     ],
 )
+# Path of the most probable particle at each evaluated iteration, from which its map was computed.
 PATHS = schema("slam.paths", 1, [*fields(evaluated=INT), *_ITERATION, *float_fields(POSE_FIELDS)])
 
 LABEL = "FastSLAM"
@@ -74,7 +79,7 @@ WRITES = (
 
 @dataclass(frozen=True)
 class SlamSettings:
-    """All that a robot's maps depend on, beside its log."""
+    """Settings of a robot's maps, in addition to its log."""
 
     seed: int
     filter: FastSlamParameters
@@ -84,19 +89,19 @@ class SlamSettings:
 
 
 class RobotFolders(NamedTuple):
-    """Where a robot's log (with its truth) and its SLAM result lie."""
+    """Folders of a robot's log (with its truth) and of its SLAM result."""
 
     log: Path
     slam: Path
 
 
 def folders_of_both(job: Job) -> list[RobotFolders]:
-    """Those of the two robots that a job of a pair is handed."""
+    """Return the folders of the two robots of a pair's job."""
     return [RobotFolders(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab"]
 
 
 def evaluated_iterations(n_frames: int, every: int) -> list[int]:
-    """Each multiple of `every` from the first on, and the last frame."""
+    """Return each positive multiple of `every` and the last frame."""
     return sorted({*range(every, n_frames, every), n_frames - 1})
 
 
@@ -138,7 +143,7 @@ def run(settings: SlamSettings, job: Job) -> None:
             paths.add(rows, evaluated=k)
     poses = {name: np.array([step[name] for step in steps]) for name in steps[0]}
     poses |= {"iteration": np.arange(len(steps))} | named_columns(_FINAL, path)
-    # An empty map has no row: the list tells that its iteration was evaluated all the same.
+    # The list includes iterations with an empty map, which has no row.
     evaluated = {"iterations": ",".join(map(str, iterations))}
     tables = (maps.columns, associations.columns, poses, clouds.columns, paths.columns)
     schemas = (SNAPSHOTS, ASSOCIATIONS, POSES, CLOUDS, PATHS)
@@ -146,26 +151,24 @@ def run(settings: SlamSettings, job: Job) -> None:
         write_table(job.output / file, rows, table_schema, evaluated)
     gate = gate_finding(log, counted)
     findings = [*found.findings, *([] if gate is None else [gate])]
-    write_table(job.output / WRITES[-1], _finding_columns(findings, found.jumps), FINDINGS)
+    write_findings(job.output, findings, found.jumps)
 
 
-def _finding_columns(
-    findings: Sequence[Finding], jumps: Sequence[Jump]
-) -> Mapping[str, np.ndarray | list[str]]:
-    observed, covariance = (
-        np.full((len(findings), 3), np.nan),
-        np.full((len(findings), 3, 3), np.nan),
-    )
+def write_findings(slam: Path, findings: Sequence[Finding], jumps: Sequence[Jump]) -> None:
+    """Write the findings about a robot's log, with the observed motion of jumps."""
+    observed = np.full((len(findings), 3), np.nan)
+    covariance = np.full((len(findings), 3, 3), np.nan)
     row = {finding.frame: n for n, finding in enumerate(findings) if finding.kind == "jump"}
     for jump in jumps:
         observed[row[jump.frame]], covariance[row[jump.frame]] = jump.observed, jump.covariance
-    return {
+    rows = {
         "check": [finding.kind for finding in findings],
         "iteration": np.array([finding.frame for finding in findings], dtype=np.int32),
         "finding": [finding.text for finding in findings],
         **named_columns(_OBSERVED, observed),
         **covariance_columns(_OBSERVED_COVARIANCE, covariance),
     }
+    write_table(slam / WRITES[-1], rows, FINDINGS)
 
 
 def read_findings(slam: Path) -> pd.DataFrame:
@@ -174,7 +177,7 @@ def read_findings(slam: Path) -> pd.DataFrame:
 
 
 def log_as_filtered(log: Path, slam: Path) -> tuple[RobotLog, Float | None]:
-    """A log as the filter took it, without jumps, and the covariance of its odometry if known."""
+    """Return the filter's input log, without jumps, and its odometry covariance if known."""
     table, _ = read_table(slam / WRITES[-1], FINDINGS)
     recorded = read_log(log)
     observed, covariance = columns(table, _OBSERVED), covariances_from(table, _OBSERVED_COVARIANCE)
@@ -187,13 +190,13 @@ def log_as_filtered(log: Path, slam: Path) -> tuple[RobotLog, Float | None]:
 
 
 class _Rows:
-    """Rows of a table, a part of them at a time."""
+    """Rows of a table, collected in parts."""
 
     def __init__(self) -> None:
         self._parts = list[Mapping[str, np.ndarray]]()
 
     def add(self, columns: Mapping[str, np.ndarray], **same: int) -> None:
-        """Further rows, by column, and what is the same in all of them."""
+        """Add rows by column, with further columns of constant values."""
         n = len(next(iter(columns.values())))
         self._parts.append(
             dict(columns) | {name: np.full(n, value) for name, value in same.items()}
@@ -201,13 +204,14 @@ class _Rows:
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """All rows, by column."""
+        """All rows by column."""
         return {
             name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]
         }
 
 
 def _step(result: StepResult) -> dict[str, float]:
+    """Return the row of one filter step in the table of poses."""
     weights = np.exp(result.log_weights - result.log_weights.max())
     weights /= weights.sum()
     centred = result.cloud[:, :2] - weights @ result.cloud[:, :2]
@@ -222,5 +226,122 @@ def _step(result: StepResult) -> dict[str, float]:
 
 
 def final_path(slam: Path) -> Float:
-    """(T, 3) the most probable particle's whole path, at the end."""
+    """Read the final path of the most probable particle, shape (T, 3)."""
     return read_rows(slam / "poses.parquet", POSES)[_FINAL].to_numpy(np.float64)
+
+
+ROBOTS_KEPT = 4  # robots whose maps a process keeps; tens of megabytes for minutes of driving
+
+
+class Associations:
+    """Landmark of each observation, as C changes between evaluated iterations.
+
+    Attributes:
+        from_iteration: iteration of each change, ascending, shape (C,).
+        observation: row of the log, shape (C,).
+        source: observation that created the landmark, -1 for none, shape (C,).
+    """
+
+    def __init__(
+        self, from_iteration: np.ndarray, observation: np.ndarray, source: np.ndarray
+    ) -> None:
+        order = np.argsort(from_iteration, kind="stable")
+        self.from_iteration = from_iteration[order]
+        self.observation, self.source = observation[order], source[order]
+
+    @classmethod
+    def read(cls, slam: Path) -> "Associations":
+        """Read the associations from the stage's folder."""
+        table, _ = read_table(slam / "associations.parquet", ASSOCIATIONS)
+        names = ("from_iteration", "observation", "source_observation")
+        return cls(*(column(table, name) for name in names))
+
+    def at(self, iteration: int, n_observations: int) -> np.ndarray:
+        """Return the source of the log's first observations at an iteration, int64."""
+        counts_for = np.full(n_observations, -1, dtype=np.int64)
+        so_far = slice(np.searchsorted(self.from_iteration, iteration, side="right"))
+        # the last change of an observation applies
+        counts_for[self.observation[so_far]] = self.source[so_far]
+        return counts_for
+
+
+class Snapshots(Mapping[int, LandmarkMap]):
+    """Map of a robot at each evaluated iteration, created at the first access.
+
+    Descriptors, labels and viewing evidence of the landmarks are taken from the log.
+
+    Args:
+        slam: folder of the stage.
+        log: the filter's input log.
+        viewing: True if maps have viewing evidence, which depends on the whole log up to then.
+    """
+
+    def __init__(self, slam: Path, log: RobotLog, viewing: bool = True) -> None:
+        self._slam, self._log, self._viewing = slam, log, viewing
+        table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
+        about = (column(table, "count"), column(table, "source_observation"))
+        self._landmarks = LandmarkMap(*points_from(table), *about)
+        self._rows = _rows(column(table, "iteration"), attributes["iterations"])
+        self._made: dict[int, LandmarkMap] = {}
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._rows)
+
+    def __getitem__(self, iteration: int) -> LandmarkMap:
+        if iteration not in self._made:
+            landmarks, log = with_rows(self._landmarks, self._rows[iteration]), self._log
+            origin, seen = landmarks.source_observation, log.observations
+            self._made[iteration] = replace(
+                landmarks,
+                descriptor=None if seen.descriptor is None else seen.descriptor[origin],
+                label=None if seen.label is None else seen.label[origin],
+                planar=log.planar,
+                name=log.robot,
+                viewing=self._viewing_of(iteration, origin) if self._viewing else None,
+                calibration=log.calibration,
+            )
+        return self._made[iteration]
+
+    def _viewing_of(self, iteration: int, origin: np.ndarray) -> Viewing:
+        """Return the viewing evidence along the path from which the map was computed."""
+        evaluated, poses = self._paths
+        log, path = self._log, poses[slice(*np.searchsorted(evaluated, [iteration, iteration + 1]))]
+        n_seen = int(np.searchsorted(log.iteration, iteration + 1))
+        return self._sight_lines.viewing(self.associations.at(iteration, n_seen), path, origin)
+
+    @cached_property
+    def _sight_lines(self) -> LogSightings:
+        return LogSightings.of(self._log)
+
+    @cached_property
+    def associations(self) -> Associations:
+        """Landmark of each of the log's observations."""
+        return Associations.read(self._slam)
+
+    @cached_property
+    def _paths(self) -> tuple[np.ndarray, Float]:
+        table, _ = read_table(self._slam / "paths.parquet", PATHS)
+        return column(table, "evaluated"), columns(table, POSE_FIELDS)
+
+
+def stored_maps(folders: RobotFolders, viewing: bool = True) -> Snapshots:
+    """Return a robot's maps, with or without viewing evidence.
+
+    Maps of a few robots stay in memory, because several stages read them. The name of their folder
+    depends on the content of the log.
+    """
+    return _stored_maps(folders, viewing)
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def _stored_maps(folders: RobotFolders, viewing: bool) -> Snapshots:
+    return Snapshots(folders.slam, read_log(folders.log), viewing)
+
+
+def _rows(iteration: np.ndarray, evaluated: str) -> dict[int, slice]:
+    """Return the rows of each evaluated iteration."""
+    known = map(int, evaluated.split(","))
+    return {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in known}

@@ -1,8 +1,8 @@
-"""Stage: one robot's log smoothed in one batch, at each iteration that maps are fused at.
+"""Stage: batch smoothing of one robot's log, at each iteration at which maps are fused.
 
-It takes the filter's noise model and its associations, of which it parts what cannot be one corner.
-So what it finds differs from the filter's map by what a batch knows more, and by the correlations
-of all landmarks that come with it.
+The smoother uses the filter's noise model and its associations, and splits landmarks whose
+observations cannot be of one corner. So its map differs from the filter's by the information of the
+whole batch and by the joint covariance of all landmarks.
 """
 
 from dataclasses import dataclass, replace
@@ -12,8 +12,12 @@ import numpy as np
 import pandas as pd
 
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.slam import evaluated_iterations, final_path, log_as_filtered
-from experiments.pipeline.stages.snapshots import Associations
+from experiments.pipeline.stages.slam import (
+    Associations,
+    evaluated_iterations,
+    final_path,
+    log_as_filtered,
+)
 from experiments.pipeline.tables import INT, fields
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.errors import DamagedFileError
@@ -30,34 +34,34 @@ from mapfusion.files import (
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.robot_log import RobotLog, first_frames
-from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth, smoothed_map
+from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 
-# Its attributes tell how smoothing ended: `n_steps`, the degrees of freedom of the Student-t's of
-# observations and offsets (`observation_dof`, `offset_dof`), the factor on the observations' stated
-# covariances that the log told (`observation_level`), and `not_smoothed`, why there is no path
-# (else empty).
+# Attributes describe the result: `n_steps`, the degrees of freedom of the Student-t distributions
+# of observations and offsets (`observation_dof`, `offset_dof`), the estimated factor on the stated
+# covariances of observations (`observation_scale`), and `not_smoothed`, the reason for a missing
+# path (else empty).
 PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
 
-# Observations that are of another landmark than the filter took them for.
+# Observations whose landmark differs from that of the filter.
 PARTED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
 
 LABEL = "smooth the logs"
 WRITES = ("parted_{part}.parquet", "path_{part}.parquet")
-# Beside these where the log was smoothed: `PATH` tells whether it was.
+# Further files of a smoothed log; `PATH` tells if it was smoothed.
 _MAP_FILES = (
     "map_{part}.parquet",
     "map_{part}.joint.parquet",
     "map_{part}.viewing.parquet",
     "map_{part}.frames.parquet",
 )
-# Unless they are said, maps are fused at so many evenly spread iterations, the last among them.
+# Default number of evenly spaced iterations at which maps are fused, including the last.
 _FUSED_ITERATIONS = 5
-_ENDED = ("n_steps", "observation_dof", "offset_dof", "observation_level", "not_smoothed")
+_ENDED = ("n_steps", "observation_dof", "offset_dof", "observation_scale", "not_smoothed")
 
 
 @dataclass(frozen=True)
 class SmoothSettings:
-    """All that a robot's smoothed maps depend on, beside its log and its filter."""
+    """Settings of a robot's smoothed maps, in addition to its log and filter."""
 
     smoother: SmootherParameters
     noise_floor_m: float
@@ -66,7 +70,7 @@ class SmoothSettings:
 
 
 def fused_iterations(n_frames: int, evaluated_every: int, fused_every: int | None) -> list[int]:
-    """The evaluated iterations that maps are fused at: each multiple, or evenly spread ones."""
+    """Return the evaluated iterations at which maps are fused: multiples or evenly spaced."""
     if fused_every is not None:
         return evaluated_iterations(n_frames, fused_every)
     known = np.array(evaluated_iterations(n_frames, evaluated_every))
@@ -75,24 +79,24 @@ def fused_iterations(n_frames: int, evaluated_every: int, fused_every: int | Non
 
 
 def iterations_of(n_frames: int, fused: list[int]) -> tuple[int, ...]:
-    """Those of a robot; one whose log ends earlier takes part with its last map from then on."""
+    """Return the iterations of a robot; after the end of its log, its last one."""
     return tuple(sorted({min(k, n_frames - 1) for k in fused}))
 
 
 def parts(iterations: tuple[int, ...]) -> tuple[str, ...]:
-    """The stage's parts, one an iteration."""
+    """Return the stage's parts, one per iteration."""
     return tuple(map(str, iterations))
 
 
 def run(settings: SmoothSettings, job: Job) -> None:
     """Smooth the log up to one iteration; write the map with its joint covariance, and the path.
 
-    A log that cannot be smoothed has no map and an empty path, with the reason.
+    If the log cannot be smoothed, there is no map and an empty path with the reason.
     """
     log, covariance = log_as_filtered(job.inputs["log"], job.inputs["slam"])
-    given = filtered_until(job, log, int(job.part), settings.noise_floor_m)
+    given = smoother_inputs(job, log, int(job.part), settings.noise_floor_m)
     own = replace(settings, smoother=replace(settings.smoother, odometry_covariance=covariance))
-    made = smoothed_anew(own, *given, read_attitude(job.inputs["log"]))
+    made = smooth_log(own, *given, read_attitude(job.inputs["log"]))
     landmarks, path, landmark, ended = made
     if landmarks is not None:
         write_map(_map_path(job.output, job.part), landmarks)
@@ -106,60 +110,53 @@ def run(settings: SmoothSettings, job: Job) -> None:
 
 
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:
-    """A log as it was at an iteration, its observations as noisy as the filter takes them."""
+    """Return a log up to an iteration, with the filter's covariances of observations."""
     part = first_frames(log, iteration + 1)
     covariance = part.observations.covariance_m2 + noise_floor_m**2 * np.eye(3)
     return replace(part, observations=replace(part.observations, covariance_m2=covariance))
 
 
-def filtered_until(
+def smoother_inputs(
     job: Job, log: RobotLog, iteration: int, noise_floor_m: float
 ) -> tuple[RobotLog, np.ndarray, Float]:
-    """What is smoothed: the log until then, the filter's associations as they were, its path."""
+    """Return the log up to an iteration, and the filter's associations and path there."""
     log = log_until(log, iteration, noise_floor_m)
     landmark = Associations.read(job.inputs["slam"]).at(iteration, len(log.observations))
     return log, landmark, final_path(job.inputs["slam"])[: iteration + 1]
 
 
-def smoothed_anew(
+def smooth_log(
     settings: SmoothSettings,
     log: RobotLog,
     landmark: np.ndarray,
     path: Float,
     attitude: Attitude | None,
 ) -> tuple[LandmarkMap | None, Float, np.ndarray, tuple[object, ...]]:
-    """Map, path, which landmark observations are of, and how smoothing ended, see `_ENDED`.
+    """Return map, path, landmark of each observation, and the values of `_ENDED`.
 
-    There is no map, and no pose in the path, where the log cannot be smoothed.
+    If the log cannot be smoothed, the map is None and the path is empty.
     """
-    found = _smoothed(log, landmark, path, settings)
-    if not isinstance(found, str):
+    try:
+        found = smooth(log, landmark, path, settings.smoother, settings.max_memory_gb)
+    except MemoryError as error:
+        reason = f"smoothing {error}: smooth.max_memory_gb is {settings.max_memory_gb:g}"
+    except np.linalg.LinAlgError as error:
+        reason = (
+            f"its equations have no solution ({error}): covariances of its observations, or what "
+            "slam.filter.motion states of its odometry, differ by too many orders of magnitude"
+        )
+    else:
         ended = (found.n_steps, *found.tails, found.observation_scale, "")
         try:
             made = smoothed_map(log, found, attitude=attitude)
             return made, found.estimate.path, found.landmark, ended
         except np.linalg.LinAlgError:
-            found = "has a map whose covariance cannot be computed"
-    return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, found)
-
-
-def _smoothed(
-    log: RobotLog, landmark: np.ndarray, path: Float, settings: SmoothSettings
-) -> Smoothed | str:
-    """Return what the smoother finds, or why it finds nothing and what can be done."""
-    try:
-        return smooth(log, landmark, path, settings.smoother, settings.max_memory_gb)
-    except MemoryError as error:
-        return f"smoothing {error}: smooth.max_memory_gb is {settings.max_memory_gb:g}"
-    except np.linalg.LinAlgError as error:
-        return (
-            f"its equations have no solution ({error}): covariances of its observations, or what "
-            "slam.filter.motion states of its odometry, differ by too many orders of magnitude"
-        )
+            reason = "has a map whose covariance cannot be computed"
+    return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, reason)
 
 
 def map_files(folder: Path, iteration: int) -> list[Path]:
-    """The files of the map at an iteration that has one: the map, and what lies beside it."""
+    """Return the files of the map at a smoothed iteration."""
     return [folder / name.format(part=iteration) for name in _MAP_FILES]
 
 
@@ -176,9 +173,10 @@ def _path_path(folder: Path, part: str) -> Path:
 
 
 def read_smoothed(folder: Path, last_whole: bool = False) -> dict[int, LandmarkMap]:
-    """The robot's smoothed map, with its joint covariance, at each iteration that has one.
+    """Read the smoothed map of a robot at each smoothed iteration.
 
-    If `last_whole` only the last one has that, and viewing evidence: it is most of what is read.
+    If `last_whole`, only the last map has its joint covariance and viewing evidence, which are most
+    of the data.
 
     Raises:
         DamagedFileError: a file of a map is damaged or missing.
@@ -193,7 +191,7 @@ def read_smoothed(folder: Path, last_whole: bool = False) -> dict[int, LandmarkM
 
 
 def read_smoothed_path(folder: Path) -> dict[int, Float]:
-    """The smoothed path (k + 1, 3) up to each iteration k that has one, in order."""
+    """Read the smoothed path (k + 1, 3) up to each smoothed iteration k, in order."""
     paths = {}
     for k in _iterations(folder):
         table, attributes = read_table(_path_path(folder, str(k)), PATH)
@@ -203,13 +201,13 @@ def read_smoothed_path(folder: Path) -> dict[int, Float]:
 
 
 def smoothed_owners(smooth: Path, slam: Path, iteration: int, n_observations: int) -> np.ndarray:
-    """(n_observations,) source of the smoothed map's landmark that each is of, -1 for none.
+    """Return the source of each observation's landmark in the smoothed map, -1 for none.
 
     Args:
-        smooth: this stage's folder.
-        slam: the filter's, whose associations hold where nothing was parted.
-        iteration: that has a smoothed map.
-        n_observations: of the log until then.
+        smooth: folder of this stage.
+        slam: folder of the filter, whose associations hold except for split landmarks.
+        iteration: an iteration with a smoothed map.
+        n_observations: number of observations of the log up to the iteration.
     """
     owner = Associations.read(slam).at(iteration, n_observations)
     table, _ = read_table(_parted_path(smooth, str(iteration)), PARTED)
@@ -218,9 +216,9 @@ def smoothed_owners(smooth: Path, slam: Path, iteration: int, n_observations: in
 
 
 def read_endings(folder: Path) -> pd.DataFrame:
-    """How smoothing ended, one row an iteration.
+    """Read the outcome of smoothing, one row per iteration.
 
-    Columns: iteration, n_steps, observation_dof, offset_dof, observation_level, not_smoothed.
+    Columns: iteration, n_steps, observation_dof, offset_dof, observation_scale, not_smoothed.
     """
     ends = {k: read_table(_path_path(folder, str(k)), PATH)[1] for k in _iterations(folder)}
     rows = pd.DataFrame([{name: end[name] for name in _ENDED} for end in ends.values()])
@@ -229,6 +227,7 @@ def read_endings(folder: Path) -> pd.DataFrame:
 
 
 def _iterations(folder: Path) -> list[int]:
+    """Return the iterations of the stage's files."""
     begin, _, end = WRITES[1].partition("{part}")
     files = (path.name for path in folder.glob(f"{begin}[0-9]*{end}"))
     return sorted(int(name.removeprefix(begin).removesuffix(end)) for name in files)

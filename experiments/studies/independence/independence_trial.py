@@ -30,7 +30,7 @@ from experiments.pipeline.stages.fuse import FuseSettings, read_fusions
 from experiments.pipeline.stages.match import MatchSettings
 from experiments.pipeline.stages.slam import SlamSettings
 from experiments.pipeline.stages.smooth import SmoothSettings
-from experiments.pipeline.store import Store, mending
+from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows
 from experiments.pipeline.tasks import OnProgress, run_tasks, tasks_of
 from experiments.pipeline.workers import workers
@@ -434,7 +434,7 @@ def run_independence(
     for scenario in scenarios:
         run = EvaluatedRun.of(scenario, store)
         make = partial(_tables, run, sizes, jobs, on_progress)
-        own_teams, own_costs = mending(store, make)
+        own_teams, own_costs = retry_damaged(store, make)
         teams.append(own_teams.assign(scenario=scenario.name, seed=scenario.seed))
         costs.append(own_costs.assign(scenario=scenario.name, seed=scenario.seed))
     both = (pd.concat(tables, ignore_index=True) for tables in (teams, costs))

@@ -22,7 +22,7 @@ from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import fuse, smooth
 from experiments.pipeline.stages.aligner import AlignerSettings
 from experiments.pipeline.stages.fuse import FuseSettings
-from experiments.pipeline.stages.match import known_at, maps_of_both
+from experiments.pipeline.stages.match import latest_at, maps_of_both
 from experiments.pipeline.stages.slam import SlamSettings
 from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows
@@ -177,9 +177,9 @@ def _filter(
 
 def _smooth_at(settings: SmoothSettings, job: Job, log: RobotLog, iteration: int) -> Cost:
     """Return the cost of smoothing the log up to an iteration, with the joint covariance."""
-    given = smooth.filtered_until(job, log, iteration, settings.noise_floor_m)
+    given = smooth.smoother_inputs(job, log, iteration, settings.noise_floor_m)
     meter = Meter()
-    smooth.smoothed_anew(settings, *given, read_attitude(job.inputs["log"]))
+    smooth.smooth_log(settings, *given, read_attitude(job.inputs["log"]))
     return meter.read()
 
 
@@ -231,7 +231,7 @@ def measure_pair(settings: PairCostSettings, job: Job) -> None:
     """Write the cost of aligning two maps at each iteration, with matching and acceptance."""
     single_threaded()
     maps_a, maps_b = maps_of_both(job)
-    both = {k: (known_at(maps_a, k), known_at(maps_b, k)) for k in settings.iterations}
+    both = {k: (latest_at(maps_a, k), latest_at(maps_b, k)) for k in settings.iterations}
     _align(settings, *both[settings.iterations[-1]])  # compiles and fills caches
     costs = [cost_row(k, ALIGNMENT, _align(settings, *maps)) for k, maps in both.items()]
     write_rows(job.output / COSTS_FILE, WORK_COSTS, costs)

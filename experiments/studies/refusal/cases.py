@@ -22,8 +22,7 @@ from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.pair_evaluation import load_robot
 from experiments.evaluation.result import require_result
 from experiments.evaluation.truth import common_landmarks, true_pairs
-from experiments.pipeline.stages.slam import RobotFolders, evaluated_iterations
-from experiments.pipeline.stages.snapshots import stored_maps
+from experiments.pipeline.stages.slam import RobotFolders, evaluated_iterations, stored_maps
 from experiments.pipeline.store import Store
 from experiments.scenario.seeds import parse_seeds
 from experiments.scenario.settings import AnyScenario, Simulation

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.tables import table_path
-from experiments.pipeline.stages.match import known_at
+from experiments.pipeline.stages.match import latest_at
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.tasks import OnProgress
 from experiments.pipeline.workers import workers
@@ -267,7 +267,7 @@ def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
     of_a, of_b = functools.cache(crossing.a.maps), functools.cache(crossing.b.maps)
     rows: Rows = []
     for robot_a, robot_b, iteration in crossing.meetings:
-        maps = known_at(of_a(robot_a), iteration), known_at(of_b(robot_b), iteration)
+        maps = latest_at(of_a(robot_a), iteration), latest_at(of_b(robot_b), iteration)
         rows += _answers(scenario, cases.apart(*maps, matching), worlds, iteration)
     if len(crossing.a.folders) < 2 or not crossing.hung:  # a poster needs a second robot in world a
         return rows
@@ -275,7 +275,7 @@ def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
     last = min(world.iterations[-1] for world in worlds)
     first, partner, *_ = in_a.values()
     source = cases.common(first, partner, last, matching, scenario.evaluate.true_pair_radius_m)
-    others = [known_at(robot.maps, last) for robot in in_b.values()]
+    others = [latest_at(robot.maps, last) for robot in in_b.values()]
     for number in range(REPEATED_PER_WORLDS):
         each, size = divmod(number, len(cases.POSTER_RADII_M))  # every robot with every size
         rng = generator(scenario.seed, "poster", crossing.a.name, crossing.b.name, number)

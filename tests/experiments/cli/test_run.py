@@ -12,8 +12,8 @@ import pytest
 from experiments.evaluation import tables
 from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import run_scenario
-from experiments.pipeline.pipeline import lay_out
 from experiments.pipeline.stage import Job
+from experiments.pipeline.stages.pipeline import build_pipeline
 from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Recording, Simulation
@@ -205,7 +205,9 @@ def test_only_the_changed_aligner_runs_again(tiny: Simulation) -> None:
     changed = tiny.align.aligners[0].model_copy(update={"parameters": {"gate_m": 0.25}})
     entries = [changed, *tiny.align.aligners[1:]]
     other = tiny.model_copy(update={"align": tiny.align.model_copy(update={"aligners": entries})})
-    before, after = (lay_out(scenario).pairs[0].estimates.before for scenario in (tiny, other))
+    before, after = (
+        build_pipeline(scenario).pairs[0].estimates.before for scenario in (tiny, other)
+    )
     same = {name: after[name].key == stage.key for name, stage in before.items()}
     assert same == {"match": True, "aligner 0": False, "aligner 1": True, "aligner 2": True}
 
@@ -220,7 +222,7 @@ def test_maps_are_fused_again_when_the_aligner_changed_that_merges_them(
         row = (row + 1) % len(entries)
     entries[row] = entries[row].model_copy(update={"time_limit_s": 7.5})
     other = tiny.model_copy(update={"align": tiny.align.model_copy(update={"aligners": entries})})
-    before, after = (lay_out(scenario).fusers for scenario in (tiny, other))
+    before, after = (build_pipeline(scenario).fusers for scenario in (tiny, other))
     assert [before[name].key != after[name].key for name in before] == [merges] * len(before)
 
 

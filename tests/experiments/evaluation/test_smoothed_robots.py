@@ -92,12 +92,14 @@ FILTER_S = "FastSLAM's map stands in"
 
 def fails_at(monkeypatch: pytest.MonkeyPatch, places: list[tuple[str, int]]) -> None:
     """Have smoothing fail for robots at iterations."""
-    works = smooth._smoothed
+    works = smooth.smooth_log
 
-    def fails(log, *rest):
-        return "fails here" if (log.robot, len(log) - 1) in places else works(log, *rest)
+    def fails(settings, log, landmark, path, attitude):
+        if (log.robot, len(log) - 1) not in places:
+            return works(settings, log, landmark, path, attitude)
+        return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, "fails here")
 
-    monkeypatch.setattr(smooth, "_smoothed", fails)
+    monkeypatch.setattr(smooth, "smooth_log", fails)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from experiments.evaluation.truth import (
     landmark_truth,
     true_pairs,
 )
-from experiments.pipeline.stages.snapshots import Associations
+from experiments.pipeline.stages.slam import Associations
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotTruth

@@ -10,8 +10,8 @@ import pytest
 
 from experiments.pipeline import cluster
 from experiments.pipeline.cluster import (
+    SweepTerms,
     TaskFailedError,
-    Terms,
     UnfitWorkerError,
     code_version,
     perform,
@@ -39,35 +39,35 @@ class Killed:
 def test_it_is_started_again(monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
     killed = Killed(failures)
     monkeypatch.setattr(cluster, "LocalCluster", killed)
-    assert cluster._started(2) == "a cluster"
+    assert cluster._start_cluster(2) == "a cluster"
     assert killed.started == failures + 1
 
 
 def test_three_times_in_a_row_is_no_accident(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "LocalCluster", Killed(99))
     with pytest.raises(InputError, match="--jobs 2: 2 workers could not be started, 3 times"):
-        cluster._started(2)
+        cluster._start_cluster(2)
 
 
 @pytest.fixture
-def terms(tmp_path: Path) -> Terms:
+def terms(tmp_path: Path) -> SweepTerms:
     attempts = tmp_path / "attempts"
     attempts.mkdir()
-    return Terms(attempts, 2, code_version())
+    return SweepTerms(attempts, 2, code_version())
 
 
 def packed(function: object, *arguments: object, outputs: tuple[Path, ...] = ()) -> bytes:
     return pickle.dumps(Task("drive/k", "drive", function, arguments, outputs))  # type: ignore[arg-type]
 
 
-def test_it_runs_and_leaves_no_mark(terms: Terms, tmp_path: Path) -> None:
+def test_it_runs_and_leaves_no_mark(terms: SweepTerms, tmp_path: Path) -> None:
     task = packed(acting.write, tmp_path / "out", "text", outputs=(tmp_path / "out",))
     perform("drive/k", task, terms)
     assert (tmp_path / "out").read_text() == "text"
     assert not list(terms.attempts.iterdir())
 
 
-def test_it_returns_what_the_function_returns(terms: Terms, tmp_path: Path) -> None:
+def test_it_returns_what_the_function_returns(terms: SweepTerms, tmp_path: Path) -> None:
     assert perform("drive/k", packed(int, "7"), terms) == 7
     done = packed(acting.break_down, outputs=(Path(__file__),))  # done before: it is not called
     assert perform("drive/k", done, terms) is None
@@ -82,7 +82,7 @@ def test_it_returns_what_the_function_returns(terms: Terms, tmp_path: Path) -> N
     ],
 )
 def test_what_it_raises_is_a_reason(
-    terms: Terms, function: object, reason: str, with_details: bool
+    terms: SweepTerms, function: object, reason: str, with_details: bool
 ) -> None:
     with pytest.raises(TaskFailedError) as raised:
         perform("drive/k", packed(function), terms)
@@ -93,7 +93,9 @@ def test_what_it_raises_is_a_reason(
     assert not list(terms.attempts.iterdir())
 
 
-def test_a_task_that_kills_its_worker_is_begun_only_so_often(terms: Terms, tmp_path: Path) -> None:
+def test_a_task_that_kills_its_worker_is_begun_only_so_often(
+    terms: SweepTerms, tmp_path: Path
+) -> None:
     """Only the task at work is blamed, by the mark that the killed process left behind."""
     journal, script = tmp_path / "journal", tmp_path / "worker.py"
     task = packed(acting.die, journal)
@@ -113,10 +115,10 @@ def test_a_task_that_kills_its_worker_is_begun_only_so_often(terms: Terms, tmp_p
     assert journal.read_text().split() == ["died"] * 3
 
 
-def test_machines_that_cannot_take_part_say_so(terms: Terms, tmp_path: Path) -> None:
-    elsewhere = Terms(tmp_path / "not shared" / "attempts", 2, terms.code)
+def test_machines_that_cannot_take_part_say_so(terms: SweepTerms, tmp_path: Path) -> None:
+    elsewhere = SweepTerms(tmp_path / "not shared" / "attempts", 2, terms.code)
     with pytest.raises(UnfitWorkerError, match="must be shared"):
         perform("drive/k", packed(acting.break_down), elsewhere)
-    outdated = Terms(terms.attempts, 2, "another version")
+    outdated = SweepTerms(terms.attempts, 2, "another version")
     with pytest.raises(UnfitWorkerError, match="other source or libraries"):
         perform("drive/k", packed(acting.break_down), outdated)

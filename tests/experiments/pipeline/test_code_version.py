@@ -195,7 +195,7 @@ class Source:
         os.utime(self._root / "mapfusion" / f"{module}.py", (1e9, 1e9))
 
     def called(self) -> dict[str, list[object]]:
-        """What the kernels give for 10, and whether they had been compiled before."""
+        """Return the kernels' values for 10, and whether each kernel was in the cache."""
         left_out = {"NUMBA_CACHE_DIR", "PYTHONPATH"}
         environment = {name: value for name, value in os.environ.items() if name not in left_out}
         environment["XDG_CACHE_HOME"] = str(self.cache)

@@ -1,4 +1,4 @@
-"""Which renderer made a result is known; one that is not there is one clear line."""
+"""A result names its renderer; a missing renderer gives one clear line."""
 
 import json
 from pathlib import Path
@@ -62,7 +62,7 @@ def test_the_ray_caster_is_in_the_record_and_in_the_key(tiny_path: Path, tmp_pat
     assert [provenance(run)["renderer"] for run in runs] == ["TinyRenderer", "our ray caster"]
     tiny, cast = (run.pipeline.simulated[0] for run in runs)
     assert tiny.features.key != cast.features.key
-    assert "sim/raycast/wall_columns.py" in cast.features.sources
+    assert "sim/rendering/walls.py" in cast.features.sources
 
 
 def test_the_ray_caster_s_camera_stays_below_the_walls_upper_edge(

@@ -14,8 +14,8 @@ from pydantic_core import to_jsonable_python
 from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.pipeline import stage as stage_module
 from experiments.pipeline.code_version import imported_sources
-from experiments.pipeline.pipeline import lay_out
-from experiments.pipeline.stage import Job, RecordedLog, Stage, with_those_before
+from experiments.pipeline.stage import Job, RecordedLog, Stage, in_dependency_order
+from experiments.pipeline.stages.pipeline import build_pipeline
 from experiments.pipeline.store import Store
 from experiments.plugins.discovery import find_method
 from experiments.scenario.loading import load_scenario, scenario_of
@@ -102,7 +102,7 @@ WORDS += ("other", "raycast", "pixels", "drop")
 def stages_of(scenario: Simulation) -> list[Stage]:
     """In the scenario's order: done they are in another, the aligner that merges first."""
     found = EvaluatedRun.of(scenario, Store(Path("nowhere"))).stages()
-    return with_those_before([*(s for s in found if s.name not in ("aligner", "fuse")), *found])
+    return in_dependency_order([*(s for s in found if s.name not in ("aligner", "fuse")), *found])
 
 
 @pytest.fixture(scope="module")
@@ -250,7 +250,7 @@ def test_a_recorded_log_that_has_changed_is_read_again(tmp_path: Path) -> None:
     for n_frames in (4, 5):
         times_s, still = np.arange(float(n_frames)), np.zeros((n_frames, 3))
         write_log(tmp_path / "log", RobotLog("R1", True, times_s, still, np.empty(0), nothing))
-        (robot,) = lay_out(load_scenario(path)).robots
+        (robot,) = build_pipeline(load_scenario(path)).robots
         found.append((robot.n_frames, robot.log.key))
     (before, old_key), (after, new_key) = found
     assert (before, after) == (4, 5)

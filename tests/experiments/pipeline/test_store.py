@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from experiments.pipeline.stage import Job, Stage
-from experiments.pipeline.store import Store, link_or_copy, require_sound
+from experiments.pipeline.store import Store, link_or_copy, require_undamaged
 from experiments.pipeline.tasks import tasks_of
 from mapfusion.errors import DamagedFileError, StoreRepairWarning
 from mapfusion.files import write_json
@@ -57,7 +57,7 @@ def finished_stage(root: Path) -> tuple[Path, dict[str, Path]]:
 
 def test_a_flipped_bit_of_a_finished_stage_is_noticed(tmp_path: Path) -> None:
     folder, files = finished_stage(tmp_path)
-    require_sound(folder)
+    require_undamaged(folder)
     assert len(files) == 6
     for path in files.values():
         data = path.read_bytes()
@@ -66,10 +66,10 @@ def test_a_flipped_bit_of_a_finished_stage_is_noticed(tmp_path: Path) -> None:
             flipped[at] ^= 1 << at % 8
             path.write_bytes(flipped)
             with pytest.raises(DamagedFileError) as raised:
-                require_sound(folder)
+                require_undamaged(folder)
             assert raised.value.path == path
         path.write_bytes(data)
-        require_sound(folder)
+        require_undamaged(folder)
 
 
 @pytest.mark.parametrize("data", [None, b"", b"half", b"half a!"])
@@ -80,15 +80,15 @@ def test_a_file_of_a_stage_that_is_missing_or_cut_is_named(
     half = files["half_a"]
     half.unlink() if data is None else half.write_bytes(data)
     with pytest.raises(DamagedFileError, match=r"half_a: (damaged|no such file)"):
-        require_sound(folder)
-    require_sound(folder, "picture_*.png")
+        require_undamaged(folder)
+    require_undamaged(folder, "picture_*.png")
 
 
 def test_what_is_added_to_a_finished_stage_later_is_not_checked(tmp_path: Path) -> None:
     folder, _ = finished_stage(tmp_path)
     (folder / "aligner_timings.parquet").write_bytes(b"")
-    require_sound(folder)
-    require_sound(tmp_path / "log of a user")
+    require_undamaged(folder)
+    require_undamaged(tmp_path / "log of a user")
 
 
 @pytest.mark.parametrize("files", [None, [], {"half_a": 3}, {"half_a": {"size": -1}}])
@@ -96,7 +96,7 @@ def test_a_mark_that_lists_no_files_is_named(tmp_path: Path, files: object) -> N
     folder, paths = finished_stage(tmp_path)
     write_json(paths["done_a.json"], {"figures": {}, "files": files})
     with pytest.raises(DamagedFileError, match=r"done_a\.json: is not the mark of a finished"):
-        require_sound(folder)
+        require_undamaged(folder)
 
 
 def test_a_stage_is_made_from_sound_inputs_alone(tmp_path: Path) -> None:

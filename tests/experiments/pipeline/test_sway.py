@@ -21,7 +21,7 @@ SWAY = "drive.body_sway.sigma_rad=0.052"  # 3 degrees
 
 
 class Mapped(NamedTuple):
-    """Of one robot: its log's folder, the trajectory's, and the landmarks' error after a fit."""
+    """Return folders of log and trajectory of one robot, and the landmark error after a fit."""
 
     log: Path
     drive: Path

@@ -1,4 +1,4 @@
-"""What is known of a pair of maps comes back from the rows of its tables."""
+"""Tests of `experiments.pipeline.tables`."""
 
 import numpy as np
 import pandas as pd

@@ -155,7 +155,7 @@ def _append_after(journal: Path, name: str, output: Path, other: Path) -> None:
 
 
 def test_this_process_does_nothing_where_no_task_is_left(tmp_path: Path) -> None:
-    """What it would load is loaded by whoever wants it."""
+    """The final task is not run without tasks before it."""
     with workers(1) as pool:
         run_tasks([], pool, lambda *_: None, tasks(tmp_path, {"own": ()})["own"])
     assert journal(tmp_path) == []

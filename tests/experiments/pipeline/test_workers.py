@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from experiments.cli import main as cli
-from experiments.pipeline.workers import held_back_interrupts, saved_defect, workers
+from experiments.pipeline.workers import blocked_interrupts, save_defect, workers
 from mapfusion.errors import InputError
 from tests.helpers import acting
 from tests.helpers.tiny_scenario import command
@@ -37,7 +37,7 @@ def in_a_worker() -> None:
 
 @pytest.mark.parametrize("work", [acting.break_down, in_a_worker])
 def test_the_place_is_where_it_was_raised(work: Callable[[], object]) -> None:
-    told = saved_defect(raised(work))
+    told = save_defect(raised(work))
     assert "\n" not in told
     assert "ZeroDivisionError a bug at " in told
     lines, first = inspect.getsourcelines(acting.break_down)
@@ -67,7 +67,7 @@ def child_is_spared() -> bool:
 
 
 def test_processes_started_meanwhile_never_see_it() -> None:
-    with held_back_interrupts() as let_them_come:
+    with blocked_interrupts() as let_them_come:
         assert child_is_spared()
         started = threading.Event()
         spared: list[bool] = []
@@ -83,12 +83,12 @@ def test_processes_started_meanwhile_never_see_it() -> None:
 
 FIRST_OF_ALL = """
 import multiprocessing, sys
-from experiments.pipeline.workers import held_back_interrupts
+from experiments.pipeline.workers import blocked_interrupts
 from tests.experiments.pipeline.test_workers import tell
 
 if __name__ == "__main__":
     spawn = multiprocessing.get_context("spawn")
-    with held_back_interrupts():
+    with blocked_interrupts():
         for name in ("first", "second"):
             process = spawn.Process(target=tell, args=(f"{sys.argv[1]}/{name}",))
             process.start()

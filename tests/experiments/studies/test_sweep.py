@@ -28,7 +28,7 @@ from distributed import Client, Future, LocalCluster
 from distributed.security import Security
 
 from experiments.evaluation import tables
-from experiments.pipeline.cluster import Terms, code_version, connected
+from experiments.pipeline.cluster import SweepTerms, code_version, dask_client
 from experiments.pipeline.store import Store
 from experiments.pipeline.tasks import Task, unfinished
 from experiments.studies import sweep as driver_module
@@ -200,7 +200,7 @@ def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
     short_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two workers need 0.3 GB each before they begin; other machines have what they have."""
-    monkeypatch.setattr("experiments.pipeline.memory.memory_bytes", lambda: 0.6e9)
+    monkeypatch.setattr("experiments.pipeline.stages.memory.memory_bytes", lambda: 0.6e9)
     asked = prepare([short_path], [0], [], tmp_path)
     (reason,) = execute(asked, 2, None, lambda _: None).failed.values()
     assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason
@@ -267,7 +267,7 @@ def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path
 def client() -> Iterator[Client]:
     """On a machine so busy that Dask would take a killed worker for lost before it is back."""
     busy = {"distributed.deploy.lost-worker-timeout": "0.1s"}
-    with dask.config.set(busy), connected(2, None) as connection:
+    with dask.config.set(busy), dask_client(2, None) as connection:
         yield connection
 
 
@@ -277,7 +277,7 @@ class Scene:
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.folder = folder
         self.dataset = SweepDataset(folder / "sweep", ())
-        self.terms = Terms(folder / "attempts", 3, code_version())
+        self.terms = SweepTerms(folder / "attempts", 3, code_version())
         self.terms.attempts.mkdir()
         self.tasks: dict[int, list[Task]] = {}
         self.told: list[SweepProgress] = []
@@ -558,8 +558,8 @@ def test_an_existing_cluster_of_unfit_workers_ends_the_sweep(scene: Scene, tmp_p
         n_workers=1, processes=False, dashboard_address="localhost:0", silence_logs=50
     ) as cluster:
         assert isinstance(cluster.scheduler_address, str)
-        with connected(1, cluster.scheduler_address) as client:
-            scene.terms = Terms(tmp_path / "elsewhere" / "attempts", 3, code_version())
+        with dask_client(1, cluster.scheduler_address) as client:
+            scene.terms = SweepTerms(tmp_path / "elsewhere" / "attempts", 3, code_version())
             with pytest.raises(InputError, match="must be shared by all machines"):
                 scene.execute(client)
 
@@ -567,7 +567,7 @@ def test_an_existing_cluster_of_unfit_workers_ends_the_sweep(scene: Scene, tmp_p
 def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("experiments.pipeline.cluster.CONNECT_TIMEOUT_S", 0.2)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "tls://127.0.0.1:1"):
-        with pytest.raises(InputError, match=f"--scheduler {address}"), connected(1, address):
+        with pytest.raises(InputError, match=f"--scheduler {address}"), dask_client(1, address):
             pass
 
 

@@ -1,6 +1,6 @@
-"""How the stages of a scenario are laid out; nothing is run."""
+"""Tests of `experiments.pipeline.stages.pipeline`."""
 
-from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stages.pipeline import build_pipeline
 from experiments.scenario.settings import Simulation
 
 
@@ -9,7 +9,7 @@ def test_two_robots_are_aligned_in_the_order_of_their_names(tiny: Simulation) ->
     first, second = tiny.robots
     renamed = [first.model_copy(update={"name": "R10"}), second]
     for robots in (renamed, renamed[::-1]):
-        pipeline = lay_out(tiny.model_copy(update={"robots": robots}))
+        pipeline = build_pipeline(tiny.model_copy(update={"robots": robots}))
         (pair,) = pipeline.pairs
         assert (pair.a.name, pair.b.name) == ("R2", "R10")
         assert [robot.name for robot in pipeline.robots] == [robot.name for robot in robots]
@@ -17,7 +17,7 @@ def test_two_robots_are_aligned_in_the_order_of_their_names(tiny: Simulation) ->
 
 def test_no_robot_waits_for_another_with_what_is_made_in_one_piece(tiny: Simulation) -> None:
     """The robots' tasks of a stage are neighbours: two processes are both busy with it."""
-    names = [stage.name for stage in lay_out(tiny).stages()]
+    names = [stage.name for stage in build_pipeline(tiny).stages()]
     assert names[:2] == ["drive", "faces"]
     for name in ("features", "slam", "smooth"):
         first = names.index(name)

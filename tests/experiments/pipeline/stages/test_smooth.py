@@ -1,4 +1,4 @@
-"""The smoother as a stage: what it is given, what it writes, and when it cannot."""
+"""Tests of `experiments.pipeline.stages.smooth`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.slam import ASSOCIATIONS, FINDINGS, POSES
+from experiments.pipeline.stages.slam import ASSOCIATIONS, FINDINGS, POSES, Associations
 from experiments.pipeline.stages.smooth import (
     WRITES,
     SmoothSettings,
@@ -22,7 +22,6 @@ from experiments.pipeline.stages.smooth import (
     read_smoothed_path,
     run,
 )
-from experiments.pipeline.stages.snapshots import Associations
 from experiments.pipeline.tables import write_rows
 from mapfusion.errors import DamagedFileError
 from mapfusion.files import POSE_FIELDS

@@ -5,10 +5,10 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from mapfusion.geometry.camera import StereoCamera
-from sim.raycast.floor_and_ceiling import BACKGROUND, fill, footprints, row_depth_m
-from sim.raycast.scene import make_scene
-from sim.raycast.visible_walls import Pinhole
-from tests.sim.raycast.scenes import pinhole
+from sim.rendering.floor_and_ceiling import BACKGROUND, draw_plane, footprints, row_depth_m
+from sim.rendering.scene import make_scene
+from sim.rendering.walls import Pinhole
+from tests.sim.rendering.scenes import pinhole
 
 # wide, so that a row is drawn in pieces; coarse, so that it needs smaller copies of the picture
 CAMERA = StereoCamera(300, 120, 60.0, mount_x_m=0.0)
@@ -26,7 +26,7 @@ def test_a_floor_is_the_mean_of_its_samples(pose: list[float]) -> None:
     floor = make_scene(corners, lambda i: texels).floor
     camera = pinhole(CAMERA, np.array(pose))
     picture = np.zeros((CAMERA.height_px, CAMERA.width_px), dtype=np.uint8)
-    fill(camera, floor, False, np.full(CAMERA.width_px, 60), picture)
+    draw_plane(camera, floor, False, np.full(CAMERA.width_px, 60), picture)
     plan, copies = footprints(camera, floor), copies_of(texels, len(floor.first))
     assert plan[:, 2].max() > 0
     off = []

@@ -1,6 +1,6 @@
-"""All stages of a scenario up to the aligners' estimates, laid out; nothing is computed here.
+"""Pipeline of a scenario: all stages up to the aligners' estimates; nothing is computed here.
 
-Each stage is handed its own settings, taken from the scenario here and nowhere else.
+This is the only module that takes the stages' settings from a scenario.
 """
 
 import itertools
@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.pipeline.stage import RecordedLog, Stage, with_those_before
+from experiments.pipeline.stage import RecordedLog, Stage, in_dependency_order
 from experiments.pipeline.stages import (
     align,
     aligner,
@@ -26,7 +26,7 @@ from experiments.pipeline.stages import (
     slam,
     smooth,
 )
-from experiments.pipeline.stages.walls import Walls
+from experiments.pipeline.stages.faces import Walls
 from experiments.plugins.discovery import Kind, find_method, fingerprint
 from experiments.scenario.settings import AnyScenario, Recording, Scenario, Simulation
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section
@@ -41,7 +41,7 @@ from sim.renderer import renderer_name
 
 @dataclass(frozen=True)
 class RobotStages:
-    """From one robot's log to its maps."""
+    """Stages from one robot's log to its maps."""
 
     name: str
     n_frames: int
@@ -52,7 +52,7 @@ class RobotStages:
 
 @dataclass(frozen=True)
 class SimulatedRobotStages(RobotStages):
-    """The same of a robot whose log is simulated."""
+    """Stages of a robot whose log is simulated."""
 
     log: Stage
     features: Stage
@@ -61,14 +61,14 @@ class SimulatedRobotStages(RobotStages):
 
 @dataclass(frozen=True)
 class PairStages:
-    """Two robots, and the aligners' estimates from their maps.
+    """Stages of two robots, up to the aligners' estimates from their maps.
 
     Attributes:
-        a: the first robot by name.
-        b: the second.
+        a: first robot by name.
+        b: second robot.
         match: correspondences and rivals.
-        aligners: by the name that the scenario gives them.
-        estimates: all of these joined.
+        aligners: stages of the aligners by their names in the scenario.
+        estimates: estimates of all aligners joined.
     """
 
     a: RobotStages
@@ -80,25 +80,24 @@ class PairStages:
 
 @dataclass(frozen=True)
 class Pipeline:
-    """What a scenario's stages lead to: maps of each robot, estimates of every two, fused maps."""
+    """Stages of a scenario: maps of each robot, estimates of each pair, and fused maps."""
 
     scenario: AnyScenario
     robots: tuple[RobotStages, ...]
     pairs: tuple[PairStages, ...]
-    fusers: Mapping[str, Stage]  # by name; none for a single robot
+    fusers: Mapping[str, Stage]  # by name; empty for a single robot
 
     @property
     def simulated(self) -> list[SimulatedRobotStages]:
-        """Robots with images."""
+        """Simulated robots."""
         return [robot for robot in self.robots if isinstance(robot, SimulatedRobotStages)]
 
     def stages(self) -> list[Stage]:
-        """All stages, each after those before it; in the order in which they keep processes busy.
+        """Return all stages, each after the stages that it needs.
 
-        What is made in one piece (a robot's tracks, its filter) is made for all robots at a time,
-        and not for the last one while others wait. Fused maps need one aligner only and are made in
-        few long pieces, so they come before the others' estimates: many short pieces at the end
-        keep all processes at work until then.
+        Stages with one part (tracks and filter of a robot) run for all robots at the same time.
+        Fused maps need one aligner only and have few long tasks. So they come before the estimates
+        of the other aligners, whose many short tasks keep all processes busy until the end.
         """
         images = [robot.features for robot in self.simulated]
         logs = [robot.log for robot in self.simulated]
@@ -106,14 +105,14 @@ class Pipeline:
         maps = [robot.smooth for robot in self.robots]
         estimates = (pair.estimates for pair in self.pairs)
         in_order = [*images, *logs, *filters, *maps, *self.fusers.values(), *estimates]
-        return with_those_before(in_order)
+        return in_dependency_order(in_order)
 
 
-def lay_out(scenario: AnyScenario) -> Pipeline:
-    """The stages of a scenario; of recorded logs the names and lengths are read.
+def build_pipeline(scenario: AnyScenario) -> Pipeline:
+    """Return the stages of a scenario; names and lengths of recorded logs are read.
 
     Raises:
-        InputError: a recorded log that cannot be read, or names that cannot be used together.
+        InputError: a recorded log cannot be read, or names of robots are invalid.
     """
     recorded = isinstance(scenario, Recording)
     robots = tuple(_recorded(scenario) if recorded else _simulated(scenario))
@@ -123,9 +122,9 @@ def lay_out(scenario: AnyScenario) -> Pipeline:
 
 
 def _stage(module: ModuleType, *sections: Section, own: dict[str, Any], **more: Any) -> Stage:
-    """The stage that a module of `experiments.pipeline.stages` does the work of, under its name.
+    """Return the stage of a module of `experiments.pipeline.stages`, named after the module.
 
-    It is told the fields of its settings and no others: its own, and from the sections by name.
+    The fields of its settings are taken from `own` and, by name, from the sections.
     """
     kind = module.run.__annotations__["settings"]
     known = {name: value for section in sections for name, value in section} | own
@@ -135,6 +134,7 @@ def _stage(module: ModuleType, *sections: Section, own: dict[str, Any], **more: 
 
 
 def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
+    """Yield the stages of simulated robots."""
     world, render, keep = scenario.world, scenario.render, scenario.keep
     lines = tuple(tuple(wall.points) for wall in world.walls)
     walls = Walls(lines, world.wall_height_m, world.wall_thickness_m)
@@ -164,11 +164,13 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
 
 
 def _recorded(scenario: Recording) -> Iterable[RobotStages]:
-    """Robots of recorded logs give their names to files, as those of scenarios do."""
+    """Yield the stages of robots with recorded logs, whose names must be valid file names."""
     robots: dict[str, tuple[int, RecordedLog]] = {}
     for folder in map(Path, scenario.logs):
         frames = folder / "frames.parquet"
-        recorded, name, n_frames = _known(folder, _stamps(folder))
+        files = ((path.name, path.stat()) for path in sorted(folder.glob("*")))
+        stamps = tuple((name, stat.st_mtime_ns, stat.st_size) for name, stat in files)
+        recorded, name, n_frames = _read_recorded(folder, stamps)
         if not n_frames:
             raise InputError(f"{folder}: frames.parquet holds no frame")
         if not re.fullmatch(NAME_PATTERN, name):
@@ -185,20 +187,18 @@ def _recorded(scenario: Recording) -> Iterable[RobotStages]:
         yield RobotStages(name, n_frames, recorded, mapped, smoothed)
 
 
-def _stamps(folder: Path) -> tuple[tuple[str, int, int], ...]:
-    """What changes with a log's files."""
-    files = ((path.name, path.stat()) for path in sorted(folder.glob("*")))
-    return tuple((name, stat.st_mtime_ns, stat.st_size) for name, stat in files)
+@lru_cache(maxsize=256)  # all runs of a sweep have the same logs
+def _read_recorded(folder: Path, _: object) -> tuple[RecordedLog, str, int]:
+    """Return a recorded log, its robot's name and number of frames.
 
-
-@lru_cache(maxsize=256)  # a sweep lays out the same logs for every run
-def _known(folder: Path, _: object) -> tuple[RecordedLog, str, int]:
-    """A recorded log, its robot's name and number of frames; read again when it has changed."""
+    The second argument is the state of the files: a changed log is read again.
+    """
     log = read_log(folder)
     return RecordedLog(folder), log.robot, len(log)
 
 
 def _slam(scenario: Scenario, logged: Stage | RecordedLog) -> Stage:
+    """Return the stage of a robot's filter."""
     sections = (scenario, scenario.slam, scenario.evaluate, scenario.keep)
     return _stage(slam, *sections, own={}, before={"log": logged})
 
@@ -206,7 +206,7 @@ def _slam(scenario: Scenario, logged: Stage | RecordedLog) -> Stage:
 def _smooth(
     scenario: Scenario, logged: Stage | RecordedLog, mapped: Stage, n_frames: int, n_most: int
 ) -> Stage:
-    """By the filter's own noise model; `n_most` are the frames of the team's longest log."""
+    """Return the stage of a robot's smoother; `n_most` are the frames of the team's longest log."""
     fused = smooth.fused_iterations(n_most, scenario.evaluate.every, scenario.fuse.every)
     settings, iterations = scenario.slam.filter, smooth.iterations_of(n_frames, fused)
     return _stage(
@@ -223,27 +223,27 @@ def _smooth(
 
 
 def smoother_parameters(scenario: Scenario) -> SmootherParameters:
-    """The filter's own noise model, but for the corners that the filter cannot tell apart."""
+    """Return the smoother's parameters, with the filter's noise model."""
     slam = scenario.slam
     return SmootherParameters(slam.filter.motion, scenario.smooth.stray_m, slam.min_count)
 
 
 def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
-    """Two robots, in the order of their names: whichever a scenario lists first."""
+    """Return the stages of two robots, which are ordered by name."""
     a, b = sorted(robots, key=lambda robot: name_order(robot.name))
     n_frames = max(a.n_frames, b.n_frames)
     iterations = tuple(slam.evaluated_iterations(n_frames, scenario.evaluate.every))
     parts = match.batches(iterations)
     maps = {"log_a": a.log, "slam_a": a.slam, "log_b": b.log, "slam_b": b.slam}
     own = {"iterations": iterations}
-    # a robot's maps are in several pairs, and what is matched of two goes to all aligners
+    # a robot's maps are shared by several pairs, and the matches of a pair by all aligners
     matched = _stage(match, scenario.align, own=own, before=maps, parts=parts, shares=match.LABEL)
     estimates: dict[str, Stage] = {}
     for entry in scenario.align.aligners:
         method = find_method(entry.method)
         module = method.target.partition(":")[0]
         if method.kind is Kind.PLUG_IN:
-            module = "mapfusion.align"  # it may import whatever helps it
+            module = "mapfusion.align"  # a plug-in may import any of its modules
         estimates[entry.name] = _stage(
             aligner,
             *(scenario, scenario.align, entry),
@@ -251,7 +251,7 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
             before=maps | {"match": matched},
             parts=parts,
             loads=(module,),
-            # fusing does not wait for the others
+            # fusing waits for the merging aligner only
             shares="" if entry.name == scenario.merge.aligner else f"estimates on {matched.key}",
         )
     named = {f"aligner {i}": stage for i, stage in enumerate(estimates.values())}
@@ -262,13 +262,14 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
 def _fusers(
     scenario: Scenario, robots: Sequence[RobotStages], pairs: Sequence[PairStages]
 ) -> dict[str, Stage]:
+    """Return the stages of the fusers by name."""
     n_frames = max(robot.n_frames for robot in robots)
     iterations = smooth.fused_iterations(n_frames, scenario.evaluate.every, scenario.fuse.every)
     before: dict[str, Stage | RecordedLog] = {}
     for robot in robots:
         before |= {f"log {robot.name}": robot.log, f"slam {robot.name}": robot.slam}
         before[f"smooth {robot.name}"] = robot.smooth
-    for pair in pairs:  # fused maps stay as they are when an aligner changes that does not merge
+    for pair in pairs:  # fused maps do not depend on the other aligners
         both = f"{pair.a.name} {pair.b.name}"
         before[f"match {both}"] = pair.match
         before[f"aligner {both}"] = pair.aligners[scenario.merge.aligner]

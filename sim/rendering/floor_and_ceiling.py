@@ -1,9 +1,9 @@
 """Floor and ceiling: mean texture over the footprint of each pixel.
 
-A row of a level camera's picture shows a level plane at one depth, Z = h f / |v - c|. A footprint
-is Z / f wide and Z^2 / (h f) deep: far off it is long and narrow, turned against the picture's
-texels: it is filled with bilinear samples all along it, from the copy whose texels are as
-large as it is wide (Heckbert 1989, section 3; McCormack et al. 1999, Feline).
+A row of a level camera shows a horizontal plane at one depth, Z = h f / |v - c|. The footprint of a
+pixel is Z / f wide and Z^2 / (h f) deep, so at large depths it is long, narrow and rotated against
+the texels. It is sampled bilinearly along its length, from the pyramid level whose texels are as
+large as its width (Heckbert 1989, section 3; McCormack et al. 1999, Feline).
 """
 
 import functools
@@ -13,51 +13,51 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapfusion.geometry.numerics import Float, kernel
-from sim.raycast.scene import Level
-from sim.raycast.visible_walls import Pinhole, anywhere
+from sim.rendering.scene import HorizontalPlane
+from sim.rendering.walls import Pinhole, at_origin
 
-BACKGROUND = 255.0  # grey level of what is nowhere, as PyBullet has it
-MOST_SAMPLES = 64  # along a footprint
-STEP_TEXELS = 2.0  # between samples; floors are painted with a low pass of one texel
-# Places are whole numbers of 2^-22 cells, shares of a cell of 2^-8, sums of 2^-16 grey levels: so
-# loops take half the time. 2 x MOST_SAMPLES values of 255 still fit into 32 bits,
-# and so does the way of PIECE pixels, of two cells each at most.
+BACKGROUND = 255.0  # grey level of the background in PyBullet
+MOST_SAMPLES = 64  # most samples along a footprint
+STEP_TEXELS = 2.0  # distance between samples; textures have a low pass of one texel
+# Fixed-point numbers, which halve the time of loops: positions in 2^-22 cells, shares of a cell in
+# 2^-8, sums in 2^-16 grey levels. Sums of 2 x MOST_SAMPLES values of 255 fit into 32 bits, and so
+# do positions along PIECE pixels of at most two cells each.
 PLACE_BITS, SHARE_BITS, PIECE = 22, 8, 128
 PLACE_UNIT, SUM_UNIT = 1 << PLACE_BITS, 1 << 2 * SHARE_BITS
 MOST_CELLS = 2 * PIECE
 TO_SHARE = np.uint32(PLACE_BITS - SHARE_BITS)
 WHOLE_SHARE, LOW_SHARE = np.uint32(1 << SHARE_BITS), np.uint32((1 << SHARE_BITS) - 1)
-FIRST_AND_THIRD = np.uint32(0x00FF00FF)  # bytes of a cell
+FIRST_AND_THIRD = np.uint32(0x00FF00FF)  # mask of these bytes of a cell
 BYTE, HALF, LOW_HALF = np.uint32(8), np.uint32(16), np.uint32(0xFFFF)
 
-Way = tuple[float, float, float]
+RayCoefficients = tuple[float, float, float]
 Line = tuple[float, float, float, float]  # x, y and their steps from pixel to pixel
-Size = tuple[int, int]  # of a copy of the picture: rows and columns
+Size = tuple[int, int]  # rows and columns of a pyramid level
 
 
 def row_depth_m(camera: Pinhole, height_m: ArrayLike, v: ArrayLike) -> Float:
-    """Depths (N,) at which rays through rows (N,) meet level planes; infinity if they do not."""
+    """Return depths (N,) at which rays of rows (N,) meet planes; infinity without intersection."""
     down = (np.asarray(v) - camera.center_v) / camera.focal_px
     drop = camera.eye_z_m - np.asarray(height_m)
     with np.errstate(divide="ignore"):
         return np.where(drop * down > 0, drop / down, np.inf)
 
 
-def footprints(camera: Pinhole, level: Level) -> np.ndarray:
-    """How each row is sampled (H, 3) int64: samples along, samples across, copy of the picture."""
+def footprints(camera: Pinhole, level: HorizontalPlane) -> np.ndarray:
+    """Return the sampling of each row: samples along, samples across and pyramid level, (H, 3)."""
     per_m = float(level.shape[0, 1] / level.size_m[0])
-    return _footprints(anywhere(camera), level.height_m, per_m, len(level.first))
+    return _footprints(at_origin(camera), level.height_m, per_m, len(level.first))
 
 
 @functools.lru_cache(maxsize=8)
 def _footprints(camera: Pinhole, height_m: float, per_m: float, copies: int) -> np.ndarray:
-    """The same of a picture with so many texels per metre and so many copies."""
+    """Return `footprints` for a number of texels per metre and of pyramid levels."""
     edges_m = row_depth_m(camera, height_m, np.arange(camera.height_px + 1) - 0.5)
     z = row_depth_m(camera, height_m, np.arange(camera.height_px))
     seen = np.isfinite(edges_m[:-1]) & np.isfinite(edges_m[1:])
     along = np.abs(edges_m[1:][seen] - edges_m[:-1][seen]) * per_m
     across = z[seen] / camera.focal_px * per_m
-    # halved until they are at most two texels wide, as far as there are copies
+    # the pyramid level at which footprints are at most two texels wide
     mantissa, halvings = np.frexp(across)
     k = np.clip(halvings - np.where(mantissa > 0.5, 1, 2), 0, copies - 1)
     across, along = np.ldexp(across, -k), np.ldexp(along, -k)
@@ -68,33 +68,42 @@ def _footprints(camera: Pinhole, height_m: float, per_m: float, copies: int) -> 
     return plan
 
 
-def ways(camera: Pinhole, level: Level) -> tuple[Way, Way]:
-    """How rays go over a picture: right = a + (b + c u) Z, and up likewise, both 0 to 1 on it."""
+def ray_coefficients(
+    camera: Pinhole, level: HorizontalPlane
+) -> tuple[RayCoefficients, RayCoefficients]:
+    """Return coefficients a, b, c of texture coordinates of rays: right = a + (b + c u) Z, and up.
+
+    Both coordinates are 0 to 1 on the texture.
+    """
     cos, sin = math.cos(camera.theta), math.sin(camera.theta)
     left = camera.center_u / camera.focal_px
     corner_x, corner_y = level.corner_m.tolist()
     x0, y0 = camera.eye_x_m - corner_x, camera.eye_y_m - corner_y
     dx, dy = cos - left * sin, sin + left * cos
 
-    def along(x: float, y: float) -> Way:
+    def along(x: float, y: float) -> RayCoefficients:
         return x * x0 + y * y0, x * dx + y * dy, (x * sin - y * cos) / camera.focal_px
 
     return along(*level.right_per_m2.tolist()), along(*level.up_per_m2.tolist())
 
 
-def fill(
-    camera: Pinhole, level: Level, is_above: bool, open_rows: np.ndarray, picture: np.ndarray
+def draw_plane(
+    camera: Pinhole,
+    level: HorizontalPlane,
+    is_above: bool,
+    open_rows: np.ndarray,
+    picture: np.ndarray,
 ) -> None:
-    """Draw floor or ceiling where walls leave pixels open on its side of the horizon.
+    """Draw floor or ceiling in pixels that walls leave open on its side of the horizon.
 
     Args:
-        camera: level.
+        camera: level camera.
         level: floor or ceiling.
-        is_above: whether it lies above the horizon.
-        open_rows: (W,) so many rows of each column, from the picture's edge on, are open.
-        picture: (H, W) uint8, changed.
+        is_above: True if the plane lies above the horizon.
+        open_rows: number of open rows of each column, from the image's edge on, shape (W,).
+        picture: image, shape (H, W) uint8; changed.
     """
-    plan, way = footprints(camera, level), ways(camera, level)
+    plan, way = footprints(camera, level), ray_coefficients(camera, level)
     rise = (camera.eye_z_m - level.height_m) * camera.focal_px
     texels = level.shape, level.first, level.cells
     _fill(*texels, plan, way, rise, camera.center_v, is_above, open_rows, picture)
@@ -106,14 +115,14 @@ def _fill(
     firsts: np.ndarray,
     cells: np.ndarray,
     plan: np.ndarray,
-    way: tuple[Way, Way],
+    way: tuple[RayCoefficients, RayCoefficients],
     rise: float,
     center_v: float,
     is_above: bool,
     open_rows: np.ndarray,
     picture: np.ndarray,
 ) -> None:
-    """Row by row: there the depth is one, and footprints lie side by side on a line."""
+    """Draw row by row: the footprints of a row have one depth and lie on a line."""
     height, width = picture.shape
     place, cell = np.empty((3, PIECE), dtype=np.int32), np.empty(PIECE, dtype=np.uint32)
     sums = np.empty(PIECE, dtype=np.uint32)
@@ -129,7 +138,7 @@ def _fill(
             end = first
             while end < last:
                 begin, end = end, last
-                if row >= least:  # the next columns that are open
+                if row >= least:  # the next open columns
                     while begin < last and row >= open_rows[begin]:
                         begin += 1
                     end = begin
@@ -149,8 +158,7 @@ def _fill(
                             _add_at_the_edge(cells, corner, line, size, count, sums)
                         else:
                             wide = size[1] + 1
-                            # Fill in places: along x and y from the lowest cell, and in cells
-                            # from it.
+                            # positions relative to the lowest cell, and cell indices
                             x, y, x_step, y_step = line
                             first_x, first_y = x - leftmost, y - lowest
                             from_x, step_x = (
@@ -174,7 +182,7 @@ def _fill(
                                 sums[i] += _between(
                                     cell[i], np.uint32(place[0, i]), np.uint32(place[1, i])
                                 )
-                # Draw means of samples, rounded, into a row's pixels from `begin` on.
+                # draw rounded means of samples from column `begin` on
                 samples = max(n * across, 1)
                 scale, at = np.float32(1 / (SUM_UNIT * samples)), np.uintp(begin)
                 for i in range(count):
@@ -183,11 +191,8 @@ def _fill(
 
 
 @kernel
-def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
-    """Where a row's pixels lie on a copy of the picture, in cells, from the one at `u` on.
-
-    Cells lie between the middles of texels.
-    """
+def _line(way: tuple[RayCoefficients, RayCoefficients], u: float, z: float, size: Size) -> Line:
+    """Return the line of a row's footprints on a pyramid level, in cells, from `u` on."""
     (right_0, right_z, right_zu), (up_0, up_z, up_zu) = way
     height, width = size
     x = (right_0 + (right_z + right_zu * u) * z) * width + 0.5
@@ -197,10 +202,7 @@ def _line(way: tuple[Way, Way], u: float, z: float, size: Size) -> Line:
 
 @kernel
 def _lowest_cell(line: Line, count: int, size: Size) -> tuple[int, int]:
-    """Row and column that none of a line's cells is below or to the left of.
-
-    -1: near the edge, or too far.
-    """
+    """Return the lowest row and column of a line's cells; -1 near the edge or if too long."""
     x, y, x_step, y_step = line
     height, width = size
     x_last, y_last = x + (count - 1) * x_step, y + (count - 1) * y_step
@@ -212,15 +214,16 @@ def _lowest_cell(line: Line, count: int, size: Size) -> tuple[int, int]:
     return int(low), int(left)
 
 
-# Of the loops that follow each does one thing: those that only look up and those that only reckon
-# run in the processor's vectors, one that does both does not. They are functions of their own,
-# whose arrays need not be held on to: that takes longer than such a loop.
+# Look-ups and arithmetic are in separate loops, so that the compiler vectorises them. The loops are
+# kernels of their own, because Numba otherwise counts references of their arrays, which takes
+# longer than the loop.
 
 
 @kernel
 def _look_up(
     cells: np.ndarray, lowest: int, place: np.ndarray, count: int, cell: np.ndarray
 ) -> None:
+    """Fill in the cells at positions relative to the lowest cell."""
     corner = np.uint64(lowest)
     for i in range(count):
         cell[i] = cells[corner + np.uint64(place[2, i])]
@@ -228,9 +231,9 @@ def _look_up(
 
 @kernel
 def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
-    """What lies between a cell's corners, the bytes of one number, in 2^-16 grey levels."""
+    """Return the bilinear interpolation between the bytes of a cell, in 2^-16 grey levels."""
     right, up = (x >> TO_SHARE) & LOW_SHARE, (y >> TO_SHARE) & LOW_SHARE
-    # lower and upper edge at once, in the halves of one number
+    # lower and upper edge at the same time, in the halves of one number
     lefts, rights = cell & FIRST_AND_THIRD, (cell >> BYTE) & FIRST_AND_THIRD
     edges = np.uint32(np.uint32(lefts * (WHOLE_SHARE - right)) + np.uint32(rights * right))
     lower, upper = edges & LOW_HALF, edges >> HALF
@@ -241,7 +244,7 @@ def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
 def _add_at_the_edge(
     cells: np.ndarray, corner: int, line: Line, size: Size, count: int, sums: np.ndarray
 ) -> None:
-    """Add samples anywhere; beside the picture there is nothing."""
+    """Add samples at any position; the background lies beside the texture."""
     height, width = size
     for i in range(count):
         x, y = line[0] + i * line[2], line[1] + i * line[3]
@@ -254,11 +257,11 @@ def _add_at_the_edge(
             sums[i] += np.uint32(SUM_UNIT * int(BACKGROUND))
 
 
-def texels(level: Level, right: Float, up: Float) -> np.ndarray:
-    """The texels (...) that points of the picture lie on; the background beside it."""
+def lookup_texels(level: HorizontalPlane, right: Float, up: Float) -> np.ndarray:
+    """Return texels (...) at texture coordinates; the background beside the texture."""
     inside = (right >= 0) & (right < 1) & (up >= 0) & (up < 1)
     height, width = level.shape[0]
-    # it is the first corner of the cell to the right of its middle and above it
+    # a texel is the lower left corner of the cell to the upper right of its centre
     row, column = (up[inside] * height).astype(int) + 1, (right[inside] * width).astype(int) + 1
     found = np.full(inside.shape, BACKGROUND)
     found[inside] = level.cells[row * (width + 1) + column] & 0xFF

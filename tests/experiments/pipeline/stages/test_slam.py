@@ -1,4 +1,4 @@
-"""What the SLAM stage tells of a step of the filter."""
+"""Tests of `experiments.pipeline.stages.slam`."""
 
 import numpy as np
 import pytest

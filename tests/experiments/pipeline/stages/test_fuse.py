@@ -1,4 +1,4 @@
-"""What the stage `fuse` writes is what it reads again."""
+"""Tests of `experiments.pipeline.stages.fuse`."""
 
 from pathlib import Path
 

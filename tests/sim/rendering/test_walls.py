@@ -1,13 +1,13 @@
-"""What columns see in plan, against rays cast one by one."""
+"""Tests of `sim.rendering.walls`."""
 
 import numpy as np
 import pytest
 
 from mapfusion.geometry.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
-from sim.raycast.scene import Walls, make_scene
-from sim.raycast.visible_walls import NONE, Pinhole, look
-from tests.sim.raycast.scenes import pinhole
+from sim.rendering.scene import Walls, make_scene
+from sim.rendering.walls import NO_WALL, Pinhole, find_visible_walls
+from tests.sim.rendering.scenes import pinhole
 
 CAMERA = StereoCamera(160, 120, 144.0)
 PLAN = FloorPlan(
@@ -45,14 +45,14 @@ def cast(walls: Walls, camera: Pinhole, u: np.ndarray) -> tuple[np.ndarray, np.n
         z = (to_start[:, 0] * walls.along[:, 1] - to_start[:, 1] * walls.along[:, 0]) / cross
         t = (to_start[:, 0] * ray[..., 1] - to_start[:, 1] * ray[..., 0]) / cross
         z = np.where((z > camera.near_m) & (t >= 0) & (t <= walls.width_m) & (cross < 0), z, np.inf)
-    return np.where(np.isfinite(z.min(axis=1)), z.argmin(axis=1), NONE), z.min(axis=1)
+    return np.where(np.isfinite(z.min(axis=1)), z.argmin(axis=1), NO_WALL), z.min(axis=1)
 
 
 def test_columns_middles_see_the_nearest_wall_at_its_depth(walls: Walls) -> None:
     u = np.arange(float(CAMERA.width_px))
     for pose in places(60):
         camera = pinhole(CAMERA, pose)
-        plan = look(camera, walls)
+        plan = find_visible_walls(camera, walls)
         true_face, true_m = cast(walls, camera, u)
         np.testing.assert_array_equal(plan.middle, true_face)
         np.testing.assert_allclose(plan.middle_m, true_m, rtol=1e-9)
@@ -62,7 +62,7 @@ def test_strips_are_what_rays_through_their_middles_meet(walls: Walls) -> None:
     several = 0
     for pose in places(60):
         camera = pinhole(CAMERA, pose)
-        plan = look(camera, walls)
+        plan = find_visible_walls(camera, walls)
         begin, end = plan.low, plan.high
         edges = np.arange(CAMERA.width_px + 1) - 0.5
         np.testing.assert_allclose(begin[plan.first[:-1]], edges[:-1], atol=1e-8)
@@ -80,9 +80,9 @@ def test_where_no_wall_is_none_is_seen() -> None:
     corners = np.array([[[2, 0.5, 0], [2, -0.5, 0], [2, -0.5, 2.5], [2, 0.5, 2.5]]], dtype=float)
     walls = make_scene(corners, lambda _: np.zeros((4, 4), dtype=np.uint8)).walls
     camera = pinhole(StereoCamera(160, 120, 80.5, mount_x_m=0.0), np.zeros(3))
-    plan = look(camera, walls)
+    plan = find_visible_walls(camera, walls)
     assert np.sum((plan.high - plan.low)[plan.face == 0]) == pytest.approx(80.5 / 2, abs=1e-9)
     turned = pinhole(CAMERA, np.array([4.0, 0.0, np.pi]))  # behind it: seen from its front only
-    plan = look(turned, walls)
-    assert np.all(plan.face == NONE)
+    plan = find_visible_walls(turned, walls)
+    assert np.all(plan.face == NO_WALL)
     assert np.all(np.isinf(plan.middle_m))

@@ -1,7 +1,7 @@
-"""The memory a run will need, estimated before it starts: it is refused where the machine has less.
+"""Memory that a run will need, estimated before the run starts.
 
-Estimates are upper bounds of what grows with the settings, good to a factor of two or so: they are
-to catch a slip of the keyboard, not to plan a cluster.
+Estimates are upper bounds of the parts that grow with the settings, accurate to a factor of about
+two. They detect mistyped settings.
 """
 
 import os
@@ -11,39 +11,39 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from experiments.pipeline.pipeline import Pipeline, RobotStages
 from experiments.pipeline.stage import RecordedLog
+from experiments.pipeline.stages.pipeline import Pipeline, RobotStages
 from experiments.scenario.settings import Scenario, SimulatedScenario, Simulation
 from mapfusion.errors import InputError
 from mapfusion.tables import is_csv, table_path
 from sim.textures import STYLES
 
 _GB = 1e9
-_PROCESS_BYTES = 300e6  # a worker with the numerical libraries and compiled kernels
-# A landmark's row holds a mean (3 numbers), a covariance (6) and a count for each particle; while
-# rows are doubled the old half is there too, so half as much again. Its slot has a descriptor.
+_PROCESS_BYTES = 300e6  # worker with numerical libraries and compiled kernels
+# A landmark has a mean (3 numbers), a covariance (6) and a count for each particle, and a slot with
+# a descriptor. The factor 1.5 is for the old half while arrays are doubled.
 _ROW_BYTES, _SLOT_BYTES = 1.5 * (9 * 8 + 4), 1.5 * 400
-# Of the corners seen in a frame so many are taken for new landmarks: 0.5 to 2 % in the suite.
+# Share of the corners of a frame that become new landmarks: 0.5 to 2 % in the suite.
 _NEW_SHARE = 0.02
-_POSE_BYTES = 3 * 8 + 4  # kept of each particle and frame: its pose and its ancestor
-_ASSOCIATION_BYTES = 4  # and of each observation: the landmark it went into
-# Both are kept of all particles only since these had one ancestor. That is 2 M resamplings ago on
-# average where weights differ little, fewer elsewhere, and each takes ten frames or more.
+_POSE_BYTES = 3 * 8 + 4  # per particle and frame: pose and ancestor
+_ASSOCIATION_BYTES = 4  # per particle and observation: landmark
+# Both are stored for all M particles only since their common ancestor. That is at most 2 M
+# resamplings ago on average, with ten frames or more between two resamplings.
 _FRAMES_A_PARTICLE = 30
-# An observation of a log: position, covariance, descriptor, label, pixels, frame.
+# Observation of a log: position, covariance, descriptor, label, pixels, frame.
 _OBSERVATION_BYTES = 3 * 8 + 9 * 8 + 64 * 4 + 4 + 3 * 4 + 4
-# Two images with their depth, noise and corner responses: 60 to 80 bytes measured at 2048 x 2048.
+# Two images with depth, noise and corner responses need 60 to 80 bytes per pixel.
 _PIXEL_BYTES = 100
-# The renderer's copy of a texture, and what one face needs while it is painted.
+# The renderer's copy of a texel, and the memory per texel while a face is painted.
 _TEXEL_BYTES, _PAINTED_BYTES = 4, 20
-# A landmark of an evaluated map is a row of twelve numbers, and there once more when it is written.
+# A landmark of an evaluated map has twelve numbers, and a copy while it is written.
 _EVALUATED_BYTES = 2 * 12 * 8
-_CGROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # of version 2 and 1
+_CGROUP_LIMITS = ("memory.max", "memory/memory.limit_in_bytes")  # cgroup version 2 and 1
 
 
 @dataclass(frozen=True)
 class Need:
-    """Memory of one process, and which setting it grows with."""
+    """Memory of one process, and the setting on which it depends."""
 
     n_bytes: float
     setting: str
@@ -51,9 +51,9 @@ class Need:
 
 
 def require_memory(pipeline: Pipeline, jobs: int, machine_bytes: float | None = None) -> None:
-    """Raise InputError, naming the setting, where the machine has less than the run will need.
+    """Raise InputError, naming the setting, if the machine has less memory than the run needs.
 
-    `machine_bytes` is what this machine has, unless it is given.
+    `machine_bytes` is the memory of the machine; None: that of this machine.
     """
     has = memory_bytes() if machine_bytes is None else machine_bytes
     need = max(needs(pipeline), key=lambda need: need.n_bytes)
@@ -67,10 +67,10 @@ def require_memory(pipeline: Pipeline, jobs: int, machine_bytes: float | None = 
 
 
 def needs(pipeline: Pipeline) -> Iterator[Need]:
-    """Yield what the tasks that need most of a process need.
+    """Yield the memory of the tasks that need most.
 
-    The smoother is not among them: its need depends on what was seen. It is bounded when the log is
-    there, by `smooth.max_memory_gb` (`mapfusion.smoother.elimination.memory_bytes`).
+    The smoother's memory depends on the log and is bounded later, by
+    `smooth.max_memory_gb` (`mapfusion.smoother.elimination.memory_bytes`).
     """
     scenario = pipeline.scenario
     for robot in pipeline.robots:
@@ -83,25 +83,22 @@ def needs(pipeline: Pipeline) -> Iterator[Need]:
         yield _of_textures(scenario)
 
 
-def _n_rows(path: Path) -> int:
-    """Return the number of rows of a log's table, Parquet or CSV, without reading the table."""
-    if is_csv(path):
-        with path.open("rb") as file:
-            return max(sum(1 for _ in file) - 1, 0)
-    return pq.read_metadata(path).num_rows
-
-
 def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
-    """The log, its landmarks, and of late: particles x landmarks, frames and observations."""
+    """Yield the memory of the filter with its log, and of the evaluated maps."""
     settings = scenario.slam.filter
     n_frames = n_observations = robot.n_frames
     where = "drive.frames"
     if isinstance(robot.log, RecordedLog):
-        n_observations = _n_rows(table_path(robot.log.path, "observations"))
+        path = table_path(robot.log.path, "observations")
+        if is_csv(path):
+            with path.open("rb") as file:
+                n_observations = max(sum(1 for _ in file) - 1, 0)
+        else:
+            n_observations = pq.read_metadata(path).num_rows
         where = "logs"
     elif isinstance(scenario, SimulatedScenario):
         n_observations = n_frames * scenario.vision.harris.max_corners
-    n_landmarks, late = _NEW_SHARE * n_observations, 1.0  # share of frames since particles differ
+    n_landmarks, late = _NEW_SHARE * n_observations, 1.0  # share of frames with distinct particles
     if settings.resample_fraction > 0:
         late = min(1.0, _FRAMES_A_PARTICLE * settings.n_particles / max(n_frames, 1))
     a_particle = late * (
@@ -112,14 +109,14 @@ def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
     setting = "slam.filter.n_particles" if of_particles > once else where
     why = f"{n_observations} observations in {n_frames} frames"
     yield Need(of_particles + once, setting, f"{settings.n_particles} particles with {why}")
-    # maps grow from nothing, so their mean is half of the last
+    # maps grow from zero, so their mean size is half that of the last one
     n_rows = n_frames / scenario.evaluate.every * n_landmarks / 2
     often = f"maps each {scenario.evaluate.every} of {n_frames} frames"
     yield Need(n_rows * _EVALUATED_BYTES, "evaluate.every", often)
 
 
 def _of_textures(scenario: Simulation) -> Need:
-    """Texels of all faces: walls have two sides, floor and ceiling reach around them."""
+    """Return the memory of the textures of all walls (two sides each), floor and ceiling."""
     world = scenario.world
     corners = [point for wall in world.walls for point in wall.points]
     wide, deep = (max(axis) - min(axis) for axis in zip(*corners, strict=True))
@@ -138,11 +135,11 @@ def _of_textures(scenario: Simulation) -> Need:
 
 
 def memory_bytes() -> float:
-    """What this machine, or the container this process is confined to, has in all."""
+    """Return the total memory of this machine, or of the container of this process."""
     has = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     for name in _CGROUP_LIMITS:
         try:
             has = min(has, float((Path("/sys/fs/cgroup") / name).read_text()))
-        except (OSError, ValueError):  # no such confinement; "max" is none either
+        except (OSError, ValueError):  # no limit; "max" means no limit either
             continue
     return has

@@ -7,10 +7,10 @@ import numpy as np
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import compose
 from sim.p3at import URDF
-from sim.raycast.picture import filtered, sight
-from sim.raycast.scene import Scene, make_scene
-from sim.raycast.solids import read_solids
-from sim.raycast.visible_walls import Pinhole
+from sim.rendering.ray_caster import find_visible, render_filtered
+from sim.rendering.robots import read_solids
+from sim.rendering.scene import Scene, make_scene
+from sim.rendering.walls import Pinhole
 
 NOBODY = np.zeros((0, 3))
 SOLIDS = read_solids(URDF)
@@ -48,12 +48,12 @@ def slanted(distance_m: float, slant_rad: float, half_m: float) -> tuple[np.ndar
 
 def look(scene: Scene, camera: Pinhole) -> np.ndarray:
     """The filtered picture (H, W) as float64, nobody else in view."""
-    seen = sight(camera, scene.walls, SOLIDS, NOBODY)
-    return filtered(seen, scene, SOLIDS, GREY).astype(np.float64)
+    seen = find_visible(camera, scene.walls, SOLIDS, NOBODY)
+    return render_filtered(seen, scene, SOLIDS, GREY).astype(np.float64)
 
 
 def along_m(start: np.ndarray, end: np.ndarray, camera: Pinhole, u: np.ndarray) -> np.ndarray:
-    """Where rays through columns `u` meet a wall's line, in metres from its start."""
+    """Return where rays through columns `u` meet a wall's line, in metres from its start."""
     left = (camera.center_u - u) / camera.focal_px
     cos, sin = np.cos(camera.theta), np.sin(camera.theta)
     ray = np.stack([cos - left * sin, sin + left * cos], -1)

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from mapfusion.geometry.camera import StereoCamera
-from sim.raycast.scene import make_scene
-from tests.sim.raycast.scenes import TEXELS_PER_M, along_m, look, one_wall, pinhole, slanted
+from sim.rendering.scene import make_scene
+from tests.sim.rendering.scenes import TEXELS_PER_M, along_m, look, one_wall, pinhole, slanted
 
 CAMERA = StereoCamera(640, 48, 577.0, mount_x_m=0.0)
 STRAIGHT = np.zeros(3)
@@ -18,7 +18,7 @@ VIEWS = [(1.5, 0.0), (3.0, 0.6), (6.0, -0.9), (12.0, 1.1), (18.0, 1.25)]  # metr
 def test_a_wave_shows_with_the_amplitude_of_its_integral_over_a_pixel(
     distance_m: float, slant_rad: float
 ) -> None:
-    """Of a wave that a pixel covers a third of and more, most is lost, and how much is known."""
+    """A wave is damped by the known transfer function of a pixel's footprint."""
     per_pixel_m = distance_m / CAMERA.focal_px / np.cos(slant_rad)
     wave_m = max(3 * per_pixel_m, 0.16)  # 40 texels, so that texels are fine enough
     start, end = slanted(distance_m, slant_rad, 1.0)

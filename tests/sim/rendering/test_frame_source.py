@@ -1,4 +1,4 @@
-"""Tests of `sim.recorder`."""
+"""Tests of `sim.rendering.frame_source`."""
 
 import hashlib
 import subprocess
@@ -17,8 +17,8 @@ from mapfusion.geometry.se2 import transform_points
 from mapfusion.geometry.se3 import in_space
 from sim.floorplan import FloorPlan, Wall
 from sim.p3at import LENGTH_M
-from sim.recorder import FrameSource, Visibility, truth_behind
 from sim.renderer import Renderer
+from sim.rendering.frame_source import FrameSource, Visibility, truth_behind
 from sim.stereo_head import RadiometricNoise, StereoFrame, render_stereo
 from sim.world import World, write_faces
 
@@ -61,7 +61,7 @@ def test_any_order_and_any_process_give_the_same_bits(
     program = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from pathlib import Path\n"
-        "import test_recorder as t\n"
+        "import test_frame_source as t\n"
         "s = t.FrameSource(Path(sys.argv[1]), t.CAMERA, 'ab', sys.argv[2])\n"
         "print(t.digest([t.render(s, k) for k in (2, 0, 3, 1)][1::2]))\n"
     )

@@ -1,7 +1,7 @@
-"""Recorder: render any frame of a recording, in any order and process.
+"""Frame source: render any frame of a simulation, in any order and process.
 
-Walls are upright and TinyRenderer samples each pixel column along one vertical plane, so in plan a
-column is one ray, and what lies behind the first wall that reaches the ceiling shows nowhere.
+Walls are upright and TinyRenderer samples each pixel column along one vertical plane. So in plan a
+column is one ray, and the first wall that reaches the ceiling hides everything behind it.
 """
 
 from collections.abc import Sequence
@@ -16,20 +16,20 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
 from mapfusion.parameters import require_shape
 from sim.p3at import P3at
-from sim.raycast.caster import RayCaster
 from sim.renderer import BulletRenderer, Renderer
+from sim.rendering.ray_caster import RayCaster
 from sim.stereo_head import SAME_SURFACE, RadiometricNoise, StereoFrame, depth_at, render_stereo
 from sim.world import OUT_OF_SIGHT_M, World
 
-MARGIN_M = 1e-3  # a face is taken as so much wider when it is seen, narrower when it hides others
+MARGIN_M = 1e-3  # faces are widened by it when they are visible, narrowed when they occlude
 
 
 class Visibility:
-    """Sorts out the faces that neither camera of a robot can see.
+    """Visibility of faces from the cameras of a robot.
 
     Args:
-        corners_m: (F, 4, 3) of the world's faces, see `sim.floorplan.Face`.
-        camera: its columns are the rays.
+        corners_m: corners of the world's faces, shape (F, 4, 3), see `sim.floorplan.Face`.
+        camera: stereo camera, whose pixel columns are the rays.
     """
 
     def __init__(self, corners_m: Float, camera: StereoCamera) -> None:
@@ -51,9 +51,9 @@ class Visibility:
         self._ceiling_from_m = to_ceiling_m * camera.focal_px / center_v - MARGIN_M
 
     def seen(self, T_world_robot: Float) -> np.ndarray:
-        """Mask (F,) over the faces: False only where no pixel of either image shows the face.
+        """Return a mask (F,) of faces, False only if no pixel of either image shows the face.
 
-        A robot at a pose (4, 4) may tilt: its columns are no rays in plan, and nothing is left out.
+        The columns of a tilted camera are not rays in plan, so for a pose (4, 4) all are True.
         """
         if self._tilts or np.ndim(T_world_robot) == 2:
             return np.ones(len(self._is_wall), dtype=bool)
@@ -62,10 +62,11 @@ class Visibility:
         return self._seen_by_one(left) | self._seen_by_one(right)
 
     def _seen_by_one(self, T_world_camera: Float) -> np.ndarray:
+        """Return the mask (F,) of faces for one camera at a pose (3,)."""
         cos, sin = np.cos(T_world_camera[2]), np.sin(T_world_camera[2])
         ray = self._ray @ np.array([[cos, sin], [-sin, cos]])
         to_eye = T_world_camera[:2] - self._start
-        # distance of the eye before a face's plane, and how fast each ray nears it
+        # distance from a face's plane to the eye, and its decrease along each ray
         front = np.stack([self._along[:, 1], -self._along[:, 0]])
         before = np.sum(to_eye.T * front, axis=0)
         nearing = -ray @ front
@@ -82,7 +83,7 @@ class Visibility:
 
 
 class _Bullet:
-    """PyBullet's world with all robots' bodies in it."""
+    """PyBullet world with the bodies of all robots."""
 
     def __init__(
         self, faces: Path, camera: StereoCamera, robots: int, renderer: BulletRenderer
@@ -105,13 +106,13 @@ class _Bullet:
 
 
 class FrameSource:
-    """A world with all robots' bodies; renders what one of them sees. Use it in a `with` block.
+    """Rendered images of a world with robots, for a `with` block.
 
     Args:
-        faces: folder that `sim.world.write_faces` has filled.
-        camera: of all robots.
-        robots: their names.
-        renderer: what draws; raises InputError where it cannot.
+        faces: folder that `sim.world.write_faces` wrote.
+        camera: stereo camera of all robots.
+        robots: names of the robots.
+        renderer: renderer; raises InputError if it does not work.
     """
 
     def __init__(
@@ -135,7 +136,7 @@ class FrameSource:
         self.close()
 
     def close(self) -> None:
-        """Free the world."""
+        """Close the renderer's world."""
         if isinstance(self._drawn, _Bullet):
             self._drawn.close()
 
@@ -147,10 +148,15 @@ class FrameSource:
         rng: np.random.Generator,
         colour: bool = True,
     ) -> StereoFrame:
-        """What `robot` sees when the robots (in the order of their names) stand at poses (R, 3).
+        """Render the images of one robot.
 
-        Bodies that tilt have poses (R, 4, 4); the ray caster draws the other robots upright.
-        Without `colour` the frame may come without its picture in colour, which takes time.
+        Args:
+            T_world_robots: poses of all robots in the order of their names, shape (R, 3), or
+                (R, 4, 4) for tilted bodies. The ray caster draws the other robots upright.
+            robot: name of the robot.
+            noise: sensor noise.
+            rng: random generator.
+            colour: False if the colour image is not needed.
         """
         poses = np.asarray(T_world_robots, dtype=np.float64)
         shape = (4, 4) if poses.ndim == 3 else (3,)
@@ -167,27 +173,31 @@ class FrameSource:
 def truth_behind(
     camera: StereoCamera, depth_m: np.ndarray, uv_px: ArrayLike, T_world_robot: ArrayLike
 ) -> tuple[Float, Float]:
-    """World points behind pixels (N, 2) of the left image, and how they move with the pixel.
+    """Return world points at pixels of the left image, and their derivatives by the pixel.
 
-    Between pixels of one surface the inverse depth is interpolated (it is linear in the image for a
-    plane); at the edge of a surface the nearest pixel's depth counts.
+    Between pixels of one surface the inverse depth is interpolated, which is linear in the image of
+    a plane. At the edge of a surface the depth of the nearest pixel is used.
 
     Args:
-        camera: of the image.
-        depth_m: (H, W) along the optical axis.
-        uv_px: pixels.
-        T_world_robot: the robot's pose (3,), or (4, 4) where its body tilts.
+        camera: camera of the image.
+        depth_m: depth along the optical axis, shape (H, W).
+        uv_px: pixels, shape (N, 2).
+        T_world_robot: robot pose, shape (3,), or (4, 4) for a tilted body.
 
     Returns:
-        Points (N, 3), NaN where nothing is, and their derivatives (N, 3, 2) by the pixel on the
-        surface that is seen there: the difference to the next pixel, or to the one before where
-        that is another surface's; 0 where both are.
+        Points (N, 3), NaN for the background, and their derivatives (N, 3, 2) by the pixel on the
+        same surface: the difference to the next pixel, or to the previous pixel if the next one
+        shows another surface; 0 if both do.
     """
     uv = np.asarray(uv_px, dtype=np.float64).reshape(-1, 2)
     steps = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=np.float64)
     there = (uv + steps[:, None]).reshape(-1, 2)
     depth = depth_at(depth_m, there)
-    point = _in_world(T_world_robot, camera.back_project(there, depth)).reshape(5, -1, 3)
+    p_robot, T = camera.back_project(there, depth), np.asarray(T_world_robot, dtype=np.float64)
+    p_world = (
+        p_robot @ T[:3, :3].T + T[:3, 3] if T.shape == (4, 4) else transform_points(T, p_robot)
+    )
+    point = p_world.reshape(5, -1, 3)
     depth = depth.reshape(5, -1)
     same = (np.abs(depth - depth[0]) <= SAME_SURFACE * depth[0])[:, :, None]
     slope = np.empty((len(uv), 3, 2))
@@ -195,10 +205,3 @@ def truth_behind(
         back = np.where(same[before], -(point[before] - point[0]), 0.0)
         slope[:, :, axis] = np.where(same[after], point[after] - point[0], back)
     return point[0], slope
-
-
-def _in_world(T_world_robot: ArrayLike, p_robot: Float) -> Float:
-    T = np.asarray(T_world_robot, dtype=np.float64)
-    if T.shape == (4, 4):
-        return p_robot @ T[:3, :3].T + T[:3, 3]
-    return transform_points(T, p_robot)

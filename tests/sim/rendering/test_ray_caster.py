@@ -11,8 +11,8 @@ from mapfusion.errors import InputError
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se3 import in_space
 from sim.floorplan import FloorPlan, Wall
-from sim.raycast.caster import RayCaster, TiltedView
-from sim.recorder import FrameSource
+from sim.rendering.frame_source import FrameSource
+from sim.rendering.ray_caster import RayCaster, TiltedView
 from sim.stereo_head import RadiometricNoise, StereoFrame, camera_pose, depth_at
 from sim.world import write_faces
 
@@ -105,7 +105,7 @@ def test_filtered_pictures_are_tinyrenderer_s_of_four_times_the_size_averaged(fa
 
 
 def test_robots_in_filtered_pictures_are_those_that_many_rays_hit(faces: Path) -> None:
-    """What a robot changes in a picture, walls before it and behind it."""
+    """The change of an image by a robot, with walls in front of it and behind it."""
     caster, fine, nobody = RayCaster(faces, CAMERA), finer(CAMERA, 8), np.zeros((0, 3))
     by_rays = RayCaster(faces, fine, "middle")
     for view in VIEWS:
@@ -124,7 +124,7 @@ TILTS = np.array([[0.09, -0.05], [-0.03, 0.1], [0.05, 0.05]])
 
 
 def test_tilted_pictures_are_tinyrenderer_s(faces: Path) -> None:
-    """Of four times the size, averaged, within the bounds of level ones; and so is the depth."""
+    """Images and depths equal averaged ones of four times the size, within the level bounds."""
     caster, nobody = RayCaster(faces, CAMERA), np.zeros((0, 3))
     off, off_edges, plain = [], [], []
     with (

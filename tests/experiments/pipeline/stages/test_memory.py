@@ -1,11 +1,11 @@
-"""What a run will need is estimated, and refused where the machine has less."""
+"""Tests of `experiments.pipeline.stages.memory`."""
 
 from pathlib import Path
 
 import pytest
 
-from experiments.pipeline.memory import memory_bytes, needs, require_memory
-from experiments.pipeline.pipeline import lay_out
+from experiments.pipeline.stages.memory import memory_bytes, needs, require_memory
+from experiments.pipeline.stages.pipeline import build_pipeline
 from experiments.scenario.loading import load_scenario
 from mapfusion.errors import InputError
 from mapfusion.fastslam.landmarks import allocate
@@ -15,7 +15,7 @@ GB = 1e9
 
 
 def need(path: Path, *overrides: str) -> dict[str, float]:
-    asked = needs(lay_out(load_scenario(path, overrides)))
+    asked = needs(build_pipeline(load_scenario(path, overrides)))
     return {each.setting: each.n_bytes for each in asked}
 
 
@@ -31,14 +31,14 @@ def need(path: Path, *overrides: str) -> dict[str, float]:
 def test_what_does_not_fit_is_refused_by_its_setting(
     tiny_path: Path, overrides: list[str], named: str
 ) -> None:
-    pipeline = lay_out(load_scenario(tiny_path, overrides))
+    pipeline = build_pipeline(load_scenario(tiny_path, overrides))
     with pytest.raises(InputError, match=f"^{named}: .* GB, this machine has 1.0 GB"):
         require_memory(pipeline, 1, GB)
     require_memory(pipeline, 1, 1e15)
 
 
 def test_each_process_needs_its_own(tiny_path: Path) -> None:
-    pipeline = lay_out(load_scenario(tiny_path))
+    pipeline = build_pipeline(load_scenario(tiny_path))
     require_memory(pipeline, 1, GB)
     with pytest.raises(InputError, match="in each of 8 processes"):
         require_memory(pipeline, 8, GB)
@@ -61,7 +61,7 @@ def test_a_long_drive_needs_a_row_for_what_was_seen_lately(tiny_path: Path) -> N
     rarely = ("evaluate.every=10000", "fuse.every=10000")
     long = (particles, "drive.frames=100000", "vision.harris.max_corners=50", *rarely)
     fits, never = (
-        lay_out(load_scenario(tiny_path, [*long, f"slam.filter.resample_fraction={share}"]))
+        build_pipeline(load_scenario(tiny_path, [*long, f"slam.filter.resample_fraction={share}"]))
         for share in (0.5, 0.0)
     )
     require_memory(fits, 1, 8 * GB)
@@ -74,7 +74,7 @@ def test_a_long_drive_needs_a_row_for_what_was_seen_lately(tiny_path: Path) -> N
 def test_shipped_scenarios_fit_into_4_gb() -> None:
     for path in (Path(__file__).parents[3] / "scenarios").glob("*.yaml"):
         if path.stem not in ("mrclam7", "mrclam9"):  # their logs are not there
-            require_memory(lay_out(load_scenario(path)), 2, 4 * GB)
+            require_memory(build_pipeline(load_scenario(path)), 2, 4 * GB)
 
 
 def test_a_run_is_refused_before_anything_is_computed(

@@ -1,4 +1,4 @@
-"""Tests of `sim.raycast.robots`."""
+"""Tests of `sim.rendering.robots`."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,16 @@ from scipy.spatial import ConvexHull
 
 from mapfusion.geometry.se2 import transform_points
 from sim.p3at import URDF
-from sim.raycast.robots import Body, cast, fill_coverage, fill_least, place, within_view
-from sim.raycast.solids import read_solids
-from sim.raycast.visible_walls import Pinhole
+from sim.rendering.robots import (
+    ProjectedRobot,
+    cast_rays,
+    fill_coverage,
+    fill_minimum,
+    project_robot,
+    read_solids,
+    within_view,
+)
+from sim.rendering.walls import Pinhole
 from sim.stereo_head import NEAR_M
 
 
@@ -66,7 +73,7 @@ def test_the_least_function_is_filled_in_where_pixels_middles_are_inside(seed: i
     corners = outline(rng.uniform(-3, [14, 11], (6, 2)))
     in_row, per_column = rng.normal(5.0, 1.0, (8, 3)), rng.normal(0.0, 1.0, 3)
     found = np.zeros((8, 11))
-    fill_least(edges(corners), in_row, per_column, found)
+    fill_minimum(edges(corners), in_row, per_column, found)
     v, u = np.mgrid[:8, :11]
     least = np.min(in_row[:, None] + per_column * np.arange(11)[:, None], axis=2)
     np.testing.assert_allclose(found, np.where(is_inside(corners, u, v), least, 0.0), atol=1e-12)
@@ -87,7 +94,7 @@ def depth_of(planes: np.ndarray, eye_m: np.ndarray, rays: np.ndarray) -> np.ndar
     return np.where(enter < leave, enter, np.inf)
 
 
-def depths_m(i: int, body: Body) -> np.ndarray:
+def depths_m(i: int, body: ProjectedRobot) -> np.ndarray:
     """Depths (H, W) of a solid behind pixels' middles, infinity where it is not."""
     v, u = np.mgrid[: CAMERA.height_px, : CAMERA.width_px].reshape(2, -1, 1)
     ahead, left, up = body.axes
@@ -98,7 +105,7 @@ def depths_m(i: int, body: Body) -> np.ndarray:
 
 
 def ahead_m(camera: Pinhole, i: int, pose: np.ndarray) -> np.ndarray:
-    """How far ahead of a camera a solid's corners (K,) are, of a robot at a pose."""
+    """Return depths (K,) of a solid's corners for a robot at a pose."""
     corners = SOLIDS.corners_m[SOLIDS.first_corner[i] : SOLIDS.first_corner[i + 1]]
     x, y = transform_points(pose, corners)[:, :2].T
     x, y = x - camera.eye_x_m, y - camera.eye_y_m
@@ -110,10 +117,10 @@ POSES = [(0.1, -0.4, 0.3), (0.0, 0.45, 1.7), (0.35, -0.4, -2.0)]
 
 @pytest.mark.parametrize("pose", [*POSES, (0.05, 0.0, 0.3), (1.2, 0.3, 0.4)])
 def test_depths_are_those_of_rays_through_all_pixels(pose: tuple) -> None:
-    """Of what reaches the lens and even holds it, and of what is farther off."""
-    body = place(CAMERA, SOLIDS, np.array(pose))
+    """Solids in front of the camera, across the near plane and around the camera."""
+    body = project_robot(CAMERA, SOLIDS, np.array(pose))
     seen = np.full((CAMERA.height_px, CAMERA.width_px), np.inf)
-    cast(CAMERA, SOLIDS, [body], np.zeros(len(SOLIDS.rgb)), seen)
+    cast_rays(CAMERA, SOLIDS, [body], np.zeros(len(SOLIDS.rgb)), seen)
     true = np.min([depths_m(i, body) for i in range(len(SOLIDS.rgb))], axis=0)
     both = np.isfinite(seen) & np.isfinite(true)
     assert both.sum() > 90
@@ -123,7 +130,7 @@ def test_depths_are_those_of_rays_through_all_pixels(pose: tuple) -> None:
 
 @pytest.mark.parametrize("pose", POSES)
 def test_the_window_holds_all_that_shows_of_what_reaches_the_lens(pose: tuple) -> None:
-    body, cut, share = place(CAMERA, SOLIDS, np.array(pose)), 0, 1.0
+    body, cut, share = project_robot(CAMERA, SOLIDS, np.array(pose)), 0, 1.0
     for i in range(len(SOLIDS.rgb)):
         hit = np.argwhere(depths_m(i, body) < np.inf)
         assert body.is_cut[i] == (ahead_m(CAMERA, i, np.array(pose)).min() <= NEAR_M)
@@ -142,7 +149,7 @@ def test_what_stands_beside_the_lens_has_no_window() -> None:
     beside = np.array([0.2, -1.5, 0.0])
     ahead = [ahead_m(CAMERA, i, beside) for i in range(len(SOLIDS.rgb))]
     assert any(m.min() <= NEAR_M < m.max() for m in ahead)
-    body = place(CAMERA._replace(focal_px=80.0), SOLIDS, beside)
+    body = project_robot(CAMERA._replace(focal_px=80.0), SOLIDS, beside)
     assert not np.any(body.is_cut[body.shown])
 
 
@@ -153,7 +160,7 @@ def test_robots_that_have_a_window_are_within_view_and_others_mostly_not() -> No
     within = {tuple(pose) for pose in within_view(camera, SOLIDS.reach_m, poses)}
     beside = 0
     for pose in poses:
-        shows = len(place(camera, SOLIDS, pose).shown) > 0
+        shows = len(project_robot(camera, SOLIDS, pose).shown) > 0
         assert tuple(pose) in within or not shows
         beside += tuple(pose) in within and not shows
     assert 0 < len(within) < len(poses)
