@@ -128,7 +128,7 @@ def test_a_damaged_file_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("value", "sigma", "message"),
     [
-        ([[0, 1.6, 0]], [[0, 0, 0]], "on end"),
+        ([[0, 1.6, 0]], [[0, 0, 0]], "roll and pitch"),
         ([[0, 0, 0]], [[0, -1, 0]], "sigma: is below 0"),
         ([[0, np.nan, 0]], [[0, 0, 0]], "value: contains NaN"),
         ([[0, 0, 0]], [[0, 0]], "sigma: shape"),
