@@ -15,7 +15,7 @@ from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.tables import NO_LABEL
-from mapfusion.vision.visual_odometry import MIN_LINKS, RigidMotion, rigid_links
+from mapfusion.vision.visual_odometry import MIN_LINKS, RigidMotion, estimate_rigid_motion
 
 PLANAR = [0, 1, 5]  # x, y and the rotation about z, within shifts and rotation vectors in space
 MIN_MOTIONS = 4  # of which a median is computed
@@ -106,7 +106,7 @@ def _planar_motion(
     """Fit a planar motion to links; return None if fewer than two agree or the rotation is free.
 
     The fit is a weighted least-squares fit of the links inside the gate. A tolerance that is added
-    to all covariances decreases to zero, as in `rigid_links`.
+    to all covariances decreases to zero, as in `estimate_rigid_motion`.
     """
     n = len(p_before)
     extent = float(np.sqrt(np.mean(np.var(p_after, axis=0)))) or 1.0
@@ -157,7 +157,7 @@ def _pair_motion(
         return _planar_motion(p[a, :2], S[a, :2, :2], p[b, :2], S[b, :2, :2])
     if log.planar or len(a) < MIN_LINKS:
         return None
-    _, found = rigid_links(p[a], S[a], p[b], S[b], _LINK_PROBABILITY)
+    _, found = estimate_rigid_motion(p[a], S[a], p[b], S[b], _LINK_PROBABILITY)
     if found is None:
         return None
     return _PairMotion(found.T_before_after, found.covariance, len(a), found.n_links)
