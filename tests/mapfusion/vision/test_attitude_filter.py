@@ -210,7 +210,9 @@ def test_far_points_are_expected_where_a_tilt_moves_them() -> None:
     before, after = se3.tilt(*rng.normal(0, 0.05, (2, 2)).T)
     p_world = rng.uniform([1e6, -3e5, -2e5], [2e6, 3e5, 2e5], (30, 3))
     uv_before, uv_after = (camera.project(p_world @ R)[:, :2] for R in (before, after))
-    np.testing.assert_allclose(camera.rotate_pixels(uv_before, after.T @ before), uv_after, atol=1e-3)
+    np.testing.assert_allclose(
+        camera.rotate_pixels(uv_before, after.T @ before), uv_after, atol=1e-3
+    )
 
 
 def moved_from(value: np.ndarray, T: np.ndarray) -> np.ndarray:
