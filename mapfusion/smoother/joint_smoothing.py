@@ -73,7 +73,7 @@ def smooth_jointly(
     T_first_robot: Float,
     max_memory_gb: float,
 ) -> JointlySmoothed:
-    """Compute the most probable paths and points of K robots with equal noise levels.
+    """Compute the most probable paths and points of K robots with equal noise scales.
 
     Args:
         recordings: K recordings; `stray_m` is that of the first.

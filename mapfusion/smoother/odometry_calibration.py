@@ -1,4 +1,4 @@
-"""Odometry calibration from logs: systematic errors of each robot, noise levels of all.
+"""Odometry calibration from logs: systematic errors of each robot, noise parameters of all.
 
 An increment (x, y, theta) of the log stands for the motion
 
@@ -226,10 +226,10 @@ def calibrate(
     parameters: SmootherParameters,
     on_round: Callable[[int, int], None] = lambda done, most: None,
 ) -> Calibration:
-    """Estimate the constants and noise levels of maximum likelihood.
+    """Estimate the constants and noise parameters of maximum likelihood.
 
     Args:
-        logs: a log of each robot; the noise levels are common to all.
+        logs: a log of each robot; the noise parameters are common to all.
         landmarks: landmark of each observation of each log, shape (N,); negative for none.
         paths: initial path of each log, shape (T, 3). None: computed by smoothing increasing parts
             of the log, which needs landmarks without wrong associations.

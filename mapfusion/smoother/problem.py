@@ -170,7 +170,7 @@ def _sums(values: Float, starts: np.ndarray) -> Float:
 def order_observations(
     log: RobotLog, landmark: np.ndarray, min_count: int, *, with_offsets: bool
 ) -> OrderedObservations:
-    """Order the observations of landmarks that were seen at least `min_count` times.
+    """Order the observations of landmarks that were observed at least `min_count` times.
 
     Args:
         log: the log.

@@ -70,7 +70,7 @@ def second_order_errors(problem: Problem, state: OptimizerState) -> SecondOrder 
     which determine the headings. There are no second-order errors then.
 
     Args:
-        problem: the problem with the final noise levels.
+        problem: the problem with the final noise scales.
         state: the smoothed state.
     """
     if not state.solution.landmarks_first or len(state.estimate.path) < 2:
