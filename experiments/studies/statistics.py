@@ -283,7 +283,7 @@ def summarise(runs: Runs) -> Summary:
 
 
 class ReducedErrors(NamedTuple):
-    """Errors of runs, reduced batch by batch to `maps_of` and `medians_of_run`.
+    """Errors of runs, reduced batch by batch to `summarise_alignments` and `medians_of_run`.
 
     `absent` are aligners whose package is not installed, which is not a failure.
     """
@@ -311,7 +311,7 @@ def reduced_errors(runs: Runs) -> ReducedErrors:
 
 
 def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
-    """Add overlap_share to rows of `maps_of`: n_common over the landmarks of the smaller map.
+    """Add overlap_share to rows of `summarise_alignments`: n_common over the landmarks of the smaller map.
 
     It is NaN if the runs have no table `robots`. A robot whose log has ended keeps its last map.
     """

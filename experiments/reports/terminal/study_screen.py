@@ -34,7 +34,7 @@ from experiments.studies.sweep import Survey, SweepProgress
 from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_tables import ERRORS, GIVEN, SweepDataset, medians_over_runs
 from mapfusion.align.alignment import Status
-from mapfusion.smoother.noise_estimation import LEVELS
+from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
 from mapfusion.smoother.odometry_calibration import Calibration
 
 
@@ -149,7 +149,7 @@ def calibration_rows(calibration: Calibration) -> list[dict[str, Any]]:
 
 def document(calibration: Calibration, written: Sequence[Path]) -> dict[str, Any]:
     """Return the content of `--json`."""
-    errors = zip(LEVELS, calibration.relative_errors, strict=True)
+    errors = zip(NOISE_PARAMETERS, calibration.relative_errors, strict=True)
     return {
         "robots": calibration_rows(calibration),
         "settings": filter_settings(calibration),

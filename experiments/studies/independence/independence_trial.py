@@ -17,7 +17,7 @@ import pandas as pd
 
 from experiments.evaluation.alignment_errors import first_shared_iteration
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.fused_map_errors import GivenMap, JudgedFusion
+from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.map_consistency import rmse
 from experiments.evaluation.path_errors import STATISTICS
 from experiments.evaluation.smoothed_robots import SmoothedRobot
@@ -363,7 +363,7 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
         for k, fusion in read_fusions(folder, names).items():
             beside = smoothed if make_fuser(fuser).smoothed else [None] * len(robots)
             given = [GivenMap.at(*both, k) for both in zip(robots, beside, strict=True)]
-            judgement = JudgedFusion(fuser, k, fusion, given)
+            judgement = EvaluatedFusion(fuser, k, fusion, given)
             fused = judgement.fusion
             row = {"n_merged": len(fused.members), "fallback": judgement.fallback}
             if len(fused.members) >= 2:
