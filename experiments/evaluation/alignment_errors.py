@@ -257,10 +257,12 @@ class AlignerTiming:
         }
         n_common = []
         for pair in maps:
-            points = pair.points_world_m
-            known = all(np.isfinite(own).any() for own in points)
+            points_a, points_b = pair.points_world_m
+            known = all(np.isfinite(own).any() for own in (points_a, points_b))
             radius_m = settings.true_pair_radius_m
-            n_common.append(common_landmarks(*points, radius_m) if known else tables.UNKNOWN)
+            n_common.append(
+                common_landmarks(points_a, points_b, radius_m) if known else tables.UNKNOWN
+            )
         ready = cls(scenario.seed, settings.timing_repeats, aligners, maps, n_common)
         for smallest_or_largest in (maps[0], maps[-1]):  # some aligners treat few pairs apart
             for name in aligners:

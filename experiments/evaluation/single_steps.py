@@ -156,7 +156,7 @@ class MergeResult(NamedTuple):
     def reasons(self) -> dict[tuple[int, int], str]:
         """Return by pair of maps the reason why their alignment is not used; empty if it is."""
         reasons: dict[tuple[int, int], str] = {}
-        for pair, place in zip(self.pairs, self.fusion.place, strict=True):
+        for pair, place in zip(self.pairs, self.fusion.edge_status, strict=True):
             reason = pair.alignment.reason or _TEAM_REASONS.get(place, "")
             if place in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
                 reasons[pair.a, pair.b] = ""

@@ -70,7 +70,7 @@ class Quantity(NamedTuple):
 
 
 def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of `summarise_alignments` with each map's refined error over that of the oracle."""
+    """Return alignment summaries with each map's refined error over that of the oracle."""
     maps = criteria.summarise_alignments(errors)
     of_oracle = maps.assign(oracle=maps[_REFINED].where(maps["aligner"] == ORACLE))
     reference = of_oracle.groupby(MAP_PAIR)["oracle"].transform("first")

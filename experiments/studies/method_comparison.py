@@ -63,10 +63,10 @@ _WITH_TEST = (*_WITHOUT_TEST, "accepted", "false_accepted", "refused_apart")
 def success_rates(
     maps: pd.DataFrame, by: str, edges: Sequence[float] | None = None
 ) -> pd.DataFrame:
-    """Return binned success rates of each method over rows of `summarise_alignments`.
+    """Return binned success rates of each method over alignment summaries.
 
     Args:
-        maps: rows of `summarise_alignments`; for overlap_share, rows that `with_overlap_share` returned.
+        maps: alignment summaries; for overlap_share, rows that `with_overlap_share` returned.
         by: iteration, n_common (landmarks that truly correspond), overlap_share (n_common over
             the smaller map's landmarks), n_true (true pairs among the correspondences),
             outlier_share (1 - n_true / n_correspondences) or last (only the last iteration of each
@@ -133,7 +133,7 @@ STAGES = {"estimated": "translation_error_m", "refined": "refined_translation_er
 def oracle_ratios(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """Return each method's median translation error over the oracle's, estimated and refined.
 
-    Only rich maps of the rows of `summarise_alignments` count. Medians are over runs, robot pairs and
+    Only rich maps of the alignment summaries count. Medians are over runs, robot pairs and
     iterations. For intervals whole runs are resampled, the same for method and oracle.
 
     Returns:
@@ -200,7 +200,7 @@ def compare_methods(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
 
 
 def paired_values(maps: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return a column of `summarise_alignments` as one row per pair of maps and one column per method."""
+    """Return a column of the alignment summary by pair of maps (rows) and method (columns)."""
     return maps.pivot_table(index=MAP_PAIR, columns="aligner", values=column, dropna=False)
 
 
@@ -296,7 +296,7 @@ def aligner_summary(
 
 
 def _shown_columns(maps: pd.DataFrame) -> pd.DataFrame:
-    """Return the columns of `SHOWN` by aligner from rows of `summarise_alignments`; NaN where they have none."""
+    """Return the columns of `SHOWN` by aligner from alignment summaries; NaN if unknown."""
     names = {
         kind: [name for name, how in SHOWN.items() if how.kind == kind and name in maps]
         for kind in ("error", "given", "share")
@@ -315,14 +315,14 @@ def _median_times_ms(timings: pd.DataFrame) -> pd.Series:
 
 
 def recommend(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -> Recommendation:
-    """Rank aligners by rows of `summarise_alignments` and of `aligner_timings`.
+    """Rank aligners by alignment summaries and of `aligner_timings`.
 
     The first criterion is the share of right results. Aligners equal to the first are ranked by the
     estimated error on the same pairs of maps, and those that are still equal by time. The unit of
     the tests is the run (see `intervals`); the ranking of a single run is a hint only.
 
     Args:
-        maps: rows of `summarise_alignments`.
+        maps: alignment summaries.
         timings: rows of `aligner_timings`, which may be empty.
         aligners: names in display order.
     """

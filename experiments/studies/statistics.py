@@ -311,7 +311,7 @@ def reduced_errors(runs: Runs) -> ReducedErrors:
 
 
 def with_overlap_share(maps: pd.DataFrame, runs: Runs) -> pd.DataFrame:
-    """Add overlap_share to rows of `summarise_alignments`: n_common over the landmarks of the smaller map.
+    """Add overlap_share to alignment summaries: n_common over the landmarks of the smaller map.
 
     It is NaN if the runs have no table `robots`. A robot whose log has ended keeps its last map.
     """

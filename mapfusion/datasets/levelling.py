@@ -325,7 +325,7 @@ class LevelledFrames:
             turn = self._levelling.expected_turn(attitude)
             frame = self._observer.observe(found, steps, turn)
             self._levelling.add(frame.tracks.motion, attitude, measurements.rotation(k))
-            own = self._levelling.applied(frame.observations)
+            own = self._levelling.to_level_frame(frame.observations)
         else:
             frame = self._observer.observe(found, steps)
             own = level_observations(

@@ -160,14 +160,14 @@ class Calibration:
         relative_errors: relative standard errors of the noise in the order of
             `NOISE_PARAMETERS`, shape (3,).
         n_rounds: number of rounds.
-        settled: true if the rounds converged.
+        converged: true if the rounds converged.
     """
 
     robots: tuple[RobotCalibration, ...]
     motion: MotionNoise
     relative_errors: Float
     n_rounds: int
-    optimize: bool
+    converged: bool
 
 
 @dataclass

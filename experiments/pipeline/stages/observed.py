@@ -76,6 +76,4 @@ def told_tilt(settings: ObservedSettings, trajectory: Trajectory) -> Float | Non
     if trajectory.tilt_rad is None or not settings.attitude.measured:
         return None
     rng = generator(settings.seed, "attitude", settings.robot)
-    return settings.attitude.to_level_frame(
-        trajectory.tilt_rad[trajectory.index(settings.robot)], rng
-    )
+    return settings.attitude.applied(trajectory.tilt_rad[trajectory.index(settings.robot)], rng)

@@ -87,7 +87,7 @@ def error_curves(rows: pd.DataFrame, aligners: Sequence[str]) -> dict[str, Any]:
 def success_curves(maps: pd.DataFrame, aligners: Sequence[str]) -> list[dict[str, Any]]:
     """Compute success rates with intervals against each quantity that affects alignment.
 
-    `maps` are rows of `summarise_alignments` with the column overlap_share, which may be unknown. Bins without
+    `maps` are alignment summaries with the column overlap_share, which may be unknown. Bins without
     maps that have common ground are left out: no answer is right there.
     """
     curves = []

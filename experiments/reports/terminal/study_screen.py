@@ -155,7 +155,7 @@ def document(calibration: Calibration, written: Sequence[Path]) -> dict[str, Any
         "settings": filter_settings(calibration),
         "relative_errors": {name: float(value) for name, value in errors},
         "n_rounds": calibration.n_rounds,
-        "settled": calibration.settled,
+        "settled": calibration.converged,
         "logs": [str(path) for path in written],
     }
 
@@ -174,7 +174,7 @@ def print_calibration(calibration: Calibration, written: Sequence[Path]) -> None
         "late turn: share of the previous turn that is made now; in place: of turns on the spot,\n"
         "relative to turns while driving",
     )
-    if not calibration.settled:
+    if not calibration.converged:
         n_rounds = calibration.n_rounds
         print_lines([f"  not settled: constants or levels still change after {n_rounds} rounds"])
     print_lines([f"  {path}: corrected" for path in written])
