@@ -68,7 +68,7 @@ class IsolatedProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether the process is ready for a request."""
+        """True if the process is ready for a request."""
         return self.end.alive and self._process.poll() is None
 
     def align(self, maps: Maps, rng: np.random.Generator, limit_s: float) -> Alignment:
@@ -211,7 +211,7 @@ class IsolatedAligner:
 
     @property
     def randomised(self) -> bool:
-        """Whether the answer depends on the generator; False if the method cannot be made."""
+        """True if the answer depends on the generator; False if the method cannot be made."""
         try:
             return not self._absence and process_for(self._method, self._parameters).randomised
         except ProcessFailedError:

@@ -1,4 +1,4 @@
-"""Of `likelihood.py`: the share of twins' regions that are their like throughout.
+"""Constant of `likelihood.py`: share of repeated regions that repeat throughout.
 
 Written by `python -m experiments.studies.refusal.fit_twins`.
 

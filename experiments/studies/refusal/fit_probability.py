@@ -105,12 +105,12 @@ def fit(features: Float, right: Float) -> Float:
 
 
 def stated(model: Float, features: Float) -> Float:
-    """The probabilities (n,) that a model (1 + F,) states."""
+    """Return the probabilities (n,) that a model (1 + F,) states."""
     return 1 / (1 + np.exp(-(model[0] + features @ model[1:])))
 
 
 def left_out(answers: Answers) -> Float:
-    """The probability (n,) of each answer by a model that saw no world of its kind."""
+    """Return each answer's probability (n,) by a model that saw no world of its kind."""
     p = np.empty(len(answers.right))
     for kind in np.unique(answers.kind):
         own = answers.kind == kind

@@ -86,7 +86,7 @@ def _joined(regions: list[Counts]) -> Counts:
 
 
 def fit(right: Counts, wrong: Counts) -> tuple[Rates, Rates, float]:
-    """The likeliest rates of both, and the share of right regions that are as wrong ones."""
+    """Return the most likely rates of both, and the share of right regions like wrong ones."""
 
     def cost_of_wrong(x: Float) -> float:
         return -float(np.sum(log_likelihood(*wrong, _rates(x))))

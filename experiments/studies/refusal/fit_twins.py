@@ -27,7 +27,7 @@ from mapfusion.verification.verdict import N_RIVALS
 
 EVERY = 3  # of the evaluated iterations: maps of neighbouring ones say the same
 _ROUNDS = 500  # of expectation and maximisation: shares have settled to the fourth digit
-_TEXT = '''"""Of `likelihood.py`: the share of twins' regions that are their like throughout.
+_TEXT = '''"""Constant of `likelihood.py`: share of repeated regions that repeat throughout.
 
 Written by `python -m experiments.studies.refusal.fit_twins`.
 
@@ -40,7 +40,7 @@ WHOLE = {share:.2f}
 
 
 def regions_of(worlds: Sequence[MappedWorld]) -> list[Regions]:
-    """Of the motions that maps without a common landmark support best."""
+    """Return the regions of the best motions of maps without a common landmark."""
     found = []
     for world in (world for world in worlds if world.repeats):
         settings, radius_m = world.scenario.align, world.scenario.evaluate.true_pair_radius_m
@@ -64,7 +64,7 @@ def regions_of(worlds: Sequence[MappedWorld]) -> list[Regions]:
 
 
 def fit(regions: Sequence[Regions]) -> Float:
-    """The likeliest shares (3,) of regions that are twins throughout, in part, or not at all.
+    """Return the most likely shares (3,) of regions that repeat fully, in part, or not.
 
     Without the regions by which the motions were found.
     """

@@ -1,4 +1,4 @@
-"""What the commands that fit numbers of the verdict are asked: worlds, seeds, where they lie."""
+"""Arguments of the commands that fit numbers of the verdict: worlds, seeds, folder."""
 
 import argparse
 from pathlib import Path
@@ -8,7 +8,7 @@ from experiments.studies.refusal.cases import MappedWorld, worlds_of
 
 
 def worlds_asked_for(description: str | None) -> tuple[list[MappedWorld], dict[str, str]]:
-    """The worlds of this process's arguments, and how a written file names them."""
+    """Return the worlds of this process's arguments, and their name in a written file."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("worlds", nargs="+")
     parser.add_argument("--seeds", default="0")
