@@ -255,11 +255,6 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
     )
 
 
-def read_observations(folder: Path) -> tuple[np.ndarray, Observations]:
-    """Read the frame numbers (N,) and observations of a log's folder; raises InputError."""
-    return _observations(folder)[:2]
-
-
 def _observations(folder: Path) -> tuple[np.ndarray, Observations, bool]:
     """Read frame numbers (N,) and observations; True if the file itself marks them as planar."""
     path = table_path(folder, "observations")

@@ -287,17 +287,6 @@ def _apply_step(T: Float, step: Float) -> None:
         T[k, 3] += step[k]
 
 
-@kernel(error_model="numpy")
-def _square(lever: Float, residual: Float, information: Float, step: Float) -> float:
-    """Squared distance of a link's points, in standard deviations, after the step."""
-    xx, xy, xz = information[0], information[1], information[2]
-    yy, yz, zz = information[3], information[4], information[5]
-    x = residual[0] - step[0] - (step[4] * lever[2] - step[5] * lever[1])
-    y = residual[1] - step[1] - (step[5] * lever[0] - step[3] * lever[2])
-    z = residual[2] - step[2] - (step[3] * lever[1] - step[4] * lever[0])
-    return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
-
-
 _PLANE = [0, 1, 5]  # indices of x, y and the rotation about z
 # Without links the motion is predicted by the last speed. The robot may have stopped or turned, so
 # the standard deviation of the prediction is the motion itself plus the largest observed step. The

@@ -9,8 +9,8 @@ import numba.extending
 
 # What an instruction of the processor does, in Python.
 _INSTRUCTIONS: dict[str, Callable[[Any], int]] = {
-    "_trailing_zeros": lambda word: (int(word) & -int(word)).bit_length() - 1,
-    "_ones": lambda word: int(word).bit_count(),
+    "trailing_zeros": lambda word: (int(word) & -int(word)).bit_length() - 1,
+    "popcount": lambda word: int(word).bit_count(),
 }
 
 
