@@ -14,10 +14,6 @@ import typer
 
 from experiments.reports.formatting import plain
 from mapfusion.errors import InputError
-from mapfusion.files import require_writable
-from mapfusion.landmark_map import MAP_ENDINGS, joint_path
-from mapfusion.tables import is_csv
-from mapfusion.viewing import viewing_paths
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 EXIT_DEFECT = 70  # EX_SOFTWARE of sysexits.h: an error of ours
@@ -92,7 +88,7 @@ def print_to_stderr(text: str) -> None:
 
 DOCUMENT, JUNIT, REPORT = (".json",), (".xml",), (".html", ".htm")
 # Suffixes of files that commands write; a folder with such a name is a mistake.
-_OF_FILES = {*MAP_ENDINGS, *DOCUMENT, *JUNIT, *REPORT, ".yaml", ".ply", ".g2o", ".tum", ".bag"}
+_OF_FILES = {*DOCUMENT, *JUNIT, *REPORT, ".yaml", ".ply", ".g2o", ".tum", ".bag"}
 _OF_RESULTS = {".ply", ".g2o", ".tum", ".rrd"}
 # Tables of a robot log, as Parquet or CSV.
 _OF_LOGS = {"frames", "observations", "truth_poses", "truth_points"}
@@ -121,6 +117,8 @@ def require_file(
         hint = "; `mapfusion export RESULT --format` writes others"
         export = hint if path.suffix.lower() in _OF_RESULTS else ""
         raise InputError(f"{option} {path}: {found}, expected {' or '.join(endings)}{export}")
+    from mapfusion.files import require_writable
+
     require_writable(path.parent)
     for each in _paths(inputs):
         if _is_same(path, each):
@@ -140,6 +138,8 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     files of an input either.
     """
     from experiments.evaluation.single_steps import numbered_path
+    from mapfusion.landmark_map import MAP_ENDINGS
+    from mapfusion.tables import is_csv
 
     require_file("--output", path, MAP_ENDINGS, inputs)
     companion = next((each for each in _COMPANIONS if path.stem.lower().endswith(each)), None)
@@ -165,9 +165,12 @@ def require_folder(path: Path | None, inputs: Iterable[Path | str | None] = ()) 
 
     It may contain input files, such as the scenario whose results are written.
     """
+    from mapfusion.files import require_writable
+    from mapfusion.landmark_map import MAP_ENDINGS
+
     if path is None:
         return
-    if path.suffix.lower() in _OF_FILES and not path.is_dir():
+    if path.suffix.lower() in {*MAP_ENDINGS, *_OF_FILES} and not path.is_dir():
         raise InputError(
             f"--output {path}: ends in {path.suffix}, as a file does; this command writes a folder"
         )
@@ -206,4 +209,8 @@ def _is_same(path: Path, other: Path) -> bool:
 
 def _beside(path: Path) -> tuple[Path, ...]:
     """Return the files that belong to a map's file."""
+    from mapfusion.landmark_map import joint_path
+    from mapfusion.tables import is_csv
+    from mapfusion.viewing import viewing_paths
+
     return () if is_csv(path) else (joint_path(path), *viewing_paths(path))

@@ -12,11 +12,12 @@ import pandas as pd
 from experiments.evaluation import metrics, tables
 from experiments.evaluation.criteria import NothingMerged, nothing_merged
 from experiments.evaluation.metrics import MERGED_ROBOTS
-from experiments.evaluation.truth import why_no_truth
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.settings import AnyScenario, Bound
+from experiments.scenario.settings import AnyScenario, Bound, Recording
 from experiments.scenario.suite import scenarios_of
 from mapfusion.errors import InputError
+from mapfusion.robot_log import TRUTH_TABLES
+from mapfusion.tables import table_path
 
 
 def load_checked(
@@ -179,3 +180,16 @@ def _run_and_check(
         raise
     else:
         yield CheckedScenario(name, outcomes, elapsed_s=elapsed_s, unmerged=unmerged)
+
+
+def why_no_truth(scenario: AnyScenario) -> str:
+    """Return a text about the first log of a scenario without truth; empty if all have truth.
+
+    Robots are evaluated together, because alignments concern the maps of two robots.
+    """
+    logs = map(Path, scenario.logs) if isinstance(scenario, Recording) else ()
+    for log in logs:
+        lacking = [name for name in TRUTH_TABLES if not table_path(log, name).is_file()]
+        if lacking and log.is_dir():
+            return f"no truth is known: {log} has no {lacking[0]}.parquet or .csv"
+    return ""

@@ -13,17 +13,17 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import pair_evaluation, tables
+from experiments.evaluation.aligner_timing import AlignerTiming
 from experiments.evaluation.alignment_errors import (
-    AlignerTiming,
     EvaluatedRobot,
     MapPair,
     join_map_pairs,
 )
+from experiments.evaluation.checks import why_no_truth
 from experiments.evaluation.fused_landmarks import FusedTeam, MergeSettings
 from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.pair_evaluation import ALIGNED, EvaluationSettings
 from experiments.evaluation.smoothed_robots import SmoothedRobot, load_smoothed
-from experiments.evaluation.truth import why_no_truth
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.fuse import read_fusions
 from experiments.pipeline.stages.match import latest_at

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from experiments.scenario.settings import AnyScenario, Recording
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
@@ -129,16 +128,3 @@ def degrees_of_freedom(landmarks: LandmarkMap) -> int:
 def squared_mahalanobis(error: Float, covariance: Float) -> Float:
     """Return squared Mahalanobis lengths of errors (..., D) with covariances (..., D, D)."""
     return np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])
-
-
-def why_no_truth(scenario: AnyScenario) -> str:
-    """Return a text about the first log of a scenario without truth; empty if all have truth.
-
-    Robots are evaluated together, because alignments concern the maps of two robots.
-    """
-    logs = map(Path, scenario.logs) if isinstance(scenario, Recording) else ()
-    for log in logs:
-        lacking = [name for name in TRUTH_TABLES if not table_path(log, name).is_file()]
-        if lacking and log.is_dir():
-            return f"no truth is known: {log} has no {lacking[0]}.parquet or .csv"
-    return ""

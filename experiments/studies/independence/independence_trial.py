@@ -16,6 +16,7 @@ from typing import Any
 import pandas as pd
 
 from experiments.evaluation.alignment_errors import first_shared_iteration
+from experiments.evaluation.checks import why_no_truth
 from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.map_consistency import rmse
@@ -23,7 +24,6 @@ from experiments.evaluation.path_errors import STATISTICS
 from experiments.evaluation.smoothed_robots import SmoothedRobot
 from experiments.evaluation.tables import UNKNOWN
 from experiments.evaluation.team_errors import PlacedPath, team_ate_m
-from experiments.evaluation.truth import why_no_truth
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.aligner import AlignerSettings
 from experiments.pipeline.stages.fuse import FuseSettings, read_fusions

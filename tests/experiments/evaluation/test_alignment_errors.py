@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from experiments.evaluation import alignment_errors
+from experiments.evaluation import aligner_timing
+from experiments.evaluation.aligner_timing import AlignerTiming
 from experiments.evaluation.alignment_errors import (
-    AlignerTiming,
     EvaluatedRobot,
     MapPair,
     alignment_nees,
@@ -275,7 +275,7 @@ def test_compilation_does_not_count_and_first_and_last_maps_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clocks = {"icp": Clockwork(), "svd": Clockwork()}
-    monkeypatch.setattr(alignment_errors, "callable_aligner", lambda method, *_: clocks[method])
+    monkeypatch.setattr(aligner_timing, "callable_aligner", lambda method, *_: clocks[method])
     evaluate = SimpleNamespace(timing_points=3, timing_repeats=11, true_pair_radius_m=0.1)
     entries = [
         SimpleNamespace(name=name, method=name, parameters={}, time_limit_s=1.0) for name in clocks

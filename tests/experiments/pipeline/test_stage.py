@@ -261,7 +261,12 @@ def test_a_recorded_log_that_has_changed_is_read_again(tmp_path: Path) -> None:
 WITH_A_ROBOT = {"drive", "faces", "features", "observed", "log"}
 OWN_METHODS = ("opencv", "kiss_matcher", *ALIGNERS)
 # the verdict on every method seeks its rivals with the clique
-BUILDS_ON = {"icp": {"impicp"}, "ransac": {"ransac_mahalanobis"}, "clique": set(OWN_METHODS)}
+BUILDS_ON = {
+    "icp": {"impicp"},
+    "impicp": {"icp"},
+    "ransac": {"ransac_mahalanobis"},
+    "clique": set(OWN_METHODS),
+}
 
 
 def reached(*modules: str, without: frozenset[str] = frozenset()) -> set[str]:
