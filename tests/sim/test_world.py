@@ -43,7 +43,8 @@ def test_nothing_reaches_the_screen(faces: Path) -> None:
 
 IMPORTS = """
 import sys
-from sim import driver, floorplan, odometry, recorder, route, stereo_head, textures, trajectory
+from sim import driver, floorplan, odometry, routes, stereo_head, textures, trajectory
+from sim.rendering import frame_source
 assert "pybullet" not in sys.modules
 """
 

@@ -117,7 +117,9 @@ def test_align_with_the_example(
 ) -> None:
     ended = command(capsys, "align", *maps, "--set", entry("best_share"))
     assert (ended.code, ended.err) == (0, "")
-    row = next(line for line in ended.out.splitlines() if line.strip().startswith("theirs"))
+    rows = [line for line in ended.out.splitlines() if line.strip().startswith("theirs")]
+    assert rows[0].split()[1] == "accepted"  # shown as soon as the method has answered
+    row = rows[1]
     assert row.split()[1:4] == ["1.000", "-2.000", "0.3000"]
     assert "20/20" in ended.out
 

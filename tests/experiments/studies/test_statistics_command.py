@@ -59,7 +59,7 @@ def test_eighty_columns_hold_everything(tmp_path: Path, capsys: pytest.CaptureFi
     assert "without the 4 of 16 pairs of maps that have no common ground" in " ".join(
         reply.out.split()
     )
-    assert "refused where" in reply.out
+    assert "refused without" in reply.out
     assert "\N{HORIZONTAL ELLIPSIS}" not in reply.out
     assert "ransac_mahalanobis" in reply.out.split("Verdicts")[1].split("Right")[0]
 

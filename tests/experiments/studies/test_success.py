@@ -159,7 +159,11 @@ def test_bins_hold_their_lower_edge_and_the_last_one_both() -> None:
 
 @pytest.mark.parametrize(
     ("by", "edges", "says"),
-    [("colour", None, "expected one of"), ("n_true", (3, 2), "rise"), ("n_true", (3,), "two")],
+    [
+        ("colour", None, "expected one of"),
+        ("n_true", (3, 2), "increasing"),
+        ("n_true", (3,), "two"),
+    ],
 )
 def test_wrong_arguments(by: str, edges: tuple | None, says: str) -> None:
     with pytest.raises(ValueError, match=says):

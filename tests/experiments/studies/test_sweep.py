@@ -281,8 +281,7 @@ class Scene:
         self.terms.attempts.mkdir()
         self.tasks: dict[int, list[Task]] = {}
         self.told: list[SweepProgress] = []
-        for module in (driver_module, plan_module):
-            monkeypatch.setattr(module, "planned", self._planned)
+        monkeypatch.setattr(driver_module, "plan_run", self._planned)
 
     def add(self, seed: int, name: str, function: object, *arguments: object, **more: Any) -> None:
         outputs = (self.folder / name.replace("/", "_"),)
@@ -535,7 +534,7 @@ def test_runs_that_cannot_be_laid_out_are_rows_too(
             raise InputError("no floor plan\nfits seed 0")
         return laid_out(run, *more)
 
-    monkeypatch.setattr(driver_module, "planned", refusing)
+    monkeypatch.setattr(driver_module, "plan_run", refusing)
     scene.execute(client)
     assert scene.rows() == {0: ("failed", "no floor plan fits seed 0"), 1: ("finished", "")}
 

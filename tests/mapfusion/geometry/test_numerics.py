@@ -63,8 +63,8 @@ def test_smoothing_runs_on_one_thread(monkeypatch):
 
 
 def test_joint_fusion_runs_on_one_thread(monkeypatch):
-    monkeypatch.setattr(mapfusion.fusion.joint, "_inliers", reached)
-    component: Any = SimpleNamespace(planar=False, drift_sigma_m=[], members=[], maps=[])
+    monkeypatch.setattr(mapfusion.fusion.joint, "cluster_landmarks", reached)
+    component: Any = SimpleNamespace(planar=False, drift_sigma_m=[], members=[], maps=[], pairs=[])
     with threadpool_limits(2, user_api="blas"), pytest.raises(ReachedError) as found:
         mapfusion.fusion.joint.JointFuser().fuse(component, MergeParameters())
     assert set(found.value.args[0]) == {1}
