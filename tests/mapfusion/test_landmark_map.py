@@ -23,7 +23,7 @@ def joint_map(n: int = 5, rank: int = 4, seed: int = 0) -> LandmarkMap:
 
 @pytest.mark.parametrize(("n", "rank"), [(5, 4), (1, 1), (5, 0), (0, 3), (0, 0)])
 def test_round_trip(tmp_path: Path, n: int, rank: int) -> None:
-    """What is a landmark's own keeps every bit; no shared variable is one that moves nothing."""
+    """Own covariances are read bit for bit; without shared variables one of zeros is read."""
     written = joint_map(n, rank)
     assert written.joint is not None
     write_map(tmp_path / "R1.parquet", written)

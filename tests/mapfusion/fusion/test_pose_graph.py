@@ -106,7 +106,7 @@ def test_one_after_the_other() -> None:
 
 
 def test_a_bent_map_shifts_and_turns_as_a_whole() -> None:
-    """Of many maps, each shifted by s along each axis and turned about its middle by s / r."""
+    """Compare with the spread of maps shifted by s and turned about their middle by s / r."""
     rng, drift_m, n = np.random.default_rng(1), 0.01, 100_000
     p_a = rng.uniform([5.0, -4.0], [9.0, -1.0], (40, 2))
     middle = p_a.mean(axis=0)

@@ -251,7 +251,7 @@ def path_of(odometry: Float, disturbance: Float) -> Float:
 
 
 def test_levels_that_follow_steps_end_where_they_are_likeliest() -> None:
-    """Of disturbances that are told each for itself, whatever levels the variances are of."""
+    """Independent disturbances give their true noise scales, whatever the initial variances."""
     rng, true = np.random.default_rng(0), np.array([0.3, 1.0, 3.0])
     problem, measured, J = told_by_themselves(rng, true, 600)
     v, first = 1 / problem.information, np.array([1.0, 0.5, 1.5])
@@ -308,7 +308,7 @@ def test_exact_odometry_ends_where_its_noise_could_still_be_told(n: int) -> None
 
 
 def test_what_holds_a_robot_is_no_noise_that_a_level_scales() -> None:
-    """Where wheels stand still the information is bounded under any level."""
+    """The information of a standing robot is bounded at every noise scale."""
     odometry = np.array([[0, 0, 0], [0.1, 0, 0.1], [0, 0, 0]])
     stated = odometry_information(odometry, NOISE)
     under = scaled_information(stated, np.full(3, 0.01))

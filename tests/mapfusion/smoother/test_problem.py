@@ -12,7 +12,7 @@ from tests.mapfusion.smoother.white_noise_logs import white_noise_log, with_trac
 def tracked_sightings(
     *, with_offsets: bool = True
 ) -> tuple[OrderedObservations, np.ndarray, np.ndarray]:
-    """Those of a log whose every second track is of two landmarks; label and track by row."""
+    """Return observations, labels and tracks of a log; every second track has two landmarks."""
     rng = np.random.default_rng(2)
     log = with_tracks(white_noise_log(rng, 40, 30), rng, 0.0).log
     obs = log.observations

@@ -55,7 +55,7 @@ def solved_chain() -> tuple[Problem, OptimizerState]:
 
 
 def test_mean_squares_are_those_of_chains_that_are_composed() -> None:
-    """Of 5 000 paths of random disturbances, in the length of the way and of its last landmark."""
+    """Compare with 5 000 paths of random disturbances: path length and last landmark."""
     problem, end = solved_chain()
     found = second_order_errors(problem, end)
     assert found is not None
@@ -118,7 +118,7 @@ def _data(found: Smoothed, at: Estimate) -> tuple[Float, Float]:
 
 
 def test_a_path_that_is_too_short_is_in_the_covariances() -> None:
-    """Of a chain of 60 m: without the errors of second order its NEES is far above one."""
+    """The NEES of a 60 m chain is far above one without the errors of second order."""
     known = []
     for seed in range(12):
         driven = chain(np.random.default_rng(seed))

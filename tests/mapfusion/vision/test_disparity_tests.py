@@ -159,7 +159,7 @@ def catmull_rom(row: np.ndarray, at: np.ndarray) -> np.ndarray:
 def looked_at(
     left: np.ndarray, right: np.ndarray, u: int, v: int, plane: np.ndarray, half: int
 ) -> np.ndarray:
-    """Of a window's pixels that lie in both pictures (n, 5): x, y, r, g and h."""
+    """Return x, y, r, g and h of a window's pixels in both images, shape (n, 5)."""
     found = []
     for y in range(max(-half, -v), min(half, len(left) - 1 - v) + 1):
         x = np.arange(max(-half, 1 - u), min(half, left.shape[1] - 2 - u) + 1)
