@@ -78,7 +78,8 @@ def cases_of(world: MappedWorld, every: int) -> Iterator[tuple[int, Case]]:
 
 # Regions observed again under right and under wrong motions
 
-_RATES = '''"""Rates of `likelihood.py`: two parameters of what must be seen, and two of what may be.
+_RATES = '''\
+"""Rates of `likelihood.py`: two parameters of what must be seen, and two of what may be.
 
 Written by `python -m experiments.studies.verdict_fitting rates`.
 
