@@ -116,8 +116,8 @@ def _folder_contents(path: Path) -> Contents:
         log = robot_log.read_log(path)
         facts: dict[str, Any] = {"robot": log.robot, "planar": log.planar}
     else:
-        told = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
-        facts = {name: value for each in told for name, value in each.facts.items()}
+        descriptions = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
+        facts = {name: value for each in descriptions for name, value in each.facts.items()}
     if kind == _RESULT:
         require_as_written(path)
     # Files and rows by table, or by folder and table in a result

@@ -272,11 +272,11 @@ def team_of(run: EvaluatedRun, n_robots: int) -> RecordedTeam:
         "merge": merge.model_copy(update={"fuser": USUAL}),
         "expect": {},
     }
-    kept = {name: value for name, value in scenario if name in Scenario.model_fields}
+    inherited = {name: value for name, value in scenario if name in Scenario.model_fields}
     logs = [str(run.store.path(robot.log)) for robot in robots]
-    recorded = Recording(**kept | changed, logs=logs)
+    recorded = Recording(**inherited | changed, logs=logs)
     if reason := why_no_truth(recorded):
-        raise InputError(f"scenario {scenario.name}: {reason}; errors cannot be told")
+        raise InputError(f"scenario {scenario.name}: {reason}; its errors are unknown")
     return RecordedTeam(EvaluatedRun.of(recorded, run.store))
 
 
@@ -356,7 +356,7 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     smoothed = run.load_smoothed(robots)
     first = first_shared_iteration(robots, run.scenario.evaluate.true_pair_radius_m)
     about = {"first_shared": UNKNOWN if first is None else first}
-    judged: dict[tuple[str, int], dict[str, Any]] = {}
+    errors_of: dict[tuple[str, int], dict[str, Any]] = {}
     for fuser, stage in team.by_fuser.items():
         folder = team.folder(stage)
         anew = read_paths(folder)
@@ -385,11 +385,11 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
                     "gross_share": fit.gross_share,
                     "path_rmse_m": STATISTICS["rmse"](team_ate_m(paths)),
                 }
-            judged[fuser, k] = row
+            errors_of[fuser, k] = row
     for strategy in STRATEGIES:
         for k in team.iterations:
             row = {"strategy": strategy.name, "iteration": k} | about
-            yield row | judged[strategy.fuser, k]
+            yield row | errors_of[strategy.fuser, k]
 
 
 def _given_path(

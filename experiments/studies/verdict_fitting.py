@@ -26,7 +26,6 @@ from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
 from experiments.evaluation.criteria import MERGEABLE_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
-from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator, parse_seeds
 from experiments.studies import refusal_cases
 from experiments.studies.refusal_cases import Case, MappedWorld, worlds_of
@@ -36,7 +35,6 @@ from mapfusion.align.oracle import Oracle
 from mapfusion.files import write_whole
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.registration import Registration
 from mapfusion.verification import fitted, fitted_rates, fitted_twins
 from mapfusion.verification.likelihood import (
     COPIED,
@@ -259,9 +257,7 @@ def answers_of(worlds: Sequence[MappedWorld]) -> Answers:
             names = (world.name, case.map_a.name, case.map_b.name, k)
             for entry in settings.aligners:
                 rng = generator(scenario.seed, "fit", *names, entry.name)
-                aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-                registration = Registration(aligner, settings.refinement, judge=None)
-                refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
+                refined = case.refined_estimate(entry, settings.refinement, rng)
                 if not np.isfinite(judge.judge(refined).probability):
                     continue
                 signs = judge.features(refined)

@@ -146,7 +146,7 @@ def _without_outliers(position_m: Float) -> Float:
     return np.where(inside[:, None], position_m, np.nan)
 
 
-def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, tuple[str, str]]:
+def classify_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, tuple[str, str]]:
     """Classify the last correspondences as right or wrong.
 
     The truth decides where it is known, else the refined inliers of the first aligner that has any.
@@ -174,7 +174,7 @@ def _add_correspondences(
 ) -> None:
     """Draw a sample of the right and of the wrong correspondences as lines."""
     rows = data.last_correspondences(pair)
-    right, names = judge_correspondences(data, pair)
+    right, names = classify_correspondences(data, pair)
     ends = np.stack([position_a[rows["index_a"]], position_b[rows["index_b"]]], axis=1)
     drawable = np.isfinite(ends).all(axis=(1, 2))
     styles: tuple[dict[str, Any], ...] = (

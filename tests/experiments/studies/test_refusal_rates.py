@@ -18,9 +18,9 @@ from experiments.reports.terminal.study_screen import print_kinds, print_reliabi
 from experiments.studies.refusal_rates import (
     N_BINS,
     Rate,
+    answers_with_probability,
     by_kind,
     first_right_answers,
-    judged_answers,
     of_any_method,
     pooled,
     reliability,
@@ -134,7 +134,7 @@ def answers(stated: np.ndarray, right: np.ndarray, n_runs: int) -> pd.DataFrame:
     rows["kind"] = np.where(np.arange(len(stated)) % 2, "a", "b")
     rows = rows.assign(ground="common", n_common=9, accepted=True, status="accepted")
     rows = rows.assign(refined_rotation_error_rad=0.0, beats_chance=True, n_true=30)
-    return judged_answers(rows.assign(log10_false_alarms=-5.0, aligner="ransac"))
+    return answers_with_probability(rows.assign(log10_false_alarms=-5.0, aligner="ransac"))
 
 
 def test_a_probability_that_holds_errs_by_what_chance_gives() -> None:
