@@ -1,14 +1,16 @@
-"""Floor plans: views, scales and error ellipses."""
+"""Tests of floor plans and of the common style."""
 
 import io
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from experiments.reports.figures import floor_plan
 from experiments.reports.figures.floor_plan import add_ellipses, semi_axes
+from experiments.reports.figures.style import write_plainly
 
 
 def test_strays_are_out_of_view_and_counted() -> None:
@@ -131,3 +133,25 @@ def test_ellipses_are_drawn_to_scale_at_their_place() -> None:
     assert columns.max() == pytest.approx(250 + half_x, abs=tolerance_px)
     assert rows.min() == pytest.approx(230 - half_y, abs=tolerance_px)
     assert rows.max() == pytest.approx(230 + half_y, abs=tolerance_px)
+
+
+def labels_between_powers(least: float, most: float) -> list[str]:
+    """Of an axis with these ends, where there are any."""
+    figure = Figure()
+    axes = figure.subplots()
+    axes.set_yscale("log")
+    write_plainly(axes.yaxis)
+    axes.set_ylim(least, most)
+    FigureCanvasAgg(figure).draw()
+    assert "0.001" in [label.get_text() for label in axes.yaxis.get_majorticklabels()]
+    return [text for label in axes.yaxis.get_minorticklabels() if (text := label.get_text())]
+
+
+def test_an_axis_of_few_powers_of_ten_has_plain_numbers_between_them() -> None:
+    labels = labels_between_powers(2e-4, 9e-3)
+    assert {"0.0003", "0.002"} <= set(labels)
+    assert all(2e-4 <= float(label) <= 9e-3 and "e" not in label for label in labels)
+
+
+def test_an_axis_of_many_powers_has_none_between_them() -> None:
+    assert labels_between_powers(1e-4, 10) == []

@@ -1,3 +1,5 @@
+"""Tests of the files that studies write."""
+
 import csv
 from io import StringIO
 from pathlib import Path
