@@ -92,7 +92,13 @@ def one_line(text: str) -> str:
     escaped = "".join(
         c if c.isprintable() or c.isspace() else c.encode("unicode_escape").decode() for c in text
     )
-    words = [_shortened(word) for word in escaped.split()]
+    first = 2 * _MAX_WORD // 3  # of a word that is too long; its end stays, too
+    words = [
+        word
+        if len(word) <= _MAX_WORD
+        else word[:first] + _GAP + word[len(word) - _MAX_WORD + first + len(_GAP) :]
+        for word in escaped.split()
+    ]
     line = " ".join(words)
     if len(line) <= MOST_CHARACTERS:
         return line
@@ -105,14 +111,6 @@ def _first_of(words: Sequence[str], most: int) -> list[str]:
     """Return as many of the first words as fit into `most` characters, with blanks between."""
     ends = itertools.accumulate(len(word) + 1 for word in words)
     return [word for word, end in zip(words, ends, strict=True) if end - 1 <= most]
-
-
-def _shortened(word: str) -> str:
-    """Return the beginning and the end of a word that is too long."""
-    if len(word) <= _MAX_WORD:
-        return word
-    first = 2 * _MAX_WORD // 3
-    return word[:first] + _GAP + word[len(word) - _MAX_WORD + first + len(_GAP) :]
 
 
 # New modules, and the former modules that plug-ins may import; all names without `mapfusion.`.
@@ -140,7 +138,9 @@ _FORMER_MODULES = {
     "align.clique": "align.max_clique",
     "align.nearest_neighbours": "align.box_tree align.nearest_points align.closest",
     "align.icp": "align.impicp",
-    "align.refinement": "align.refine",
+    "align.refinement": "align.refine align.oracle",
+    "align.ransac": "align.ransac_mahalanobis",
+    "align.peers": "align.peers.opencv align.peers.kiss_matcher",
     "align.aligners": "align.registry",
     "verification": "evidence",
     "verification.false_alarms": "align.false_alarms align.named_landmarks align.acceptance",

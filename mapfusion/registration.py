@@ -119,14 +119,11 @@ class MethodAligner:
         Raises:
             ValueError: an index of the correspondences lies outside its map.
         """
+        return self.align_pairs(Pairs(map_a, map_b, correspondences), rng)
+
+    def align_pairs(self, pairs: Pairs, rng: np.random.Generator) -> Alignment:
+        """Estimate T_a_b from pairs, for which the method may hold cached data."""
         started_s = time.perf_counter()
-        return self._align(Pairs(map_a, map_b, correspondences), rng, started_s)
-
-    def align_again(self, pairs: Pairs, rng: np.random.Generator) -> Alignment:
-        """Estimate T_a_b again from the same pairs, for which the method may hold cached data."""
-        return self._align(pairs, rng, time.perf_counter())
-
-    def _align(self, pairs: Pairs, rng: np.random.Generator, started_s: float) -> Alignment:
         height = getattr(self.method, "height", None)
         needs = getattr(self.method, "needs", None) or Needs()
         gate = height if isinstance(height, HeightGate) else None
@@ -338,7 +335,7 @@ class PairRegistration:
         """Estimate, refine and judge once."""
         pairs = self._verifier.pairs
         if isinstance(self._aligner, MethodAligner):
-            estimated = self._aligner.align_again(pairs, rng)
+            estimated = self._aligner.align_pairs(pairs, rng)
         else:
             estimated = self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
         registered = Registered(estimated, *self._verifier.verify(estimated))

@@ -26,7 +26,7 @@ from experiments.pipeline.tables import (
 )
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.oracle import Oracle
+from mapfusion.align.refinement import Oracle
 from mapfusion.fusion.fused_map import AlignedPair
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float

@@ -6,7 +6,7 @@ is therefore equal in both maps up to noise (Mangelson et al. 2018, PCM; Lusk et
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
@@ -39,21 +39,6 @@ _SHARE = 1 / 16
 _LEAST_EXTENT_M = 1e-6  # smallest extent of a map, which avoids a division by zero
 
 
-class _Coarse(NamedTuple):
-    """N correspondences in single precision, in units of the larger map's extent, arrays (N,).
-
-    Attributes:
-        ax, ay, bx, by: positions relative to the first pair.
-        most: contribution to the largest squared difference of two distances.
-    """
-
-    ax: np.ndarray
-    ay: np.ndarray
-    bx: np.ndarray
-    by: np.ndarray
-    most: np.ndarray
-
-
 @kernel
 def _worst(xx: float, xy: float, yy: float) -> float:
     """Return the larger eigenvalue of a covariance."""
@@ -61,29 +46,30 @@ def _worst(xx: float, xy: float, yy: float) -> float:
 
 
 @kernel
-def _coarse(rows: Float, variance_m2: float, bound: float) -> _Coarse:
-    """Return the pairs in single precision, with bounds that include rounding errors."""
+def _coarse(
+    rows: Float, variance_m2: float, bound: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pairs in single precision, with bounds that include rounding errors.
+
+    Returns:
+        Positions ax, ay, bx, by relative to the first pair, in units of the larger map's extent,
+        and the contribution of each pair to the largest squared difference of two distances, each
+        of shape (N,).
+    """
     n, extent = len(rows), _LEAST_EXTENT_M
     for i in range(n):
         for k in range(4):
             extent = max(extent, abs(rows[i, k] - rows[0, k]))
-    coarse = _Coarse(
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-    )
+    ax, ay = np.empty(n, np.float32), np.empty(n, np.float32)
+    bx, by, most = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     for i in range(n):
-        coarse.ax[i] = (rows[i, 0] - rows[0, 0]) / extent
-        coarse.ay[i] = (rows[i, 1] - rows[0, 1]) / extent
-        coarse.bx[i] = (rows[i, 2] - rows[0, 2]) / extent
-        coarse.by[i] = (rows[i, 3] - rows[0, 3]) / extent
+        ax[i], ay[i] = (rows[i, 0] - rows[0, 0]) / extent, (rows[i, 1] - rows[0, 1]) / extent
+        bx[i], by[i] = (rows[i, 2] - rows[0, 2]) / extent, (rows[i, 3] - rows[0, 3]) / extent
         worst = _worst(rows[i, 4], rows[i, 5], rows[i, 6])
         worst += _worst(rows[i, 7], rows[i, 8], rows[i, 9])
-        most = bound * (worst + variance_m2) / (extent * extent)
-        coarse.most[i] = (1 + _SHARE) * most + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
-    return coarse
+        own = bound * (worst + variance_m2) / (extent * extent)
+        most[i] = (1 + _SHARE) * own + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
+    return ax, ay, bx, by, most
 
 
 @kernel

@@ -62,17 +62,6 @@ def why_angle_is_open(pairs: Pairs, drift_m2: float = 0.0, which: str = " that a
     return ""
 
 
-def why_affine_map_is_open(pairs: Pairs) -> str:
-    """Return why an affine map from b to a is open; empty if the pairs determine it.
-
-    The affine map is open if all paired landmarks of map b lie on one line in plan.
-    """
-    if lacks_extent(pairs.p_b, pairs.covariance_b, 0.0, 2):
-        n = len(pairs)
-        return f"the {n} pairs lie on one line of map b in plan, as far as noise can tell"
-    return ""
-
-
 @dataclass(frozen=True)
 class Needs:
     """Requirements of a method on the pairs; a method is not called without them.
@@ -90,11 +79,12 @@ class Needs:
         """Return why the extent of the pairs is too small; empty if it is large enough."""
         if self.dimensions == 0:
             return ""
-        return (
-            why_angle_is_open(pairs, which="")
-            if self.dimensions == 1
-            else why_affine_map_is_open(pairs)
-        )
+        if self.dimensions == 1:
+            return why_angle_is_open(pairs, which="")
+        if lacks_extent(pairs.p_b, pairs.covariance_b, 0.0, 2):
+            n = len(pairs)
+            return f"the {n} pairs lie on one line of map b in plan, as far as noise can tell"
+        return ""
 
 
 @dataclass(frozen=True)

@@ -30,14 +30,17 @@ from mapfusion.datasets.stereo_recording import (
     pair_shots,
 )
 from mapfusion.datasets.text_files import (
+    ODOMETRY_FILE,
     POSES,
+    TimedPoses,
     parse_time_ns,
+    read_odometry_beside,
     read_rows,
     read_time_series,
     require_columns,
     require_increasing,
+    tum_text,
 )
-from mapfusion.datasets.tum import ODOMETRY_FILE, TimedPoses, read_odometry, tum_text
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
 
@@ -108,7 +111,6 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
             raise InputError(f"{states}: holds a quaternion of length 0")
         T_world_body = se3.from_quaternions(values[:, :3], values[:, [4, 5, 6, 3]])
         truth = TimedPoses(truth_ns, T_world_body).moved(T_body_robot)
-    odometry = root / ODOMETRY_FILE
     return StereoRecording(
         (root.resolve().parent if root.name == "mav0" else root.resolve()).name,
         time_ns,
@@ -116,7 +118,7 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
         calibration,
         settings.mount.applied(T_robot_left),
         truth,
-        read_odometry(odometry) if odometry.exists() else None,
+        read_odometry_beside(root),
         (*lost_left, *lost_right, *dropped),
         inertial,
         calibrated_by,

@@ -19,7 +19,6 @@ from mapfusion.fastslam.landmarks import (
     Estimates,
     allocate,
     grow,
-    slots_near,
     transform_boxes,
     update_block_boxes,
     update_boxes,
@@ -62,10 +61,6 @@ class ParticleMaps:
     def n_rows(self) -> int:
         """Number of slots that have a row."""
         return len(self._used_rows)
-
-    def near(self, box_m: Float) -> np.ndarray:
-        """Return slots whose box overlaps `box_m` (4,); they may be out of date."""
-        return slots_near(self.slots, box_m)
 
     def bring_up_to_date(self, which: np.ndarray) -> np.ndarray:
         """Update the rows of slots (n,) to the present generation; free slots without a particle.

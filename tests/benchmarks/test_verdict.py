@@ -11,7 +11,7 @@ import pytest
 
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import match
-from mapfusion.align.oracle import Oracle
+from mapfusion.align.refinement import Oracle
 from mapfusion.verification.verdict import Judge
 from tests.mapfusion.verification.two_rooms import Wall, mapped
 

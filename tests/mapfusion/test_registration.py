@@ -268,7 +268,7 @@ def test_equal_fits_are_one_answer_and_others_are_not():
         replace(first, refusal="unsure"),
     ]
     aligner = as_aligner(Answers(fits))
-    again = [aligner.align_again(pairs, rng) for _ in fits]
+    again = [aligner.align_pairs(pairs, rng) for _ in fits]
     for fit, found in zip(fits, again, strict=True):
         assert_same(found, as_aligner(Answers([fit])).align(*maps_of(pair), rng))
     covariances = [found.covariance.tobytes() for found in again]
@@ -284,15 +284,15 @@ def test_the_height_gate_and_needs_of_each_method_are_its_own():
     raised = replace(pair.map_b, position_m=pair.map_b.position_m + np.array([0, 0, 5.0]))
     pairs, everyone = Pairs(pair.map_a, raised, pair.correspondences), np.ones(50, bool)
     rng, plain = np.random.default_rng(0), Answers([Fit(pair.T_a_b, everyone)])
-    assert as_aligner(plain).align_again(pairs, rng).ok
+    assert as_aligner(plain).align_pairs(pairs, rng).ok
     gated = Answers([Fit(pair.T_a_b, everyone)])
     gated.height = HeightGate()
-    assert "heights of 0" in as_aligner(gated).align_again(pairs, rng).reason
+    assert "heights of 0" in as_aligner(gated).align_pairs(pairs, rng).reason
     assert not gated.given
     wants = Answers([Fit(pair.T_a_b, everyone)])
     wants.needs = Needs(51)
-    assert "51 are needed" in as_aligner(wants).align_again(pairs, rng).reason
-    assert as_aligner(plain).align_again(pairs, rng).ok
+    assert "51 are needed" in as_aligner(wants).align_pairs(pairs, rng).reason
+    assert as_aligner(plain).align_pairs(pairs, rng).ok
     assert [len(given) for given in plain.given] == [50, 50]
 
 

@@ -19,8 +19,8 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
 from mapfusion.align.mahalanobis_gate import mean_variances, refit_to_support
 from mapfusion.align.method import Fit
-from mapfusion.align.oracle import Oracle
-from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, least_truncated_squares
+from mapfusion.align.ransac import RansacMahalanobis, least_truncated_squares
+from mapfusion.align.refinement import Oracle
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
 from mapfusion.registration import as_aligner
