@@ -569,6 +569,9 @@ class _Messages:
 
         times = (drive.time_ns + _FIRST_NS).tolist()
         put("/tf_static", times[0], self._static_transforms(times[0]))
+        still = self._new("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
+        twist = self._new("geometry_msgs/Twist", still, still)
+        twist = self._new("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
         reckoned, true = drive.reckoned_bodies, drive.true_bodies
         reckoned = reckoned if reckoned.ndim == 3 else se3.from_planar(reckoned)
         for k, time_ns in enumerate(times):
@@ -582,13 +585,15 @@ class _Messages:
                 )
                 put(f"/{side}/image_rect", time_ns, picture)
                 put(f"/{side}/camera_info", time_ns, self._camera_info(time_ns, camera))
-            put("/odom", time_ns, self._odometry(time_ns, reckoned[k]))
-            header = self._header(time_ns, "world")
-            put(
-                "/truth",
-                time_ns,
-                self._new("geometry_msgs/PoseStamped", header, self._pose(true[k])),
+            # Velocities are zero, covariances unknown.
+            pose = self._new(
+                "geometry_msgs/PoseWithCovariance", self._pose(reckoned[k]), np.zeros(36)
             )
+            header = self._header(time_ns, "odom")
+            put("/odom", time_ns, self._new("nav_msgs/Odometry", header, _BASE, pose, twist))
+            header = self._header(time_ns, "world")
+            pose = self._new("geometry_msgs/PoseStamped", header, self._pose(true[k]))
+            put("/truth", time_ns, pose)
             on_frame(k + 1, len(drive))
 
     def _new(self, name: str, *values: Any) -> Any:
@@ -618,22 +623,6 @@ class _Messages:
         q = se3.quaternions(T[None])[0].tolist()
         point = self._new("geometry_msgs/Point", *T[:3, 3].tolist())
         return self._new("geometry_msgs/Pose", point, self._new("geometry_msgs/Quaternion", *q))
-
-    def _odometry(self, time_ns: int, pose: Float) -> Any:
-        """Return an Odometry message with unknown covariances and zero velocities."""
-        unknown, still = np.zeros(36), self._new("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-        own = self._pose(pose)
-        return self._new(
-            "nav_msgs/Odometry",
-            self._header(time_ns, "odom"),
-            _BASE,
-            self._new("geometry_msgs/PoseWithCovariance", own, unknown),
-            self._new(
-                "geometry_msgs/TwistWithCovariance",
-                self._new("geometry_msgs/Twist", still, still),
-                unknown,
-            ),
-        )
 
     def _static_transforms(self, time_ns: int) -> Any:
         """Return the TFMessage of the camera mounts."""
