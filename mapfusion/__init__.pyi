@@ -16,10 +16,10 @@ from mapfusion.fastslam.mapping import build_map as build_map
 from mapfusion.fastslam.mapping import run_log as run_log
 from mapfusion.fastslam.motion import MotionNoise as MotionNoise
 from mapfusion.fastslam.proposal import Proposal as Proposal
-from mapfusion.fusion.fused_map import AlignedPair as AlignedPair
-from mapfusion.fusion.fused_map import FusedMap as FusedMap
-from mapfusion.fusion.fused_map import Fusion as Fusion
-from mapfusion.fusion.fused_map import MergeParameters as MergeParameters
+from mapfusion.fusion.fusers import AlignedPair as AlignedPair
+from mapfusion.fusion.fusers import FusedMap as FusedMap
+from mapfusion.fusion.fusers import Fusion as Fusion
+from mapfusion.fusion.fusers import MergeParameters as MergeParameters
 from mapfusion.fusion.fusers import make_fuser as make_fuser
 from mapfusion.fusion.merge import merge as _merge
 from mapfusion.fusion.team_graph import EdgeStatus as EdgeStatus

@@ -128,9 +128,8 @@ _FORMER_MODULES = {
     "landmark_map": "joint_files",
     "viewing": "viewing_files",
     "registration": "align.registration align.supported align.completion",
-    "align.alignment": "align.result align.pairs",
+    "align.alignment": "align.result align.pairs align.method align.degeneracy",
     "align.rigid_motion": "align.rigid",
-    "align.method": "align.degeneracy",
     "align.correspondences": "align.nearest_descriptors",
     "align.mahalanobis_gate": "align.near_pairs align.leverage",
     "align.drift": "align.calibration_part",
@@ -151,8 +150,10 @@ _FORMER_MODULES = {
     "verification.verdict": "evidence.precision evidence.pair_evidence evidence.judge",
     "fusion": "fuse team",
     "fusion.aligned_landmarks": "aligned_landmarks same_point fuse.clusters",
-    "fusion.fused_map": "fused_map name_order fuse.parameters fuse.component",
-    "fusion.fusers": "fuse.fuser fuse.registry",
+    "fusion.fusers": (
+        "fuse.fuser fuse.registry fuse.parameters fuse.component fusion.fused_map fused_map "
+        "name_order"
+    ),
     "fusion.kalman": "fuse.sequential fuse.kalman fuse.kalman_drift",
     "fusion.covariance_intersection": "fuse.covariance_intersection",
     "fusion.joint": "fuse.jointly_fused fuse.joint",

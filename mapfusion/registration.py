@@ -10,14 +10,18 @@ from mapfusion.align.alignment import (
     MIN_PAIRS,
     NOT_RUN,
     Alignment,
+    Fit,
+    Method,
+    Needs,
     Pairs,
     Status,
+    Undetermined,
+    supported,
     undetermined,
     why_too_few,
 )
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import calibration_covariance, estimate_drift_m
-from mapfusion.align.method import Fit, Method, Needs, Undetermined, supported
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (
     least_squares_gain,

@@ -27,7 +27,7 @@ from experiments.pipeline.tables import (
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.refinement import Oracle
-from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.fusion.fusers import AlignedPair
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap

@@ -30,8 +30,7 @@ from mapfusion.datasets.log_consistency import Finding, check_log, gate_finding,
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
-from mapfusion.fusion.fused_map import AlignedPair, Fusion, name_order
-from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.fusers import AlignedPair, Fusion, make_fuser, name_order
 from mapfusion.fusion.merge import merge as merge_maps
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map

@@ -11,8 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from mapfusion.align.alignment import Alignment, Pairs, Status, without_answer
-from mapfusion.align.method import Fit, Needs, Undetermined
+from mapfusion.align.alignment import (
+    Alignment,
+    Fit,
+    Needs,
+    Pairs,
+    Status,
+    Undetermined,
+    without_answer,
+)
 from mapfusion.errors import one_line
 from mapfusion.registration import Aligner, MethodAligner
 

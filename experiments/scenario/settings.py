@@ -33,8 +33,7 @@ from experiments.scenario.world_settings import (
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refinement import Refinement
 from mapfusion.errors import OutOfRangeError, did_you_mean
-from mapfusion.fusion.fused_map import MergeParameters
-from mapfusion.fusion.fusers import USUAL
+from mapfusion.fusion.fusers import USUAL, MergeParameters
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.parameters import Range
 from mapfusion.verification.false_alarms import Acceptance

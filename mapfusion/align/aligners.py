@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
+from mapfusion.align.alignment import Method
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.gnc import Gnc
 from mapfusion.align.icp import Icp, ImpIcp
-from mapfusion.align.method import Method
 from mapfusion.align.peers import KissMatcher, OpenCv
 from mapfusion.align.ransac import Ransac, RansacMahalanobis
 from mapfusion.align.svd import Svd

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
+from mapfusion.align.alignment import Fit, Pairs, Undetermined, why_angle_is_open
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.drift import DRIFT_FLOOR_M
 from mapfusion.align.mahalanobis_gate import (
@@ -19,7 +19,6 @@ from mapfusion.align.mahalanobis_gate import (
     mean_variances,
     refit_at_best_drift,
 )
-from mapfusion.align.method import Fit, Undetermined, why_angle_is_open
 from mapfusion.geometry.numerics import (
     WORD,
     Float,

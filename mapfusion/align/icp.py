@@ -7,9 +7,8 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
+from mapfusion.align.alignment import Fit, Needs, Pairs
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.method import Fit, Needs
 from mapfusion.align.nearest_neighbours import (
     GROUP,
     BoxTree,

@@ -11,8 +11,7 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
-from mapfusion.align.method import Fit, Undetermined, supported
+from mapfusion.align.alignment import Fit, Pairs, Undetermined, supported
 from mapfusion.geometry.se2 import rotation, transform_points
 from mapfusion.parameters import Probability, Range, require_in_range
 

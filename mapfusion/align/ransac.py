@@ -9,11 +9,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
+from mapfusion.align.alignment import Fit, Pairs, Undetermined
 from mapfusion.align.consensus import Consensus, drift_needed, packed_rows, pair_spread
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.mahalanobis_gate import PlanarPairs, mark_supporters, refit_to_support
-from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.rigid_motion import fit_rigid, fit_two
 from mapfusion.geometry.numerics import Float, chi_square_bound, kernel
 from mapfusion.geometry.se2 import residual

@@ -10,7 +10,15 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.align.alignment import MIN_PAIRS, Alignment, Pairs, Status, undetermined, why_too_few
+from mapfusion.align.alignment import (
+    MIN_PAIRS,
+    Alignment,
+    Pairs,
+    Status,
+    undetermined,
+    why_angle_is_open,
+    why_too_few,
+)
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.drift import calibration_covariance, drift_step
 from mapfusion.align.mahalanobis_gate import (
@@ -19,7 +27,6 @@ from mapfusion.align.mahalanobis_gate import (
     is_outlier_to_others,
     why_rests_on_one_pair,
 )
-from mapfusion.align.method import why_angle_is_open
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import Float, invert, kernel
 from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points, wrap

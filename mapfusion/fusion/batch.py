@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
+from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.smoother.joint_smoothing import smooth_jointly
 from mapfusion.smoother.smooth import condensed_points

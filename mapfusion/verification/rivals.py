@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.align.alignment import MIN_PAIRS, Pairs
+from mapfusion.align.alignment import MIN_PAIRS, Pairs, Undetermined
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_descriptors
-from mapfusion.align.method import Undetermined
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import Float, kernel

@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 
 from mapfusion.align.aligners import ALIGNERS, make_aligner
-from mapfusion.align.alignment import Alignment, Pairs, Status, without_answer
+from mapfusion.align.alignment import (
+    Alignment,
+    Fit,
+    Needs,
+    Pairs,
+    Status,
+    Undetermined,
+    supported,
+    without_answer,
+)
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.method import Fit, Needs, Undetermined, supported
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (

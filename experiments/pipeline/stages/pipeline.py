@@ -31,8 +31,7 @@ from experiments.plugins.discovery import Kind, find_method, fingerprint
 from experiments.scenario.settings import AnyScenario, Recording, Scenario, Simulation
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section
 from mapfusion.errors import InputError
-from mapfusion.fusion.fused_map import name_order
-from mapfusion.fusion.fusers import FUSERS, target_of
+from mapfusion.fusion.fusers import FUSERS, name_order, target_of
 from mapfusion.robot_log import read_log
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.vision.front_end import FrontEndParameters

@@ -38,7 +38,7 @@ from experiments.reports.terminal.layout import (
 from experiments.studies.error_bands import ROBOT_PAIR, error_bands
 from experiments.studies.method_comparison import aligner_summary
 from mapfusion.align.alignment import NOT_RUN, Status
-from mapfusion.fusion.fused_map import FusedMap
+from mapfusion.fusion.fusers import FusedMap
 from mapfusion.geometry.se2 import motion_sigma
 
 _SEEDS_SHOWN = 3  # one by one, in a table of checks

@@ -33,7 +33,7 @@ from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import POSE_FIELDS, float_fields, named_columns, schema
-from mapfusion.fusion.fused_map import FusedMap
+from mapfusion.fusion.fusers import FusedMap
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.registration import Registration

@@ -23,7 +23,7 @@ NOW = HERE.parents[1] / "plugin_example" / "mapfusion_best_share.py"
 BEFORE = HERE / "best_share_before.py"
 FINDER = """
 import numpy as np
-from mapfusion.align.method import Fit, Needs, Undetermined
+from mapfusion.align.alignment import Fit, Needs, Undetermined
 
 T = np.array([1.0, 2.0, 0.5])
 

@@ -11,8 +11,7 @@ from mapfusion.align.aligners import make_aligner
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.drift import DRIFT_FLOOR_M, calibration_covariance, estimate_drift_m
 from mapfusion.align.refinement import Refinement
-from mapfusion.fusion.fused_map import AlignedPair
-from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.fusers import AlignedPair, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.geometry.camera import EXACT, CalibrationError
