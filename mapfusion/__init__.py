@@ -32,7 +32,7 @@ _NAMES_OF = {
     "smoother.joint_smoothing": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),
     "verification.regions": ("EvidenceParameters",),
-    "verification.verdict": ("Judge",),
+    "verification.verdict": ("Verifier",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 _CALLED_THERE = {"merge_maps": "merge"}

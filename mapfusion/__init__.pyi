@@ -38,7 +38,7 @@ from mapfusion.robot_log import write_log as write_log
 from mapfusion.smoother.joint_smoothing import AssociatedLog as AssociatedLog
 from mapfusion.verification.false_alarms import Acceptance as Acceptance
 from mapfusion.verification.regions import EvidenceParameters as EvidenceParameters
-from mapfusion.verification.verdict import Judge as Judge
+from mapfusion.verification.verdict import Verifier as Verifier
 
 merge_maps = _merge  # `merge` is the module
 __version__: str

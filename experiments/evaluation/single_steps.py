@@ -244,8 +244,8 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         done = ready.register(rng)
         false_alarms = done.verdict.log10_false_alarms
         pairs.append(AlignedPair(a, b, done.applied, offered, false_alarms))
-        if done.applied.status is Status.AMBIGUOUS and ready.judge is not None:
-            rivals = ready.judge.rivals_of(done.refined)
+        if done.applied.status is Status.AMBIGUOUS and ready.verifier is not None:
+            rivals = ready.verifier.rivals_of(done.refined)
             pairs += [AlignedPair(a, b, rival, offered, false_alarms) for rival in rivals]
     chosen = settings.merge
     fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))

@@ -155,7 +155,7 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     n_pairs, share = settings.n_pairs, settings.outlier_share
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
     registration = Registration(
-        aligner, judge=None
+        aligner, verifier=None
     )  # no verdict: methods are ranked by their estimates
     cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
     rows: list[dict[str, Any]] = []

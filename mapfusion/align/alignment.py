@@ -116,7 +116,7 @@ class Pairs:
         return Pairs(self.map_a, self.map_b, self.correspondences[rows])
 
     @cached_property
-    def kept(self) -> dict[type, Any]:
+    def cache(self) -> dict[type, Any]:
         """Values that methods keep between calls with the same pairs, by type."""
         return {}
 
@@ -189,8 +189,8 @@ class Pairs:
 
     def in_plan(self) -> PlanarPairs:
         """Return the pairs without heights, as arrays for kernels; do not change them."""
-        if PlanarPairs in self.kept:
-            return self.kept[PlanarPairs]
+        if PlanarPairs in self.cache:
+            return self.cache[PlanarPairs]
         n = len(self)
         plan = PlanarPairs(*np.empty((2, n, 2)), *np.empty((2, n, 2, 2)))
         for part, whole in zip(plan[:2], (self.p_a, self.p_b), strict=True):
@@ -198,7 +198,7 @@ class Pairs:
         for part, whole in zip(plan[2:], (self.covariance_a, self.covariance_b), strict=True):
             part[:, 0, 0], part[:, 0, 1] = whole[:, 0, 0], whole[:, 0, 1]
             part[:, 1, 0], part[:, 1, 1] = whole[:, 1, 0], whole[:, 1, 1]
-        self.kept[PlanarPairs] = plan
+        self.cache[PlanarPairs] = plan
         return plan
 
     def of_one_height(self, gate: HeightGate) -> np.ndarray:

@@ -218,7 +218,7 @@ class Consensus:
         The result is undetermined for T_a_b of NaN. Results are kept with the pairs, because
         repetitions of a method find the same motions.
         """
-        fits: dict[tuple, Fit | Undetermined] = pairs.kept.setdefault(Consensus, {})
+        fits: dict[tuple, Fit | Undetermined] = pairs.cache.setdefault(Consensus, {})
         key = self, T_a_b.tobytes()
         if key not in fits:
             inlier, level = np.zeros(len(pairs), dtype=bool), -1
@@ -249,6 +249,6 @@ class Consensus:
 
 def pair_spread(pairs: Pairs) -> PairSpread:
     """Return the `PairSpread` of the pairs, which is kept with them."""
-    if PairSpread not in pairs.kept:
-        pairs.kept[PairSpread] = PairSpread.of(pairs.in_plan())
-    return pairs.kept[PairSpread]
+    if PairSpread not in pairs.cache:
+        pairs.cache[PairSpread] = PairSpread.of(pairs.in_plan())
+    return pairs.cache[PairSpread]

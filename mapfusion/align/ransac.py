@@ -231,12 +231,12 @@ class RansacMahalanobis(Consensus):
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """Estimate T_a_b with the largest s_drift, and refit to the support."""
         planar = pairs.in_plan()
-        if RansacMahalanobis not in pairs.kept:
-            pairs.kept[RansacMahalanobis] = packed_rows(planar)
+        if RansacMahalanobis not in pairs.cache:
+            pairs.cache[RansacMahalanobis] = packed_rows(planar)
         _, T_a_b = least_truncated_squares(
             planar,
             pair_spread(pairs).own_m2,
-            pairs.kept[RansacMahalanobis],
+            pairs.cache[RansacMahalanobis],
             self.variances_m2[-1],
             self.bound,
             chi_square_bound(self.probability, 1),

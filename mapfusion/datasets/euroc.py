@@ -19,7 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.datasets.camera_calibration import StereoCalibration, parse_lens, parse_transform
-from mapfusion.datasets.export import OnFrame, StereoDrive, write_picture, write_text
+from mapfusion.datasets.export import (
+    OnFrame,
+    StereoDrive,
+    write_dead_reckoning,
+    write_picture,
+    write_text,
+)
 from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.levelling import MountSettings, robot_in_body
 from mapfusion.datasets.stereo_recording import (
@@ -30,7 +36,6 @@ from mapfusion.datasets.stereo_recording import (
     pair_shots,
 )
 from mapfusion.datasets.text_files import (
-    ODOMETRY_FILE,
     POSES,
     TimedPoses,
     parse_time_ns,
@@ -39,7 +44,6 @@ from mapfusion.datasets.text_files import (
     read_time_series,
     require_columns,
     require_increasing,
-    tum_text,
 )
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
@@ -177,7 +181,5 @@ def write_euroc(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pat
     values = np.column_stack([T[:, :3, 3], np.roll(se3.quaternions(T), 1, axis=1)]).tolist()
     rows = [",".join(map(str, [s, *v])) for s, v in zip(stamps, values, strict=True)]
     write_text(root / STATES / "data.csv", [_WRITTEN_STATE_COLUMNS, *rows])
-    about = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
-    text = tum_text(drive.time_s, drive.reckoned_bodies, about)
-    write_text(root / ODOMETRY_FILE, text.splitlines())
+    write_dead_reckoning(root, drive)
     return [folder / drive.robot]

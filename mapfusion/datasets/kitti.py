@@ -38,7 +38,13 @@ from mapfusion.datasets.camera_calibration import (
     StereoCalibration,
     require_rigid,
 )
-from mapfusion.datasets.export import OnFrame, StereoDrive, write_picture, write_text
+from mapfusion.datasets.export import (
+    OnFrame,
+    StereoDrive,
+    write_dead_reckoning,
+    write_picture,
+    write_text,
+)
 from mapfusion.datasets.levelling import MountSettings, level_mount
 from mapfusion.datasets.stereo_recording import (
     PictureFile,
@@ -49,7 +55,6 @@ from mapfusion.datasets.stereo_recording import (
 )
 from mapfusion.datasets.text_files import (
     NS,
-    ODOMETRY_FILE,
     POSES,
     TimedPoses,
     parse_numbers,
@@ -58,7 +63,6 @@ from mapfusion.datasets.text_files import (
     read_time_series,
     require_columns,
     require_increasing,
-    tum_text,
 )
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
@@ -350,9 +354,7 @@ def write_kitti(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pat
     T_world_left = drive.true_bodies @ T_robot_left
     poses = se3.between(T_world_left[0], T_world_left)
     write_text(sequence / "poses.txt", [_matrix_text(T[:3]) for T in poses])
-    about = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
-    text = tum_text(drive.time_s, drive.reckoned_bodies, about)
-    write_text(sequence / ODOMETRY_FILE, text.splitlines())
+    write_dead_reckoning(sequence, drive)
     return [sequence]
 
 

@@ -130,46 +130,13 @@ def _search_row(
 ) -> tuple[int, int]:
     """Return the column first..last of `other` that is most like (u, v) of `image`, and a status.
 
-    `limits` are the smallest correlation and the largest ambiguity of a match. The last three
-    arguments are work arrays.
+    Integer arithmetic and an inner loop over the candidates let the compiler vectorise. `limits`
+    are the smallest correlation and the largest ambiguity of a match. The last three arguments are
+    work arrays.
     """
     min_correlation, max_ambiguity = limits
     if last < first:
         return u, MatchStatus.OUTSIDE
-    if not _correlate(image, other, u, v, first, last, half, scores, strip, sums):
-        return u, MatchStatus.FLAT
-    best = 0
-    for k in range(1, last - first + 1):
-        if scores[k] > scores[best]:
-            best = k
-    if scores[best] < min_correlation:
-        return first + best, MatchStatus.WEAK
-    rival = -1.0
-    for k in range(last - first + 1):
-        if abs(k - best) > _PEAK_HALF_WIDTH_PX and scores[k] > rival:
-            rival = scores[k]
-    if 1 - scores[best] >= max_ambiguity * (1 - rival):
-        return first + best, MatchStatus.AMBIGUOUS
-    return first + best, MatchStatus.MATCHED
-
-
-@kernel
-def _correlate(
-    image: np.ndarray,
-    other: np.ndarray,
-    u: int,
-    v: int,
-    first: int,
-    last: int,
-    half: int,
-    scores: np.ndarray,
-    strip: np.ndarray,
-    sums: np.ndarray,
-) -> bool:
-    """Fill `scores` with the correlation at columns first..last; False when the window is flat.
-
-    Integer arithmetic and an inner loop over the candidates let the compiler vectorise.
-    """
     side = 2 * half + 1
     area, candidates = side * side, last - first + 1
     padded = -(-candidates // _VECTOR_LENGTH) * _VECTOR_LENGTH
@@ -208,7 +175,7 @@ def _correlate(
         total_square += row_square
     spread = area * total_square - total * total
     if spread == 0:
-        return False
+        return u, MatchStatus.FLAT
 
     # Correlation of each candidate by running sums over the columns.
     strip_total, strip_square = np.int64(0), np.int64(0)
@@ -225,7 +192,21 @@ def _correlate(
         )
         strip_total -= sums[_SUM, k]
         strip_square -= sums[_SQUARE, k]
-    return True
+
+    # Best candidate and second peak.
+    best = 0
+    for k in range(1, candidates):
+        if scores[k] > scores[best]:
+            best = k
+    if scores[best] < min_correlation:
+        return first + best, MatchStatus.WEAK
+    rival = -1.0
+    for k in range(candidates):
+        if abs(k - best) > _PEAK_HALF_WIDTH_PX and scores[k] > rival:
+            rival = scores[k]
+    if 1 - scores[best] >= max_ambiguity * (1 - rival):
+        return first + best, MatchStatus.AMBIGUOUS
+    return first + best, MatchStatus.MATCHED
 
 
 _MAX_HALF_PX = 90  # (2 * 90 + 1)^2 squared grey levels still fit a 32-bit sum

@@ -97,7 +97,7 @@ def test_refinement_200_pairs(benchmark):
 def test_acceptance(benchmark, n_pairs):
     maps = maps_with_pairs(n_pairs, n_pairs, 0.3)
     refined = Refinement().refine(Pairs(*maps), T_A_B)
-    assert benchmark(lambda: Acceptance().judge(Pairs(*maps), refined)).accepted
+    assert benchmark(lambda: Acceptance().verify(Pairs(*maps), refined)).accepted
 
 
 @pytest.mark.parametrize("planar", [False, True])

@@ -28,14 +28,14 @@ from mapfusion.align.rigid_motion import (
     residual_covariances,
 )
 from mapfusion.registration import (
-    EstimateVerifier,
     PairRegistration,
     Registered,
     Registration,
+    VerifiedRefinement,
     as_aligner,
 )
 from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks
 
 
@@ -88,14 +88,18 @@ def assert_same(first, second):
 @pytest.mark.parametrize("true_share", [0.0, 0.6])
 def test_equals_the_steps_by_hand(name, true_share):
     pair = given_pairs(np.random.default_rng(0), 80, true_share, 0.05)
-    method, refinement, judge = make_aligner(name), Refinement(gate_m=0.4), Judge(Acceptance(1e-4))
+    method, refinement, judge = (
+        make_aligner(name),
+        Refinement(gate_m=0.4),
+        Verifier(Acceptance(1e-4)),
+    )
     registration = Registration(method, refinement, judge)
     done = registration.register(*maps_of(pair), np.random.default_rng(1))
     estimated = as_aligner(method).align(*maps_of(pair), np.random.default_rng(1))
     refined = refinement.refine(Pairs(*maps_of(pair)), estimated.T_a_b)
     if np.isnan(estimated.T_a_b).any():
         refined = replace(refined, reason=estimated.reason)
-    verdict = judge.on(Pairs(*maps_of(pair))).judge(refined)
+    verdict = judge.on(Pairs(*maps_of(pair))).verify(refined)
     assert_same(done.estimated, estimated)
     assert_same(done.refined, refined)
     assert done.verdict == pytest.approx(verdict) or done.verdict == verdict
@@ -235,7 +239,7 @@ def test_what_chance_would_give_is_refused_when_applied():
     assert done.refined.ok
     assert done.applied.status is Status.REFUSED
     assert done.applied.reason == done.verdict.reason != ""
-    trusting = Registration(Ransac(), judge=None)
+    trusting = Registration(Ransac(), verifier=None)
     assert trusting.register(*maps_of(pair), np.random.default_rng(0)).applied.ok
 
 
@@ -334,25 +338,25 @@ def test_a_refusal_tells_what_about_the_maps_explains_it():
 
 
 @dataclass
-class CountedJudge:
+class CountedVerifier:
     """Keeps what it was asked to judge."""
 
     asked: list = field(default_factory=list)
 
     def on(self, pairs, known):
-        self.ready = Judge().on(pairs, known)
+        self.ready = Verifier().on(pairs, known)
         return self
 
-    def judge(self, alignment):
+    def verify(self, alignment):
         self.asked.append(alignment)
-        return self.ready.judge(alignment)
+        return self.ready.verify(alignment)
 
 
 def test_methods_on_one_pair_share_what_completes_their_estimates():
     pair = given_pairs(np.random.default_rng(8), 60, 0.8, 0.02)
     methods = [make_aligner(name) for name in ("ransac", "icp", "impicp", "clique", "gnc")] * 2
-    refinement, judge = CountedRefinement(), CountedJudge()
-    verifier = EstimateVerifier(Pairs(*maps_of(pair)), refinement, judge)
+    refinement, judge = CountedRefinement(), CountedVerifier()
+    verifier = VerifiedRefinement(Pairs(*maps_of(pair)), refinement, judge)
     motions, refined = set(), set()
     for k, method in enumerate(methods):
         rng, same_rng = np.random.default_rng(k), np.random.default_rng(k)
@@ -371,8 +375,8 @@ def test_what_becomes_the_same_is_judged_once_and_what_differs_by_itself():
     pair = given_pairs(np.random.default_rng(8), 60, 1.0, 0.02)
     motions = [pair.T_a_b + np.array([k * 0.01, 0, 0]) for k in range(6)]
     fits = [Fit(T, np.ones(60, bool)) for T in motions]
-    method, refinement, judge = Answers(fits), CountedRefinement(), CountedJudge()
-    verifier = EstimateVerifier(Pairs(*maps_of(pair)), refinement, judge)
+    method, refinement, judge = Answers(fits), CountedRefinement(), CountedVerifier()
+    verifier = VerifiedRefinement(Pairs(*maps_of(pair)), refinement, judge)
     answer, _ = verifier.verify(as_aligner(method).align(*maps_of(pair), None))
     refinement.refine = lambda pairs, T_a_b: answer  # all to one place
     n = len(judge.asked)

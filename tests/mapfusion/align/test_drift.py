@@ -86,7 +86,7 @@ def test_fused_motions_are_no_surer_than_the_cameras(pair: MapPair) -> None:
 
     def motion_covariance(pair: MapPair) -> np.ndarray:
         maps, c = (pair.map_a, pair.map_b), pair.correspondences
-        aligned = Registration(make_aligner("ransac"), judge=None).on(*maps, c)
+        aligned = Registration(make_aligner("ransac"), verifier=None).on(*maps, c)
         found = aligned.register(np.random.default_rng(0)).refined
         fused = merge(maps, [AlignedPair(0, 1, found, c)], fuser=make_fuser()).fused[0]
         return fused.motion_covariance[1]
