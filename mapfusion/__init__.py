@@ -27,11 +27,11 @@ _NAMES_OF = {
     "fusion.merge": ("merge_maps",),
     "fusion.team_graph": ("EdgeStatus", "TeamParameters", "Unconfirmed"),
     "landmark_map": ("LandmarkMap", "read_map", "write_map"),
-    "registration": ("Aligner", "Registered", "Registration"),
     "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
     "smoother.joint_smoothing": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),
     "verification.regions": ("EvidenceParameters",),
+    "verification.registration": ("Aligner", "Registered", "Registration"),
     "verification.verdict": ("Verifier",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}

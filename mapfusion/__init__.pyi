@@ -28,9 +28,6 @@ from mapfusion.fusion.team_graph import Unconfirmed as Unconfirmed
 from mapfusion.landmark_map import LandmarkMap as LandmarkMap
 from mapfusion.landmark_map import read_map as read_map
 from mapfusion.landmark_map import write_map as write_map
-from mapfusion.registration import Aligner as Aligner
-from mapfusion.registration import Registered as Registered
-from mapfusion.registration import Registration as Registration
 from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log
@@ -38,6 +35,9 @@ from mapfusion.robot_log import write_log as write_log
 from mapfusion.smoother.joint_smoothing import AssociatedLog as AssociatedLog
 from mapfusion.verification.false_alarms import Acceptance as Acceptance
 from mapfusion.verification.regions import EvidenceParameters as EvidenceParameters
+from mapfusion.verification.registration import Aligner as Aligner
+from mapfusion.verification.registration import Registered as Registered
+from mapfusion.verification.registration import Registration as Registration
 from mapfusion.verification.verdict import Verifier as Verifier
 
 merge_maps = _merge  # `merge` is the module

@@ -127,7 +127,6 @@ _FORMER_MODULES = {
     "attitude": "attitude_drift",
     "landmark_map": "joint_files",
     "viewing": "viewing_files",
-    "registration": "align.registration align.supported align.completion",
     "align.alignment": "align.result align.pairs align.method align.degeneracy",
     "align.rigid_motion": "align.rigid",
     "align.correspondences": "align.nearest_descriptors",
@@ -147,6 +146,9 @@ _FORMER_MODULES = {
     "verification.regions": "evidence.found evidence.regions evidence.parameters",
     "verification.rivals": "evidence.copies evidence.twins evidence.rivals",
     "verification.likelihood": "evidence.likelihood evidence.probability",
+    "verification.registration": (
+        "registration align.registration align.supported align.completion"
+    ),
     "verification.verdict": "evidence.precision evidence.pair_evidence evidence.judge",
     "fusion": "fuse team",
     "fusion.aligned_landmarks": "aligned_landmarks same_point fuse.clusters",

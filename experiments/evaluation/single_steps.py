@@ -34,8 +34,8 @@ from mapfusion.fusion.fusers import AlignedPair, Fusion, make_fuser, name_order
 from mapfusion.fusion.merge import merge as merge_maps
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
-from mapfusion.registration import Registration
 from mapfusion.robot_log import read_log, read_odometry_covariance, read_true_poses
+from mapfusion.verification.registration import Registration
 from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
 

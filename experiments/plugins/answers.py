@@ -21,7 +21,7 @@ from mapfusion.align.alignment import (
     without_answer,
 )
 from mapfusion.errors import one_line
-from mapfusion.registration import Aligner, MethodAligner
+from mapfusion.verification.registration import Aligner, MethodAligner
 
 _STATUSES = (Status.ACCEPTED, Status.REFUSED, Status.DEGENERATE)
 _MAX_ASYMMETRY = 1e-9  # relative to the largest entry: rounding of a symmetric product

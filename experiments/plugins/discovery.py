@@ -23,7 +23,7 @@ from experiments.plugins.isolated_process import (
 )
 from mapfusion.align.aligners import ALIGNERS, PEERS, construct
 from mapfusion.errors import did_you_mean
-from mapfusion.registration import Aligner, as_aligner
+from mapfusion.verification.registration import Aligner, as_aligner
 
 ENTRY_POINTS = "mapfusion.aligners"  # group of the entry points that declare aligners
 _CODE_SUFFIXES = (".py", ".so", ".pyd")

@@ -35,7 +35,7 @@ from mapfusion.files import schema
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 
 # Constants, so that tables of different versions can be compared.
 SIZE_M = 20.0  # side of the square that contains the landmarks

@@ -36,8 +36,8 @@ from mapfusion.files import POSE_FIELDS, float_fields, named_columns, schema
 from mapfusion.fusion.fusers import FusedMap
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, write_map
-from mapfusion.registration import Registration
 from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance, write_log
+from mapfusion.verification.registration import Registration
 from mapfusion.verification.verdict import Verifier
 
 FILTER, SMOOTHING, ALIGNMENT, FUSION = "filter", "smoothing", "alignment", "fusion"

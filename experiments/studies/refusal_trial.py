@@ -28,13 +28,13 @@ from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.files import schema
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.registration import Registration
 from mapfusion.verification.false_alarms import (
     Acceptance,
     IndependentPairs,
     fewest_false_alarms,
     independent_pairs,
 )
+from mapfusion.verification.registration import Registration
 
 N_PAIRS_OF_MAPS = 5000
 N_CORRESPONDENCES = 40

@@ -12,8 +12,8 @@ import numpy as np
 
 from mapfusion.align.alignment import Fit, Pairs, Undetermined, why_angle_is_open
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.drift import DRIFT_FLOOR_M
 from mapfusion.align.mahalanobis_gate import (
+    DRIFT_FLOOR_M,
     PairSpread,
     PlanarPairs,
     mean_variances,

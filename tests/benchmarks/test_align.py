@@ -16,8 +16,8 @@ from mapfusion.align.ransac import Ransac
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import as_aligner
 from mapfusion.verification.false_alarms import Acceptance
+from mapfusion.verification.registration import as_aligner
 
 SIZE_M = np.array([20.0, 20.0, 2.5])
 NOISE_M = 0.05

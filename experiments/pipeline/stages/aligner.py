@@ -26,9 +26,9 @@ from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Refinement
-from mapfusion.registration import PairRegistration, VerifiedRefinement
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters
+from mapfusion.verification.registration import PairRegistration, VerifiedRefinement
 from mapfusion.verification.verdict import Verifier
 
 LABEL, WRITES = match.LABEL, match.WRITES[:1]

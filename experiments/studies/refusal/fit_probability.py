@@ -26,8 +26,8 @@ from mapfusion.align.alignment import Pairs
 from mapfusion.files import write_whole
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.registration import Registration
 from mapfusion.verification import fitted
+from mapfusion.verification.registration import Registration
 
 # Pulls weights of scaled features towards 0: a kind of world may have none of a sign.
 _RIDGE = 1e-3

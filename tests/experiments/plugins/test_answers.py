@@ -13,7 +13,7 @@ from experiments.plugins.discovery import callable_aligner, make_method, require
 from experiments.plugins.isolated_process import end_children
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.geometry import se2
-from mapfusion.registration import Registration, as_aligner
+from mapfusion.verification.registration import Registration, as_aligner
 from tests.helpers.answered_here import answered_here
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again

@@ -11,7 +11,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.refinement import Oracle, Refinement
 from mapfusion.align.svd import Svd
 from mapfusion.geometry import se2
-from mapfusion.registration import as_aligner
+from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import (
     MapPair,
     error,

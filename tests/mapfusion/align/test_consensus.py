@@ -22,7 +22,7 @@ from mapfusion.align.ransac import RansacMahalanobis, least_truncated_squares
 from mapfusion.align.refinement import Oracle
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
-from mapfusion.registration import as_aligner
+from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import (
     blurred,
     error,

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 
 from mapfusion.align.aligners import make_aligner
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.drift import DRIFT_FLOOR_M, calibration_covariance, estimate_drift_m
+from mapfusion.align.drift import calibration_covariance, estimate_drift_m
+from mapfusion.align.mahalanobis_gate import DRIFT_FLOOR_M
 from mapfusion.align.refinement import Refinement
 from mapfusion.fusion.fusers import AlignedPair, make_fuser
 from mapfusion.fusion.merge import merge
@@ -17,7 +18,7 @@ from mapfusion.geometry import se2
 from mapfusion.geometry.camera import EXACT, CalibrationError
 from mapfusion.geometry.se2 import rotation
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 from tests.mapfusion.align.map_pairs import MapPair, given_pairs, stretched
 
 OF_A, OF_B = CalibrationError(0.002, 0.003), CalibrationError(0.001, 0.004)

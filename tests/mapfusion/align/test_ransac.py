@@ -10,7 +10,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.ransac import Ransac, draw_pair, list_supporters, most_supported
 from mapfusion.align.refinement import Oracle, Refinement
 from mapfusion.geometry import se2
-from mapfusion.registration import as_aligner
+from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 from tests.mapfusion.align.slow_twins import draw
 

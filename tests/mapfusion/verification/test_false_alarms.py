@@ -17,7 +17,6 @@ from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration, as_aligner
 from mapfusion.verification.false_alarms import (
     Acceptance,
     Verdict,
@@ -30,6 +29,7 @@ from mapfusion.verification.false_alarms import (
     minimal_motion,
     named_false_alarms,
 )
+from mapfusion.verification.registration import Registration, as_aligner
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks, motion, moved, swapped
 
 GATES_M = np.array([0.05, 0.1, 0.2, 0.4])

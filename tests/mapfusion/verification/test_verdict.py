@@ -12,10 +12,10 @@ from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
 from mapfusion.verification import verdict as verdict_module
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.regions import EvidenceParameters, ViewedMap
+from mapfusion.verification.registration import Registration
 from mapfusion.verification.rivals import BETWEEN, RepeatedLandmarks, self_motions
 from mapfusion.verification.verdict import RivalMotion, Verifier, landmark_sigma_m
 from tests.mapfusion.verification.two_rooms import Wall, between, mapped

@@ -1,4 +1,4 @@
-"""Tests of `mapfusion.registration`."""
+"""Tests of `mapfusion.verification.registration`."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -27,14 +27,14 @@ from mapfusion.align.rigid_motion import (
     motion_jacobian,
     residual_covariances,
 )
-from mapfusion.registration import (
+from mapfusion.verification.false_alarms import Acceptance, Verdict
+from mapfusion.verification.registration import (
     PairRegistration,
     Registered,
     Registration,
     VerifiedRefinement,
     as_aligner,
 )
-from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.verdict import Verifier
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks
 
