@@ -15,7 +15,6 @@ from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import rotation
 
-
 _TOLERANCE = 1e-9  # relative step of s_drift^2 that ends the search
 _MAX_STEPS = 100  # a dozen are the rule
 # g^2 / 2v above which the gate's term is below rounding: x exp(-x) < 2^-53
