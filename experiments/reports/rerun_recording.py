@@ -1,6 +1,6 @@
 """Recording of a result for the Rerun viewer: pictures, maps, paths and alignments over time.
 
-The timeline `frame` is the iteration. `experiments/docs/export.md` lists the entities. The package
+The timeline `frame` is the iteration. `mapfusion docs export` lists the entities. The package
 of the viewer (500 MB) is optional and imported only here.
 """
 
@@ -15,7 +15,7 @@ import pandas as pd
 from experiments.pipeline.tables import alignment_of
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.reports.figures.style import FUSED_COLOUR
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, not_installed
 from mapfusion.files import write_whole
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import transform_points
@@ -28,8 +28,7 @@ _TIMELINE = "frame"
 def write_rerun(data: ResultTables, path: Path) -> None:
     """Write the recording; raises InputError if the viewer's package is not installed."""
     if find_spec("rerun") is None:
-        remedy = "pip install 'mapfusion[rerun]' installs it"
-        raise InputError(f"--format rerun: the package rerun-sdk is not installed; {remedy}")
+        raise InputError(f"--format rerun: {not_installed('rerun-sdk', 'rerun')}")
     name = data.folder.resolve().name
 
     def write(temporary: Path) -> None:

@@ -1,6 +1,6 @@
 """Export of a result: trajectories, pose graphs, point clouds.
 
-Everything comes from the result folder. `experiments/docs/export.md` describes files, keys and
+Everything comes from the result folder. `mapfusion docs export` describes files, keys and
 frames.
 """
 
