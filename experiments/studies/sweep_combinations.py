@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from experiments.evaluation.checks import load_checked
-from experiments.scenario.settings import AnyScenario
+from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.yaml_files import parse_value, read_mapping
 from mapfusion.errors import InputError
+from sim.renderer import require_pybullet
 
 _HASH_LENGTH = 8  # hexadecimal digits of a run's values: 32 bits, and clashes are refused
 _EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
@@ -86,7 +87,8 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     is reported before anything is computed.
 
     Raises:
-        InputError: a scenario, key or value is wrong, or two scenarios have the same name.
+        InputError: a scenario, key or value is wrong, two scenarios have the same name, or PyBullet
+            is not installed.
     """
     choices = ([(key, value) for value in values] for key, values in axes.items())
     combinations = list(itertools.product(*choices))
@@ -94,8 +96,10 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     names: dict[str, Path] = {}
     for path in paths:
         content = read_mapping(path)
-        first = (SweepRun(path, "", seeds[0], each, content) for each in combinations)
-        (name,) = {run.load().name for run in first}
+        loaded = [SweepRun(path, "", seeds[0], each, content).load() for each in combinations]
+        if any(isinstance(scenario, Simulation) for scenario in loaded):
+            require_pybullet()
+        (name,) = {scenario.name for scenario in loaded}
         if names.setdefault(name, path) != path:
             raise InputError(f"{path}: is named {name}, as {names[name]} is; names must differ")
         runs += [
