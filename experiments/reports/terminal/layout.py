@@ -188,7 +188,9 @@ def print_methods() -> None:
 
 def print_pages() -> None:
     """Print the names and titles of the manual's pages, and their folder."""
-    titles = [(page.stem, page.open(encoding="utf-8").readline().strip("# \n")) for page in _pages()]
+    titles = [
+        (page.stem, page.open(encoding="utf-8").readline().strip("# \n")) for page in _pages()
+    ]
     print_table([("page", ""), ("title", "")], titles)
     print_lines(["`mapfusion docs PAGE` shows a page.", f"The pages are in {MANUAL}."])
 
