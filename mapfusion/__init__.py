@@ -5,7 +5,7 @@ Frames are right-handed: x forward, y left, z up; metres, radians, seconds.
 
 The names below are the public interface. Each is imported at its first use, so that
 `import mapfusion` is fast; `__init__.pyi` declares them for editors and type checkers.
-`experiments/docs/library.md` has an example.
+`mapfusion docs library` shows an example.
 """
 
 import importlib
@@ -44,7 +44,9 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         from importlib.metadata import version
 
-        return version("mapfusion")
+        from mapfusion.errors import DISTRIBUTION
+
+        return version(DISTRIBUTION)
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = importlib.import_module(f"{__name__}.{_MODULE_OF[name]}")

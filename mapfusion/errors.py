@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+DISTRIBUTION = "mapfusion-bench"  # on the Python package index; the import package is `mapfusion`
 MOST_CHARACTERS = 500  # of a message: enough for the longest one with two long paths
 _MAX_WORD = 120  # characters of a word, usually a path
 _GAP = "..."
@@ -75,6 +76,16 @@ class StoreRepairWarning(TellingWarning):
 
 class NameClashWarning(TellingWarning):
     """Warning that two methods have the same name; the message tells which one is used."""
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra of our distribution."""
+    return f"pip install '{DISTRIBUTION}[{extra}]'"
+
+
+def not_installed(package: str, extra: str) -> str:
+    """Return a sentence that a package of an extra is missing, and how to install it."""
+    return f"the package {package} is not installed; {install_command(extra)} installs it"
 
 
 def did_you_mean(wrong: str, known: Iterable[str]) -> str:
