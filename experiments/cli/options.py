@@ -48,6 +48,16 @@ Overrides = Annotated[
         help="Replaces a value of the scenario, e.g. slam.filter.n_particles=50.",
     ),
 ]
+Aligners = Annotated[
+    list[str],
+    typer.Option(
+        "--aligner",
+        metavar="NAME",
+        default_factory=list,
+        show_default=False,
+        help="Only this aligner: a name, or a class of yours as FILE.py:CLASS; may be repeated.",
+    ),
+]
 ImportOverrides = Annotated[
     list[str],
     typer.Option(
@@ -70,6 +80,9 @@ Format = Annotated[
 Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed (0).", min=0)]
 Seeds = Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")]
 Jobs = Annotated[int, typer.Option(help="Processes.", min=1, show_default="all cores")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Check the input and print the plan; run nothing.")
+]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
 Results = Annotated[Path, typer.Option(help="Folder that results go to.", show_default="results")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]

@@ -89,7 +89,7 @@ def sweep(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder; RESULTS/sweeps/NAME by default.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count the work.")] = False,
+    dry_run: options.DryRun = False,
     timings: Annotated[
         bool, typer.Option("--timings", help="At the end, time the aligners one after the other.")
     ] = False,
@@ -176,10 +176,7 @@ def compare(
 @studies.command()
 def benchmark(
     *,
-    methods: Annotated[
-        list[str] | None,
-        typer.Option("--method", metavar="NAME", help="Only this method; may be repeated."),
-    ] = None,
+    aligners: options.Aligners,
     trials: Annotated[int, typer.Option(help="Trials of each method in a cell.", min=1)] = 100,
     pairs: Annotated[
         list[int] | None, typer.Option(help="Numbers of pairs; may be repeated.", min=3)
@@ -208,7 +205,7 @@ def benchmark(
     from experiments.studies import benchmark
 
     require_folder(output, [scenario])
-    entries = benchmark.entries_of(methods or (), scenario)
+    entries = benchmark.entries_of(aligners, scenario)
     counts, shares = (
         tuple(pairs or benchmark.PAIR_COUNTS),
         tuple(outliers or benchmark.OUTLIER_SHARES),

@@ -5,6 +5,7 @@ A scenario in ./scenarios replaces the shipped scenario of the same name.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from mapfusion.errors import InputError, did_you_mean
 from mapfusion.files import write_whole
 
 if TYPE_CHECKING:
-    from experiments.scenario.settings import Scenario
+    from experiments.scenario.settings import AlignerEntry, Scenario
 
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
 
@@ -59,6 +60,64 @@ def settings_of(
     if word is None:
         return default_settings(overrides, seed)
     return load_scenario(one_scenario(word), overrides, seed)
+
+
+def with_aligners(
+    word: str | Path | None, overrides: Sequence[str], names: Sequence[str]
+) -> list[str]:
+    """Return the overrides with others that replace the aligners of a scenario.
+
+    The first of the new aligners is used for the merge if the scenario's one is not among them.
+    Bounds of metrics of other aligners are dropped.
+
+    Args:
+        word: scenario, as in `settings_of`.
+        overrides: overrides of the scenario.
+        names: aligners of the scenario, other methods, or classes in files; none keeps them all.
+
+    Raises:
+        InputError: a name is unknown, or the scenario is wrong.
+    """
+    if not names:
+        return list(overrides)
+    from experiments.scenario.settings import why_unknown
+
+    scenario = settings_of(word, overrides)
+    entries = chosen_aligners(names, scenario.align.aligners)
+    chosen = [entry.name for entry in entries]
+    own = {"align.aligners": [entry.model_dump(mode="json") for entry in entries]}
+    if scenario.merge.aligner not in chosen:
+        own |= {"merge.aligner": chosen[0]}
+    own |= {
+        "expect": {
+            metric: bound.model_dump(mode="json")
+            for metric, bound in scenario.expect.items()
+            if not why_unknown(metric, chosen, scenario.fuse.fusers)
+        }
+    }
+    return [*overrides, "align.also=[]", *(f"{key}={json.dumps(own[key])}" for key in own)]
+
+
+def chosen_aligners(
+    names: Sequence[str], entries: Sequence[AlignerEntry] = ()
+) -> tuple[AlignerEntry, ...]:
+    """Return aligners by name: those of `entries`, else methods with their default parameters.
+
+    A class in a file, FILE.py:CLASS, is named CLASS. Raises InputError if a name is unknown.
+    """
+    from experiments.plugins.discovery import require_usable
+    from experiments.scenario.settings import AlignerEntry
+
+    known, chosen = {entry.name: entry for entry in entries}, []
+    for name in dict.fromkeys(names):
+        if name not in known:
+            try:
+                require_usable(name, {})
+                known[name] = AlignerEntry(name=name.rpartition(":")[2], method=name)
+            except ValueError as error:
+                raise InputError(f"--aligner {name}: {' '.join(str(error).split())}") from error
+        chosen.append(known[name])
+    return tuple(chosen)
 
 
 def _named(wanted: str, folder: Path | None) -> list[Path]:
