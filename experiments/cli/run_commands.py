@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.cli import options
+from experiments.cli.completion import complete_scenario
 from mapfusion.errors import InputError
 
 app = typer.Typer()
@@ -223,7 +224,12 @@ def list_scenarios(
     ] = None,
     *,
     copy: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Write scenarios/NAME.yaml instead, to edit.")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Write scenarios/NAME.yaml and its schema instead, to edit.",
+            autocompletion=complete_scenario,
+        ),
     ] = None,
     aligners: Annotated[
         bool, typer.Option("--aligners", help="List the methods they can name instead.")
@@ -233,10 +239,13 @@ def list_scenarios(
     ] = False,
 ) -> None:
     """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
-    from experiments.scenario.suite import copy_to_edit, entries
+    from experiments.scenario.suite import entries
 
     if copy is not None:
-        typer.echo(copy_to_edit(copy))
+        from experiments.scenario.editable_copy import copy_to_edit
+
+        for path in copy_to_edit(copy):
+            typer.echo(path)
         return
     if schema:
         from experiments.scenario.loading import schema_text

@@ -256,6 +256,13 @@ def _known_keys(kind: type) -> list[tuple[str, ...]]:
     return list(_keys(schema, schema))
 
 
+def setting_keys() -> list[str]:
+    """Return the dotted keys of all settings that have a value of their own, sorted."""
+    known = {*_known_keys(Simulation), *_known_keys(GeneratedScenario)}
+    sections = {path[:-1] for path in known}
+    return sorted(".".join(path) for path in known - sections if "*" not in path)
+
+
 @functools.cache
 def _schema(kind: type[S]) -> dict[str, Any]:
     return _known(kind).json_schema()

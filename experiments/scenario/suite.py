@@ -6,17 +6,18 @@ A scenario in ./scenarios replaces the shipped scenario of the same name.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.scenario.yaml_files import OWN, SHIPPED, read_mapping
 from mapfusion.errors import InputError, did_you_mean
-from mapfusion.files import write_whole
 
 if TYPE_CHECKING:
     from experiments.scenario.settings import AlignerEntry, Scenario
 
+_TAGS = re.compile(r"^tags: \[([^]\n]+)\]", re.MULTILINE)
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
 
 
@@ -146,21 +147,27 @@ def _mentions(path: Path, word: str) -> bool:
         return True  # the reader reports the error
 
 
-def copy_to_edit(name: str) -> Path:
-    """Copy a shipped scenario to ./scenarios and return the path of the copy.
-
-    Raises:
-        InputError: the name is unknown, or the file exists.
-    """
+def shipped_scenario(name: str) -> Path:
+    """Return the file of a shipped scenario; raise InputError if the name is unknown."""
     shipped = {path.stem: path for path in _files(SHIPPED)}
     if name not in shipped:
         raise InputError(f"--copy {name}: no scenario of the suite; known: {', '.join(shipped)}")
-    source = shipped[name]
-    copy = OWN / source.name
-    if copy.exists():
-        raise InputError(f"{copy}: exists; edit it, or rename it to get the shipped one again")
-    write_whole(copy, lambda temporary: temporary.write_bytes(source.read_bytes()))
-    return copy
+    return shipped[name]
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the suite's files without their suffix, sorted."""
+    return [path.stem for path in _files(None)]
+
+
+def tags_as_written() -> list[str]:
+    """Return the tags of the suite that are written as `tags: [a, b]`, sorted.
+
+    Files are searched and not read as YAML, which takes too long for a completion in the shell.
+    """
+    texts = (path.read_text(encoding="utf-8", errors="replace") for path in _files(None))
+    lists = (_TAGS.findall(text) for text in texts)
+    return sorted({tag.strip() for found in lists for each in found for tag in each.split(",")})
 
 
 def _files(folder: Path | None) -> list[Path]:

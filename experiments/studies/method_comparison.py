@@ -254,7 +254,7 @@ class Standing:
     shown: dict[str, float]
 
 
-# An aligner whose rate is lower, at the upper end of its interval, fails more often than it succeeds.
+# An aligner with a lower rate, at the upper end of its interval, fails more often than it succeeds.
 _RELIABLE_RATE = 0.5
 
 
