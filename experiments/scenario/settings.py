@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from experiments.plugins.discovery import require_usable
+from experiments.plugins.discovery import absolute_method, require_usable
 from experiments.scenario.world_settings import (
     MAX_COUNT,
     MAX_NAMED,
@@ -117,14 +117,15 @@ class AlignerEntry(Section):
 
     Attributes:
         name: name of the aligner in tables and figures.
-        method: alignment method, built in or from an installed package.
+        method: alignment method, built in, from an installed package, or a class in a Python file
+            (FILE.py:CLASS, relative to the scenario file).
         parameters: parameters of the method.
         time_limit_s: time limit for one call of an aligner from another package. The default is
             long enough for slow methods on a busy machine.
     """
 
     name: Annotated[Name, AfterValidator(free)]
-    method: Annotated[str, Field(max_length=100)]
+    method: Annotated[str, Field(max_length=1000), AfterValidator(absolute_method)]
     parameters: dict[str, Any] = Field(default_factory=dict)
     time_limit_s: Annotated[float, Range(0.01, 86_400, "s")] = 60.0
 
