@@ -35,7 +35,7 @@ from mapfusion.errors import InputError
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 
 APART, COMMON = "apart", "common"
 FEW, REPEATED = "few", "repeated"
@@ -71,7 +71,7 @@ class Case:
     ) -> Alignment:
         """Return the refined estimate of one aligner, without a verdict."""
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        registration = Registration(aligner, refinement, judge=None)
+        registration = Registration(aligner, refinement, verifier=None)
         return registration.register(self.map_a, self.map_b, self.pairs, rng).refined
 
 

@@ -299,12 +299,12 @@ def _answers(
     names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
     bound = np.log10(settings.acceptance.false_alarms)
     pairs = Pairs(case.map_a, case.map_b, case.pairs)
-    judge = settings.judge.on(pairs)  # evidence is computed once, for answers that beat chance
+    verifier = settings.judge.on(pairs)  # evidence is computed once, for answers that beat chance
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
         refined = case.refined_estimate(entry, settings.refinement, rng)
-        verdict = judge.judge(refined)
+        verdict = verifier.verify(refined)
         error = refined.T_a_b - case.T_true
         found = {
             "aligner": entry.name,

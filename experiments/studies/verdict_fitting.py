@@ -31,7 +31,7 @@ from experiments.studies import refusal_cases
 from experiments.studies.refusal_cases import Case, MappedWorld, worlds_of
 from experiments.studies.refusal_rates import calibration_error
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.oracle import Oracle
+from mapfusion.align.refinement import Oracle
 from mapfusion.files import write_whole
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
@@ -253,14 +253,14 @@ def answers_of(worlds: Sequence[MappedWorld]) -> Answers:
     for world in worlds:
         scenario, settings = world.scenario, world.scenario.align
         for k, case in cases_of(world, _EVERY_IF_REPEATED if world.repeats else 1):
-            judge = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs))
+            verifier = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs))
             names = (world.name, case.map_a.name, case.map_b.name, k)
             for entry in settings.aligners:
                 rng = generator(scenario.seed, "fit", *names, entry.name)
                 refined = case.refined_estimate(entry, settings.refinement, rng)
-                if not np.isfinite(judge.judge(refined).probability):
+                if not np.isfinite(verifier.verify(refined).probability):
                     continue
-                signs = judge.features(refined)
+                signs = verifier.features(refined)
                 if signs is not None:
                     x_m, y_m, theta_rad = refined.T_a_b - case.T_true
                     right = np.hypot(x_m, y_m) < RIGHT_WITHIN_M
