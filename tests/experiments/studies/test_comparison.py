@@ -156,7 +156,7 @@ def test_nothing_in_common_is_one_clear_line(tmp_path: Path) -> None:
 
 
 def test_runs_are_matched_apart_from_a_setting_that_is_named(tmp_path: Path) -> None:
-    """As two sweeps of one value each are compared with those of the other value."""
+    """Compare a sweep of two values with a sweep of each value."""
     seeds = range(8)
     changed = {seed: scaled(0.5, "ransac")(seed, tables_of(seed)) for seed in seeds}
     few, many = ({"drive.frames": "9", "slam.particles": each} for each in ("50", "200"))

@@ -123,7 +123,7 @@ def test_percentile_interval_agrees_with_scipys_where_clusters_are_rows() -> Non
 
 
 def coverage(resample_runs: bool, trials: int) -> float:
-    """How often the interval of a median holds the truth: 20 runs of 20 rows with a common part."""
+    """Return the coverage of the interval of a median: 20 runs of 20 rows with a common part."""
     rng = np.random.default_rng(5)
     inside = 0
     for _ in range(trials):

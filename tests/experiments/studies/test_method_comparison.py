@@ -190,7 +190,7 @@ def test_a_column_accepted_decides_what_is_merged() -> None:
 
 
 def test_of_several_runs_the_run_is_the_unit() -> None:
-    """A world of its own kind is one piece of evidence, however many maps it has."""
+    """A world is one piece of evidence, whatever the number of its maps."""
     errors = many_errors(8, methods={"slow": (1.2, 0.0, 0.0), "fast": (1.2, 0.0, 0.0)})
     own = (errors["aligner"] == "slow") & (errors["run_id"] == "world-0")
     errors.loc[own, "translation_error_m"] *= 0.7  # nearer on 8 maps of 64, farther on none
@@ -233,7 +233,7 @@ def test_a_further_column_is_shown_by_naming_it(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_what_is_told_of_an_aligner_are_medians_over_its_maps() -> None:
-    """The numbers are skewed, so that their mean is another number."""
+    """The numbers are skewed, so their mean differs from the median."""
     errors = made_up({"one": [0.1, 0.2, 0.45, 0.15, 0.4]})
     of_oracle = errors["aligner"] == "oracle"
     for name, values in (
@@ -260,7 +260,7 @@ def test_accepted_answers_are_counted_over_all_repetitions() -> None:
 
 
 def test_nearer_on_most_maps_is_not_equal_though_its_median_error_is_larger() -> None:
-    """The other is half as far off on three maps of five; five maps prove nothing in the t test."""
+    """The other error is half on three of five maps; the t test needs more maps."""
     first, other = [0.05, 0.06, 0.1, 0.3, 0.32], [0.4, 0.4, 0.05, 0.14, 0.15]
     verdict = verdict_of(made_up({"first": first, "other": other}), timings(first=9, other=1))
     assert [s.aligner for s in verdict.standings] == ["first", "other"]
@@ -306,7 +306,7 @@ def test_at_the_end_the_trials_are_runs() -> None:
 
 
 def test_maps_without_common_ground_are_counted_apart() -> None:
-    """Of 12 worlds 4 share 2 landmarks: by luck right there, and accepted in one of three."""
+    """4 of 12 worlds share 2 landmarks; answers there are right by luck, 1 of 3 is accepted."""
     errors = many_errors(12, methods={"ransac": (1.1, 0.1, 0.0)}, repetitions=3)
     apart = errors["run_id"].isin([f"world-{seed}" for seed in range(4)])
     errors["accepted"] = ~apart | (errors["repetition"] == 0)
@@ -449,7 +449,7 @@ def test_ratio_over_the_oracle_agrees_with_the_checks_metric() -> None:
 
 
 def test_ratio_resamples_method_and_oracle_together() -> None:
-    """A drift that differs from run to run, and is common to both, cancels in the ratio."""
+    """A drift that both methods share in each run cancels in the ratio."""
     errors = rich(many_errors(10, methods={"exact": (1.3, 0.0, 0.0)}))
     row = oracle_ratios(summarise_alignments(errors), rng()).set_index("aligner").loc["exact"]
     assert row["estimated_ratio"] == pytest.approx(1.3)

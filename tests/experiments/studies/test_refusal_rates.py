@@ -160,7 +160,7 @@ def test_one_that_is_too_sure_errs_by_as_much() -> None:
 
 
 def test_runs_are_resampled_whole() -> None:
-    """All answers of a run alike: the interval is that of the runs, not of the answers."""
+    """If all answers of a run are equal, the interval is that of the runs."""
     rng = np.random.default_rng(2)
     of_run = rng.random(40) < 0.5
     rows = answers(np.full(4000, 0.5), of_run[np.arange(4000) % 40], 40)

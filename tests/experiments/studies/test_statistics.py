@@ -29,7 +29,7 @@ from tests.helpers.tiny_scenario import command
 
 
 def team_of(seed: int, rmse: float = 0.1) -> pd.DataFrame:
-    """A table `team`: three of four robots merged, the others too few for a second map."""
+    """Return a table `team` in which three of four robots are merged."""
     value = rmse * np.exp(0.1 * np.random.default_rng(seed).normal())
     row = {"component": 1, "n_robots": 3, "n_team": 4, "n": 99} | dict.fromkeys(STATISTICS, value)
     rows = [row | {"source": "final"}, row | {"source": "odometry", "rmse": 9.0}]
@@ -37,7 +37,7 @@ def team_of(seed: int, rmse: float = 0.1) -> pd.DataFrame:
 
 
 def pairs_of(seed: int, off_m: float = 0.1) -> pd.DataFrame:
-    """A table `team_pairs`: right, right and not believed, wrong and believed, and apart."""
+    """Return a table `team_pairs`: right, right but not used, wrong but used, and apart."""
     value = off_m * np.exp(0.1 * np.random.default_rng(seed).normal())
     rows = [
         ("A", "B", EdgeStatus.CONFIRMED, True, 40, 2 * value, value),
@@ -66,7 +66,7 @@ def test_paths_are_medians_over_the_largest_sets_of_the_runs() -> None:
 
 
 def test_shares_of_alignments_are_those_counted_by_hand() -> None:
-    """Of two believed one is right; of three that met one is right and believed."""
+    """One of two used alignments is right; one of three pairs that met is right and used."""
     (row,) = team_alignments(of_runs(pairs_of, 6), np.random.default_rng(0)).to_dict("records")
     assert (row["n_runs"], row["n_pairs"], row["n_met"], row["n_believed"]) == (6, 24, 18, 12)
     assert (row["precision"], row["recall"]) == pytest.approx((1 / 2, 1 / 3))
@@ -89,7 +89,7 @@ def test_nothing_believed_and_nobody_met_is_unknown() -> None:
 
 
 def worse(seed: int, made: Tables) -> Tables:
-    """The team is three times as far off, and believes one more alignment, which is right."""
+    """The team's error is three times larger, and one more alignment, a right one, is used."""
     made["team"] = team_of(seed, 0.3)
     made["team_pairs"] = pairs_of(seed, 0.15)
     made["team_pairs"].loc[1, "place"] = str(EdgeStatus.BRIDGE)
@@ -303,7 +303,7 @@ def test_path_statistics_are_medians_over_paths() -> None:
 
 
 def test_every_landmark_counts_once_however_they_are_spread_over_maps() -> None:
-    """One of NEES 3 per degree of freedom and nine of 1 are 1.2; in the gate are none and all."""
+    """NEES 3 for one landmark and 1 for nine give 1.2 per degree of freedom."""
     runs = {"run_id": ["x", "y"], "landmarks": "own", "degrees_of_freedom": 3}
     maps = {"n_landmarks": [1, 9], "nees_mean": [9.0, 3.0], "share_in_gate": [0.0, 1.0]}
     (row,) = nees_of_maps(pd.DataFrame(runs | maps), np.random.default_rng(0)).to_dict("records")

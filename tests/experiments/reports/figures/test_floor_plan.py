@@ -29,7 +29,7 @@ def test_strays_are_out_of_view_and_counted() -> None:
 
 
 def test_of_a_house_much_larger_than_its_map_the_surroundings_are_shown() -> None:
-    """A map of 10 m by 2 m in a house of 400 m: 10 m around it; and to a wall that is nearer."""
+    """A map of 10 m in a house of 400 m is shown with 10 m around it, or up to a nearer wall."""
     landmarks = np.array([[0.0, 0.0, 1.0], [10.0, 2.0, 1.0]])
     landmarks = np.repeat(landmarks, 300, axis=0)  # no stray
     house = [np.array([[-200.0, -3.0], [200.0, -3.0]]), np.array([[-200.0, 50.0], [200.0, 50.0]])]
@@ -136,7 +136,7 @@ def test_ellipses_are_drawn_to_scale_at_their_place() -> None:
 
 
 def labels_between_powers(least: float, most: float) -> list[str]:
-    """Of an axis with these ends, where there are any."""
+    """Return the tick labels of an axis with these ends, without empty ones."""
     figure = Figure()
     axes = figure.subplots()
     axes.set_yscale("log")
