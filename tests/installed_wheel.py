@@ -1,7 +1,7 @@
 """The wheel in fresh environments, one for each version of Python that is on this machine.
 
-First without extras, as a user has it who aligns maps of recordings, then with `sim`. All dependencies
-are installed, which takes minutes: `make wheel-test` runs it, not `make test`.
+First without extras, as a user has it who aligns maps of recordings, then with `sim`. All
+dependencies are installed, which takes minutes: `make wheel-test` runs it, not `make test`.
 """
 
 import os
