@@ -13,66 +13,26 @@ from typing import Any
 
 _NAMES_OF = {
     "align.aligners": ("make_aligner",),
-    "align.alignment": (
-        "Alignment",
-        "Status",
-    ),
-    "align.correspondences": (
-        "Correspondences",
-        "MatchParameters",
-        "match",
-    ),
+    "align.alignment": ("Alignment", "Status"),
+    "align.correspondences": ("Correspondences", "MatchParameters", "match"),
     "align.refinement": ("Refinement",),
-    "datasets.formats": (
-        "import_recording",
-        "read_recording",
-    ),
+    "datasets.formats": ("import_recording", "read_recording"),
     "errors": ("InputError",),
     "fastslam.association": ("Association",),
-    "fastslam.filter": (
-        "FastSlam",
-        "FastSlamParameters",
-        "StepResult",
-    ),
-    "fastslam.mapping": (
-        "build_map",
-        "run_log",
-    ),
+    "fastslam.filter": ("FastSlam", "FastSlamParameters", "StepResult"),
+    "fastslam.mapping": ("build_map", "run_log"),
     "fastslam.motion": ("MotionNoise",),
     "fastslam.proposal": ("Proposal",),
-    "fusion.fused_map": (
-        "AlignedPair",
-        "FusedMap",
-        "Fusion",
-        "MergeParameters",
-    ),
-    "fusion.fusers": ("make_fuser",),
+    "fusion.fusers": ("AlignedPair", "FusedMap", "Fusion", "MergeParameters", "make_fuser"),
     "fusion.merge": ("merge_maps",),
-    "fusion.team_graph": (
-        "EdgeStatus",
-        "TeamParameters",
-        "Unconfirmed",
-    ),
-    "landmark_map": (
-        "LandmarkMap",
-        "read_map",
-        "write_map",
-    ),
-    "registration": (
-        "Aligner",
-        "Registered",
-        "Registration",
-    ),
-    "robot_log": (
-        "Observations",
-        "RobotLog",
-        "read_log",
-        "write_log",
-    ),
+    "fusion.team_graph": ("EdgeStatus", "TeamParameters", "Unconfirmed"),
+    "landmark_map": ("LandmarkMap", "read_map", "write_map"),
+    "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
     "smoother.joint_smoothing": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),
     "verification.regions": ("EvidenceParameters",),
-    "verification.verdict": ("Judge",),
+    "verification.registration": ("Aligner", "Registered", "Registration"),
+    "verification.verdict": ("Verifier",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 _CALLED_THERE = {"merge_maps": "merge"}

@@ -24,7 +24,7 @@ from experiments.reports.figures.style import FUSED_COLOUR
 from experiments.scenario.world_settings import NAME_PATTERN
 from mapfusion.datasets.export import G2oGraph, ply_text
 from mapfusion.datasets.kitti import kitti_text
-from mapfusion.datasets.tum import tum_text
+from mapfusion.datasets.text_files import tum_text
 from mapfusion.errors import InputError, not_installed
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import POSE_FIELDS, write_whole

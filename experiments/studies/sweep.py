@@ -49,28 +49,28 @@ _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
 Axes = Mapping[str, tuple[str, ...]]
 
 
-def parse_axes(entries: Sequence[str]) -> Axes:
-    """Parse `--set KEY=VALUE,VALUE,...`; raises InputError that shows the correct form."""
+def parse_axes(entries: Sequence[str], option: str = "--set") -> Axes:
+    """Parse `OPTION KEY=VALUE,VALUE,...`; raises InputError that shows the correct form."""
     axes: dict[str, tuple[str, ...]] = {}
     for entry in entries:
         key, _, listed = entry.partition("=")
         if not key or not listed.strip():
-            raise InputError(f"--set {entry}: {_EXPECTED}")
+            raise InputError(f"{option} {entry}: {_EXPECTED}")
         if key in _FIXED:
-            raise InputError(f"--set {entry}: {key} cannot be set here; use {_FIXED[key]}")
+            raise InputError(f"{option} {entry}: {key} cannot be set here; use {_FIXED[key]}")
         if key in axes:
-            raise InputError(f"--set {key}: given twice; write its values as {key}=A,B")
-        values = parse_value(f"[{listed}]", f"--set {entry}: {_EXPECTED}")
+            raise InputError(f"{option} {key}: given twice; write its values as {key}=A,B")
+        values = parse_value(f"[{listed}]", f"{option} {entry}: {_EXPECTED}")
         # Text stays as it is unless YAML would read another type; everything else becomes JSON.
         axes[key] = tuple(
             value
-            if isinstance(value, str) and parse_value(value, "--set") == value
+            if isinstance(value, str) and parse_value(value, option) == value
             else json.dumps(value, default=str)
             for value in values
         )
         for value in axes[key]:
             if axes[key].count(value) > 1:
-                raise InputError(f"--set {entry}: {value} is given twice")
+                raise InputError(f"{option} {entry}: {value} is given twice")
     return axes
 
 

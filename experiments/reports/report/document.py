@@ -53,6 +53,7 @@ from experiments.reports.report.charts import (
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
 from experiments.reports.terminal.run_screen import team_lines
 from experiments.scenario.settings import Bound
+from experiments.studies.comparison import natural_key
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
 from experiments.studies.run_tables import Runs, find_runs
@@ -60,14 +61,6 @@ from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, 
 from mapfusion.errors import InputError, install_command
 
 _SOURCE_DIGITS = 16
-
-
-def _natural(text: object) -> tuple[float, str]:
-    """Return a sorting key that puts 50 before 200."""
-    try:
-        return float(str(text)), ""
-    except ValueError:
-        return math.inf, str(text)
 
 
 def _provenance(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
@@ -110,7 +103,7 @@ def _provenance(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
     # Three or more consecutive whole numbers are written as `--seeds` takes them.
     shown: dict[str, str] = {}
     for name, different in values.items():
-        texts = sorted(different, key=_natural)
+        texts = sorted(different, key=natural_key)
         shown[name] = ", ".join(texts)
         if len(texts) > 2 and all(text.isdigit() for text in texts):
             first, last = int(texts[0]), int(texts[-1])
@@ -259,7 +252,7 @@ def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]
 
 def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield the runs of each scenario and setting with a label."""
-    ordered = sorted(configurations(spread), key=lambda each: [*map(_natural, each[0].values())])
+    ordered = sorted(configurations(spread), key=lambda each: [*map(natural_key, each[0].values())])
     for labels, rows in ordered:
         scenario = labels.pop("scenario")
         if scenario == ALL_SCENARIOS:
