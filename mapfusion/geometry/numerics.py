@@ -10,16 +10,53 @@ and its rounding depends on the processor.
 
 import math
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any, cast
 
 import numpy as np
-from numba import njit, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 Float = NDArray[np.float64]
+
+
+class Compiled:
+    """Function that Numba compiles at its first call, or that of a kernel which calls it.
+
+    The import of Numba takes longer than a command that needs no kernel.
+
+    Attributes:
+        py_func: the Python function.
+    """
+
+    def __init__(self, function: Callable[..., Any], compiler: Callable[[Any], Any]) -> None:
+        self.py_func, self._compiler = function, compiler
+
+    @cached_property
+    def compiled(self) -> Any:
+        """Object of Numba that stands for the function."""
+        _let_kernels_call_each_other()
+        return self._compiler(self.py_func)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the compiled function."""
+        return self.compiled(*arguments)
+
+
+@cache
+def _let_kernels_call_each_other() -> None:
+    """Give a `Compiled` object the Numba type of the object that stands for it."""
+    from numba.core.registry import cpu_target
+    from numba.extending import typeof_impl
+
+    context = cast(Any, cpu_target).typing_context
+
+    def typeof(function: Compiled, _: Any) -> Any:
+        compiled = function.compiled
+        context.refresh()  # a processor instruction is known from here on
+        return context.resolve_value_type(compiled)
+
+    typeof_impl.register(Compiled)(typeof)
 
 
 def kernel(function: Any = None, **options: Any) -> Any:
@@ -27,9 +64,13 @@ def kernel(function: Any = None, **options: Any) -> Any:
 
     Nothing calls kernels from C, so they have no wrapper for that.
     """
-    if function is None:
-        return partial(kernel, **options)
-    return cast(Any, njit)(function, cache=True, no_cfunc_wrapper=True, **options)
+
+    def compiler(python: Any) -> Any:
+        from numba import njit
+
+        return cast(Any, njit)(python, cache=True, no_cfunc_wrapper=True, **options)
+
+    return partial(kernel, **options) if function is None else Compiled(function, compiler)
 
 
 def source_of(compiled: Callable[..., Any]) -> Callable[..., Any]:
@@ -206,14 +247,22 @@ WORD = 64
 # to 56).
 _GATHER = np.uint64(0x0102040810204080)
 
-# Processor instructions without a Numba function, for use inside kernels only. The type hides the
-# first argument, which Numba passes.
-_instruction = cast(Callable[..., Callable[[Any], int]], intrinsic)
+
+def _instruction(generator: Callable[[Any, Any], Any]) -> Compiled:
+    """Make a processor instruction without a Numba function, for use inside kernels only."""
+
+    def compiler(python: Any) -> Any:
+        from numba.extending import intrinsic
+
+        return intrinsic(python)
+
+    return Compiled(generator, compiler)
 
 
 @_instruction
 def trailing_zeros(typing_context: Any, word: Any) -> Any:
     """Return the number of the lowest bit set in a word that is not 0."""
+    from numba import types
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         del signature
@@ -226,6 +275,7 @@ def trailing_zeros(typing_context: Any, word: Any) -> Any:
 @_instruction
 def popcount(typing_context: Any, word: Any) -> Any:
     """Return the number of bits set in a word."""
+    from numba import types
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         del context, signature
