@@ -12,8 +12,8 @@ from mapfusion.align.clique import full_set, larger_clique
 from mapfusion.align.correspondences import match
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se3 import in_space
-from mapfusion.registration import Registration
 from mapfusion.smoother.smooth import condensed_points
+from mapfusion.verification.registration import Registration
 from mapfusion.vision.disparity_tests import window_statistics
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
 from mapfusion.vision.harris import HarrisParameters
@@ -23,7 +23,7 @@ from sim.floorplan import FloorPlan, Wall
 from sim.rendering.ray_caster import RayCaster
 from sim.stereo_head import RadiometricNoise, depth_at, expose
 from sim.world import write_faces
-from tests.experiments.studies.refusal.test_refusal import (
+from tests.experiments.studies.test_refusal_trial import (
     test_calibration_counts_every_motion_of_two_pairs,
 )
 from tests.mapfusion.align.map_pairs import given_pairs
