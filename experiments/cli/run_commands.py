@@ -144,7 +144,7 @@ def export(
 ) -> None:
     """Write a result in other programs' formats: `mapfusion export results/quick-0 --format tum`.
 
-    For files, frames and keys see experiments/docs/export.md.
+    `mapfusion docs export` describes files, frames and keys.
     """
     from experiments.cli.options import require_folder
     from experiments.reports.result_export import export_result
@@ -162,6 +162,21 @@ def inspect_command(
     from experiments.reports.inspect import inspect
 
     inspect(path)
+
+
+@app.command(rich_help_panel=options.LOOK)
+def docs(
+    page: Annotated[
+        str | None, typer.Argument(metavar="[PAGE]", help="Name of a page; lists all without.")
+    ] = None,
+) -> None:
+    """Show a page of the manual: `mapfusion docs formats`."""
+    from experiments.reports.terminal import layout
+
+    if page is None:
+        layout.print_pages()
+    else:
+        layout.print_page(page)
 
 
 @app.command(rich_help_panel=options.RUN)

@@ -23,8 +23,8 @@ def record(
 ) -> None:
     """Simulate, and write the log and truth of each robot: `mapfusion record S -o logs`.
 
-    `--format` writes images, odometry and truth for other programs, see
-    experiments/docs/recordings.md.
+    `--format` writes images, odometry and truth for other programs, see `mapfusion docs
+    recordings`.
     """
     from experiments.cli.options import require_folder
     from experiments.evaluation import single_steps as single

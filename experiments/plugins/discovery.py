@@ -25,8 +25,8 @@ from experiments.plugins.isolated_process import (
     process_for,
 )
 from mapfusion.align.aligners import ALIGNERS, PEERS, construct
-from mapfusion.errors import did_you_mean
-from mapfusion.registration import Aligner, as_aligner
+from mapfusion.errors import did_you_mean, not_installed
+from mapfusion.verification.registration import Aligner, as_aligner
 
 ENTRY_POINTS = "mapfusion.aligners"  # group of the entry points that declare aligners
 _CODE_SUFFIXES = (".py", ".so", ".pyd")
@@ -81,10 +81,7 @@ class KnownMethod:
         """Reason why a peer cannot run, with a remedy; empty if the method can run."""
         if self.kind is not Kind.PEER or _find_spec(self.package) is not None:
             return ""
-        return (
-            f"the package {self.distribution} is not installed; "
-            "pip install 'mapfusion[peers]' installs it"
-        )
+        return not_installed(self.distribution, "peers")
 
     def origin(self) -> dict[str, str]:
         """Return the code that results depend on, beside our own, for the keys of stages."""

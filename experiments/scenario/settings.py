@@ -33,13 +33,12 @@ from experiments.scenario.world_settings import (
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refinement import Refinement
 from mapfusion.errors import OutOfRangeError, did_you_mean
-from mapfusion.fusion.fused_map import MergeParameters
-from mapfusion.fusion.fusers import USUAL
+from mapfusion.fusion.fusers import USUAL, MergeParameters
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.parameters import Range
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 from mapfusion.vision.front_end import FrontEndParameters
 from sim.odometry import OdometryNoise
 from sim.stereo_head import RadiometricNoise
@@ -175,9 +174,9 @@ class Align(Section):
     repetitions: Annotated[int, Range(1, 1000, "repetitions")] = 20
 
     @property
-    def judge(self) -> Judge:
+    def judge(self) -> Verifier:
         """Return the judge of alignments with these settings."""
-        return Judge(self.acceptance, self.evidence, self.refinement)
+        return Verifier(self.acceptance, self.evidence, self.refinement)
 
     @model_validator(mode="after")
     def _unique(self) -> Self:

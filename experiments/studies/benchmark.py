@@ -34,7 +34,7 @@ from mapfusion.files import schema
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 
 # Constants, so that tables of different versions can be compared.
 SIZE_M = 20.0  # side of the square that contains the landmarks
@@ -154,7 +154,7 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     n_pairs, share = settings.n_pairs, settings.outlier_share
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
     registration = Registration(
-        aligner, judge=None
+        aligner, verifier=None
     )  # no verdict: methods are ranked by their estimates
     cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
     rows: list[dict[str, Any]] = []

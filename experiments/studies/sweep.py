@@ -27,6 +27,7 @@ from experiments.pipeline.stages.memory import require_memory
 from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded
+from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import scenarios_of
 from experiments.scenario.yaml_files import parse_value, read_mapping
 from experiments.studies.sweep_tables import (
@@ -39,6 +40,7 @@ from experiments.studies.sweep_tables import (
 )
 from mapfusion.errors import InputError
 from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whole
+from sim.renderer import require_pybullet
 
 _EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
 _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
@@ -79,7 +81,8 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     is reported before anything is computed.
 
     Raises:
-        InputError: a scenario, key or value is wrong, or two scenarios have the same name.
+        InputError: a scenario, key or value is wrong, two scenarios have the same name, or PyBullet
+            is not installed.
     """
     choices = ([(key, value) for value in values] for key, values in axes.items())
     combinations = list(itertools.product(*choices))
@@ -87,8 +90,10 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     names: dict[str, Path] = {}
     for path in paths:
         content = read_mapping(path)
-        first = (SweepRun(path, "", seeds[0], each, content) for each in combinations)
-        (name,) = {run.load().name for run in first}
+        loaded = [SweepRun(path, "", seeds[0], each, content).load() for each in combinations]
+        if any(isinstance(scenario, Simulation) for scenario in loaded):
+            require_pybullet()
+        (name,) = {scenario.name for scenario in loaded}
         if names.setdefault(name, path) != path:
             raise InputError(f"{path}: is named {name}, as {names[name]} is; names must differ")
         runs += [

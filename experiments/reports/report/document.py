@@ -64,7 +64,7 @@ from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, install_command
 
 _SOURCE_DIGITS = 16
 
@@ -399,6 +399,6 @@ def templates() -> jinja2.Environment:
     )
     environment.globals |= {"text": formatting, "criteria": criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
-    environment.globals["gross_m"] = GROSS_M
+    environment.globals |= {"gross_m": GROSS_M, "install_command": install_command}
     environment.tests["nan"] = math.isnan
     return environment
