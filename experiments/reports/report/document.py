@@ -51,7 +51,7 @@ from experiments.reports.report.charts import (
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
-from experiments.reports.terminal.run_screen import team_lines
+from experiments.reports.terminal.run_screen import images_by, team_lines
 from experiments.scenario.settings import Bound
 from experiments.studies.comparison import (
     BETTER,
@@ -399,6 +399,10 @@ def templates() -> jinja2.Environment:
     )
     environment.globals |= {"text": formatting, "criteria": criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
-    environment.globals |= {"gross_m": GROSS_M, "install_command": install_command}
+    environment.globals |= {
+        "gross_m": GROSS_M,
+        "images_by": images_by,
+        "install_command": install_command,
+    }
     environment.tests["nan"] = math.isnan
     return environment
