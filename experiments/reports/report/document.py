@@ -51,9 +51,15 @@ from experiments.reports.report.charts import (
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
-from experiments.reports.terminal.run_screen import team_lines
+from experiments.reports.terminal.run_screen import images_by, team_lines
 from experiments.scenario.settings import Bound
-from experiments.studies.comparison import natural_key
+from experiments.studies.comparison import (
+    BETTER,
+    WORSE,
+    compare_values,
+    natural_key,
+    values_by_setting,
+)
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
 from experiments.studies.run_tables import Runs, find_runs
@@ -214,6 +220,7 @@ def contents_of(path: Path) -> dict[str, Any]:
             "description": ", ".join(maps["scenario"].unique()),
             "spread_text": "runs; each run is the median of its repetitions",
             "charts": {"map": None},
+            "compared": list(_compared_settings(path, runs)),
         }
         groups = list(_by_configuration(reduced.medians))
     else:
@@ -261,6 +268,39 @@ def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]
         yield ", ".join([scenario, *settings]), rows
 
 
+# Comparisons of values in the report of a sweep: each reads all tables once.
+_MOST_COMPARED = 8
+
+
+def _compared_settings(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
+    """Yield for each setting that a sweep varied what a value changes against the first one."""
+    pairs = [
+        (setting, first, other)
+        for setting, (first, *others) in values_by_setting(runs).items()
+        for other in others
+    ]
+    for setting, first, other in pairs[:_MOST_COMPARED]:
+        try:
+            found = compare_values(path, setting, first, other)
+        except InputError:  # no run with the one value matches a run with the other
+            continue
+        judged = found.table[~found.table["timed"]]
+        changed = judged[judged["verdict"].isin([BETTER, WORSE])].sort_values("p_holm")
+        counts = changed["verdict"].value_counts()
+        yield {
+            "setting": setting,
+            "first": first,
+            "other": other,
+            "n_runs": found.n_runs,
+            "unit": found.unit,
+            "n_better": int(counts.get(BETTER, 0)),
+            "n_worse": int(counts.get(WORSE, 0)),
+            "n_measures": len(judged),
+            "weak": found.n_runs < FEW_RUNS,
+            "changed": changed.to_dict("records"),
+        }
+
+
 def _of_result(data: ResultTables) -> dict[str, Any]:
     """Return the title and the sections of a result; a section without its tables is empty."""
     outcomes: list[Outcome] = []  # of this run alone
@@ -279,6 +319,7 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
     return {
         "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
         "description": data.scenario.get("description", ""),
+        "compared": (),
         "spread_text": "repetitions on the same maps",
         "charts": {"map": map_figure(data, _page_styles(data.aligners))},
         "outcomes": outcomes,
@@ -357,6 +398,10 @@ def templates() -> jinja2.Environment:
     )
     environment.globals |= {"text": formatting, "criteria": criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
-    environment.globals |= {"gross_m": GROSS_M, "install_command": install_command}
+    environment.globals |= {
+        "gross_m": GROSS_M,
+        "images_by": images_by,
+        "install_command": install_command,
+    }
     environment.tests["nan"] = math.isnan
     return environment

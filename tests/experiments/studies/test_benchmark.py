@@ -174,7 +174,7 @@ def test_command_writes_tables_and_figure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--trials", 2, "--pairs", 60, "--outliers", 0.5, "--results", tmp_path]
-    reply = command(capsys, "study", "benchmark", "--method", "ransac", *options)
+    reply = command(capsys, "study", "benchmark", "--aligner", "ransac", *options)
     assert reply.code == 0
     assert "60 pairs" in reply.out
     folder = tmp_path / "benchmark"
@@ -197,7 +197,10 @@ def test_command_writes_tables_and_figure(
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--method", "ransack"], "--method: unknown aligner 'ransack', known are ransac"),
+        (
+            ["--aligner", "ransack"],
+            "--aligner ransack: unknown aligner 'ransack', known are ransac",
+        ),
         (["--outliers", "1.5"], "'--outliers': Input should be less than or equal to 1"),
         (["--trials", "0"], "'--trials': Input should be greater than or equal to 1"),
     ],
@@ -214,8 +217,9 @@ def test_bad_input_is_one_line(
 def test_methods_of_a_scenario(tmp_path: Path, tiny_path: Path) -> None:
     assert [entry.name for entry in entries_of([], tiny_path)] == ["ransac", "svd", "icp"]
     assert [entry.name for entry in entries_of(["icp"], tiny_path)] == ["icp"]
-    with pytest.raises(InputError, match=r"align\.aligners: none is named opencv"):
-        entries_of(["opencv"], tiny_path)
+    assert [entry.name for entry in entries_of(["gnc", "svd"], tiny_path)] == ["gnc", "svd"]
+    with pytest.raises(InputError, match=r"--aligner nobody: unknown aligner 'nobody'"):
+        entries_of(["nobody"], tiny_path)
     assert {"ransac", "opencv", "kiss_matcher"} <= {entry.name for entry in entries_of([])}
 
 
