@@ -188,6 +188,9 @@ def benchmark(
         list[float] | None,
         typer.Option(help="Shares of false pairs; may be repeated.", min=0, max=1),
     ] = None,
+    unpaired: Annotated[
+        float, typer.Option(help="Share of landmarks without a partner.", min=0, max=0.99)
+    ] = 0.0,
     seed: options.Seed = None,
     scenario: options.SettingsOf = None,
     budget_s: Annotated[
@@ -214,7 +217,9 @@ def benchmark(
         tuple(outliers or benchmark.OUTLIER_SHARES),
     )
     chosen_seed = settings_of(scenario, (), seed).seed
-    design = benchmark.BenchmarkDesign(entries, trials, chosen_seed, budget_s, counts, shares)
+    design = benchmark.BenchmarkDesign(
+        entries, trials, chosen_seed, budget_s, counts, shares, unpaired
+    )
     folder = output or results / "benchmark"
     with layout.progress() as show:
         rows = benchmark.run_benchmark(design, Store(results / "store"), show)

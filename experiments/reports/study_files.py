@@ -109,6 +109,7 @@ def write_benchmark(
         "seed": design.seed,
         "trials": design.trials,
         "budget_s": design.budget_s,
+        "unpaired_share": design.unpaired_share,
         "aligners": [
             entry.model_dump(mode="json") | {"origin": find_method(entry.method).origin()}
             for entry in design.aligners
@@ -124,11 +125,13 @@ def write_benchmark(
 
 def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
     """Return the whole table in Markdown, one section for each number of pairs."""
+    share = design.unpaired_share
+    alone = f"{share:.0%} of each map's landmarks without a partner; " if share else ""
     parts = [
         f"# Aligners on made-up maps\n\n"
         f"Planar maps of landmarks uniform in {SIZE_M:g} x {SIZE_M:g} m, residuals of true pairs "
-        f"{SIGMA_M:g} m per axis, false pairs uniform; {design.trials} trials a cell, seed "
-        f"{design.seed}, the same maps for all methods.\n\n"
+        f"{SIGMA_M:g} m per axis, false pairs uniform; {alone}"
+        f"{design.trials} trials a cell, seed {design.seed}, the same maps for all methods.\n\n"
         f"Each cell: successes in % (accepted and within {RIGHT_WITHIN_M:g} m and "
         f"{RIGHT_WITHIN_RAD:g} rad as estimated) with Wilson's 95 % interval; the median "
         "translation error of the successes over the oracle's (least squares on the true pairs) on "

@@ -40,7 +40,7 @@ from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whol
 
 _LONGEST_NAME = 80
 _TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
-_TABLES += ("smoother", "team", "team_pairs", "fusers")
+_TABLES += ("sightings", "smoother", "team", "team_pairs", "fusers")
 
 
 class Sweep(NamedTuple):

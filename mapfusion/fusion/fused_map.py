@@ -57,7 +57,8 @@ class FusedMap:
         duplicate_share: share of the landmarks that pass the gate and descriptor test with another
             landmark.
         left_out: name of each map that was not fused, with the reason.
-        fallback: reason for the use of a simpler fuser than the requested one; empty if none.
+        fallback: reason for the use of a simpler fuser than the requested one, or a defect of the
+            fused covariances; empty if none.
         paths: path of each member in the fused frame, shape (T_k, 3); empty if the fuser does not
             estimate paths.
     """

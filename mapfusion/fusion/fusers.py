@@ -34,12 +34,17 @@ GROUP = "mapfusion.fusers"
 FUSERS = {
     "kalman": "mapfusion.fusion.kalman:Kalman",
     "kalman-drift": "mapfusion.fusion.kalman:KalmanDrift",
+    "kalman_as_printed": "mapfusion.fusion.kalman:KalmanAsPrinted",
     "covariance_intersection": "mapfusion.fusion.covariance_intersection:CovarianceIntersection",
     "joint": "mapfusion.fusion.joint:JointFuser",
     "batch": "mapfusion.fusion.batch:Batch",
 }
 # Reference that smooths all logs jointly, which is much slower than the other fusers.
 REFERENCE = "batch"
+# The paper's fuser with the wrong sign of eq. 13.
+AS_PRINTED = "kalman_as_printed"
+# Fusers of scenarios that name none.
+COMPARED = tuple(name for name in FUSERS if name not in (REFERENCE, AS_PRINTED))
 USUAL = "joint"  # default fuser
 
 
