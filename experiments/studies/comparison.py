@@ -34,9 +34,9 @@ from experiments.evaluation.path_errors import path_rms
 from experiments.evaluation.result_files import read_scenario
 from experiments.evaluation.team_errors import is_used_by_team
 from experiments.studies import intervals
-from experiments.studies.error_bands import ROBOT_PAIR
 from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.studies.run_tables import RunPath, Runs, find_runs, match_names
+from experiments.studies.statistics import ROBOT_PAIR
 from mapfusion.errors import InputError
 
 EACH_METHOD = "each method"  # fusers too
