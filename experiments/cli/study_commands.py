@@ -229,6 +229,48 @@ def benchmark(
 
 
 @studies.command()
+def paper(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="PATH...", help="Results or sweeps of paper and paper_as_printed, ten seeds."
+        ),
+    ],
+    *,
+    trials: Annotated[
+        int, typer.Option(help="Trials of each method at each share of false pairs.", min=1)
+    ] = 100,
+    output: options.OutputFolder = None,
+    results: options.Results = options.RESULTS,
+) -> None:
+    """Compare the claims of the paper with runs: `mapfusion study paper results/paper*`.
+
+    Writes a page with one row per claim: measure, value with interval over the runs, and verdict.
+    Makes trials with known shares of false pairs too; finished trials are reused.
+    """
+    from experiments.cli.options import require_folder
+    from experiments.pipeline.store import Store
+    from experiments.reports.study_files import write_claims
+    from experiments.reports.terminal import layout, study_screen
+    from experiments.studies import paper_claims
+    from experiments.studies.benchmark import run_benchmark
+    from experiments.studies.run_tables import find_runs
+
+    require_folder(output, paths)
+    values = paper_claims.compare_with_paper(find_runs(paths))
+    folder = output or results / "study-paper"
+    require_folder(folder)
+    with layout.progress() as show:
+        trials_of = {
+            design.unpaired_share: run_benchmark(design, Store(results / "store"), show)
+            for design in paper_claims.crossing_designs(trials)
+        }
+    study_screen.print_claims(values)
+    crossing = paper_claims.crossing_rows(trials_of)
+    layout.print_paths(folder, write_claims(folder, values, crossing))
+
+
+@studies.command()
 def independence(
     scenario: options.OneScenario,
     *,

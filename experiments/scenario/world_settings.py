@@ -248,7 +248,6 @@ class Smooth(Section):
     max_memory_gb: Annotated[float, Range(0, 10_000, "GB")] = 1.0
 
 
-
 def _known_fusers(names: list[str]) -> list[str]:
     """Refuse unknown and repeated fusers."""
     for name in names:

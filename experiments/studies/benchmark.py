@@ -26,7 +26,7 @@ from experiments.plugins.discovery import callable_aligner, find_method, known_m
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.scenario.suite import settings_of
-from experiments.studies.intervals import wilson
+from experiments.studies.intervals import log_ratio, wilson
 from mapfusion.align.alignment import NOT_RUN, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid
@@ -339,3 +339,37 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
     cells = pd.DataFrame(columns).reset_index()
     cells["n_true"] = list(map(true_pairs_of, cells["n_pairs"], cells["outlier_share"]))
     return cells[SUMMARY.names]
+
+
+def median_errors(trials: pd.DataFrame) -> pd.DataFrame:
+    """Return the median translation error of all trials by share of false pairs and method.
+
+    A trial without an accepted estimate has an infinite error. The successes alone, as in SUMMARY,
+    would hide how often a method fails.
+    """
+    error = trials["error_m"].where(trials["status"] == Status.ACCEPTED, math.inf)
+    given = trials.assign(error_m=error)
+    return given.pivot_table("error_m", "outlier_share", "method", aggfunc="median")
+
+
+def crossing_shares(errors: pd.DataFrame, first: str, second: str) -> list[float]:
+    """Return the shares of false pairs at which the order of two methods' errors changes.
+
+    Args:
+        errors: value of `median_errors`.
+        first: name of a method.
+        second: name of the other method.
+
+    Returns:
+        Shares between two neighbouring rows, interpolated linearly in the logarithm of the ratio;
+        the middle if an error is 0 or infinite.
+    """
+    share = errors.index.to_numpy(np.float64)
+    change = log_ratio(errors[first].to_numpy(), errors[second].to_numpy())
+    found = []
+    for k in np.flatnonzero(change[:-1] * change[1:] < 0):
+        left, right = change[k : k + 2]
+        known = np.isfinite(left) and np.isfinite(right)
+        along = left / (left - right) if known else 0.5
+        found.append(float(share[k] + along * (share[k + 1] - share[k])))
+    return found
