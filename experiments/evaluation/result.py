@@ -65,7 +65,7 @@ from sim.renderer import renderer_name
 
 TableMaker = Callable[[], Any]  # returns the rows of a table
 _SLOW = ("fused_map", "fusers", "fuser_coverage")  # tables of figures that take long to compute
-_IN_NO_FIGURE = ("map_history", "fused_history", "path_statistics", "timings")
+_IN_NO_FIGURE = ("fused_history", "path_statistics", "timings")
 
 
 def all_tables(

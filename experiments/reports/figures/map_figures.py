@@ -26,7 +26,7 @@ from experiments.reports.figures.result_tables import (
     ResultTables,
     of_pair,
 )
-from experiments.reports.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN
+from experiments.reports.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN, PURPLE
 from mapfusion.files import POSITION_FIELDS
 from mapfusion.geometry.numerics import Float
 
@@ -35,7 +35,7 @@ from mapfusion.geometry.numerics import Float
 _OUTLIER_SHARE, _OUTLIER_MARGIN = 0.005, 0.05
 _GAP = 0.15  # between the two maps, as a share of the width of the first map
 _MIN_HEIGHT = 0.2  # of the box, as a share of its length: rooms are low; the axis labels stay true
-_MAX_LINES = 80  # of each kind: more would hide the maps
+_MAX_LINES, _LEAST_LINES = 30, 8  # of both kinds together, and of the rarer kind
 _PADDING_IN = 0.08  # around the box with its labels
 _FITTING_STEPS = 4  # labels do not scale with the box, so its size is found by iteration
 # Drawn as pixels; the enlarged box reaches beyond the rectangle of the axes.
@@ -49,6 +49,7 @@ _MARGIN = 1.15
 # Figure 9
 _ZOOM_LANDMARKS = 5  # legible number for the size of the panel
 _ZOOM_MARGIN = 1.1  # of the side
+_LEAST_DISTANCE_M = 1e-6  # of two landmarks, for a division
 _MAX_CANDIDATES = 500  # squares to choose from; each is compared with all landmarks
 
 # Figure 10
@@ -178,14 +179,18 @@ def _add_correspondences(
     ends = np.stack([position_a[rows["index_a"]], position_b[rows["index_b"]]], axis=1)
     drawable = np.isfinite(ends).all(axis=(1, 2))
     styles: tuple[dict[str, Any], ...] = (
-        {"colors": GRAY, "linewidths": 0.3, "linestyles": (0, (4, 2))},
-        {"colors": BLACK, "linewidths": 0.6, "alpha": 0.7},
+        {"colors": PURPLE, "linewidths": 1.0, "linestyles": (0, (4, 2))},
+        {"colors": BLACK, "linewidths": 0.7},
     )
-    for chosen, name, style in zip((~right, right), names[::-1], styles, strict=True):
+    n_right, n_all = np.count_nonzero(right & drawable), max(np.count_nonzero(drawable), 1)
+    share = round(_MAX_LINES * n_right / n_all)
+    n_lines = int(np.clip(share, _LEAST_LINES, _MAX_LINES - _LEAST_LINES))
+    counts = (_MAX_LINES - n_lines, n_lines)
+    for chosen, name, style, most in zip((~right, right), names[::-1], styles, counts, strict=True):
         if not chosen.any():
             continue
         candidates = np.flatnonzero(chosen & drawable)
-        n_drawn = min(len(candidates), _MAX_LINES)
+        n_drawn = min(len(candidates), most)
         drawn = candidates[np.linspace(0, len(candidates) - 1, n_drawn).astype(int)]
         sample = f", {n_drawn} drawn" if n_drawn < chosen.sum() else ""
         label = f"{name}: {chosen.sum()}{sample}"
@@ -315,11 +320,23 @@ def draw_aligned_maps(data: ResultTables) -> Figure:
             plan.add_ellipses(axes, position[k], covariance[k], **style)
     plan.set_view(overview, fused, fused[:0])
     zoom.set(xlim=(x, x + side), ylim=(y, y + side), aspect="equal")
+    # The square is much smaller than the map: a label with a line points to it, and a circle shows
+    # where it is.
     dashed = {"fill": False, "edgecolor": BLACK, "linestyle": "--", "zorder": 6}
     overview.add_patch(Rectangle((x, y), side, side, **dashed))
+    middle = np.array([x, y]) + side / 2
+    (low_x, high_x), (low_y, high_y) = overview.get_xlim(), overview.get_ylim()
+    ring = {"markerfacecolor": "none", "color": BLACK, "markersize": 11, "zorder": 6}
+    overview.plot(*middle, "o", markeredgewidth=1.2, **ring)
+    inward = np.sign([(low_x + high_x) / 2, (low_y + high_y) / 2] - middle)
+    box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "linewidth": 0.6}
+    label: dict[str, Any] = {"xytext": tuple(28 * inward), "textcoords": "offset points"}
+    label |= {"ha": "center", "va": "center", "bbox": box, "zorder": 7}
+    line = {"arrowstyle": "-", "linewidth": 0.8, "shrinkB": 6}
+    overview.annotate("enlarged", xy=(middle[0], middle[1]), arrowprops=line, **label)
     overview.set_title(f"{len(fused)} landmarks in both maps, aligned")
     cut = f", without {part.n_cut} on its rim" if part.n_cut else ""
-    zoom.set_title(f"{part.whole.sum()} of them in the dashed square{cut}")
+    zoom.set_title(f"{part.whole.sum()} of them, enlarged: a square of {100 * side:.2g} cm{cut}")
     handles, _ = zoom.get_legend_handles_labels()
     legend = {"title": f"{plan.LEVEL_TEXT} ellipses, to scale", "title_fontsize": 7.5}
     plan.finish_plans(figure, [overview, zoom], handles, len(handles), **legend)
@@ -364,7 +381,12 @@ def choose_zoom(position_m: Float, covariance_m2: Float) -> Zoom:
     whole = np.all((low >= first) & (high <= last), axis=2)
     touched = np.all((high > first) & (low < last), axis=2)
     n_cut = np.count_nonzero(touched & ~whole, axis=1)
-    best = int(np.argmin(n_cut + side / np.median(side)))
+    # Ellipses that overlap are hard to tell apart: the size of an ellipse over the distance to the
+    # nearest neighbour, median over the neighbours.
+    extent = (high - low).max(axis=1)
+    apart = KDTree(middle).query(middle[near], k=min(2, len(middle)))[0].reshape(*near.shape, -1)
+    overlap = np.median(extent[near] / np.maximum(apart[..., -1], _LEAST_DISTANCE_M), axis=1)
+    best = int(np.argmin(n_cut + side / np.median(side) + overlap))
     return Zoom(corner[best], float(side[best]), whole[best], int(n_cut[best]))
 
 

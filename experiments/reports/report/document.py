@@ -51,10 +51,12 @@ from experiments.reports.report.charts import (
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
+from experiments.reports.study_files import claims_table
 from experiments.reports.terminal.run_screen import team_lines
 from experiments.scenario.settings import Bound
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
+from experiments.studies.paper_claims import SCENARIOS, compare_with_paper
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
 from mapfusion.errors import InputError
@@ -233,7 +235,15 @@ def contents_of(path: Path) -> dict[str, Any]:
         "stages": stages,
         "stage_times": _stage_times(runs),
         "failed": runs.failed.to_dict("records"),
+        "claims": _claims(runs),
     }
+
+
+def _claims(runs: Runs) -> list[dict[Any, Any]]:
+    """Return the table of the paper's claims for runs of the paper's experiment; else nothing."""
+    if not set(SCENARIOS) & set(runs.described["scenario"]):
+        return []
+    return claims_table(compare_with_paper(runs)).to_dict("records")
 
 
 def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]:
@@ -254,6 +264,7 @@ def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]
         "stages": stages,
         "stage_times": _stage_times(runs),
         "failed": [],
+        "claims": [],
     }
 
 
@@ -315,7 +326,7 @@ def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
                 size = dict(zip(("width", "height"), picture.size, strict=True))
             png = base64.b64encode(data).decode()
             how = _OF_FUSERS.get(name, "")
-            yield {"about": caption(name), "how": how, "png": png, **size}
+            yield {"about": caption(name, file.parent), "how": how, "png": png, **size}
 
 
 _PAGE = Path(__file__).parent / "page"
