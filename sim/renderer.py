@@ -7,7 +7,7 @@ import subprocess
 import sys
 from typing import Any, Literal
 
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, not_installed
 
 BulletRenderer = Literal["tiny", "egl"]
 Renderer = Literal["tiny", "egl", "raycast"]
@@ -22,12 +22,19 @@ NEEDED = (
 _PROBE = "from sim.renderer import probe; probe()"
 
 
+def require_pybullet() -> None:
+    """Raise InputError if PyBullet is not installed; nothing is imported."""
+    if importlib.util.find_spec("pybullet") is None:
+        raise InputError(f"a simulated world needs PyBullet: {not_installed('pybullet', 'sim')}")
+
+
 @functools.cache
 def egl_driver() -> str:
     """Return name and version of the EGL driver; raises InputError without a working one.
 
     The test runs in a process of its own, because the plug-in ends its process without a driver.
     """
+    require_pybullet()
     if importlib.util.find_spec(PLUGIN) is None:
         raise InputError(NEEDED.format(reason="the plug-in is not installed"))
     root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))

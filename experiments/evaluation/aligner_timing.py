@@ -14,7 +14,7 @@ from experiments.evaluation.truth import (
 from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AnyScenario
-from mapfusion.registration import Aligner
+from mapfusion.verification.registration import Aligner
 
 _PERCENTILES = {"elapsed_low_s": 10, "elapsed_s": 50, "elapsed_high_s": 90}
 _WARM_UP = "warm-up"  # name of the random generators of calls that are not timed

@@ -26,12 +26,12 @@ from experiments.pipeline.tables import (
 )
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.oracle import Oracle
-from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.align.refinement import Oracle
+from mapfusion.fusion.fusers import AlignedPair
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 
 _MAP_PAIR = ["robot_a", "robot_b", "iteration"]
 
@@ -152,7 +152,7 @@ def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> Float
     return nees
 
 
-def error_rows(map_pair: MapPair, judge: Judge, radius_m: float) -> pd.DataFrame:
+def error_rows(map_pair: MapPair, judge: Verifier, radius_m: float) -> pd.DataFrame:
     """Return the rows of the table `errors` of one pair of maps; the first is the oracle's.
 
     The oracle is the aligner that is given the true correspondences.
@@ -161,7 +161,7 @@ def error_rows(map_pair: MapPair, judge: Judge, radius_m: float) -> pd.DataFrame
     oracle = Oracle(judge.refinement).align(pairs, is_true)
     evidence = evidence_of(map_pair.rivals, map_pair.maps, judge.evidence)
     row = map_pair.keys | {"aligner": ORACLE, "repetition": 0}
-    row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).judge(oracle))
+    row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).verify(oracle))
     rows = [row, *map_pair.estimates]
     alignments = [alignment_of(each, len(pairs)) for each in rows]
     T_true = se2.between(map_pair.a.path.T_world_map, map_pair.b.path.T_world_map)

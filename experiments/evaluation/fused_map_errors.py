@@ -29,7 +29,7 @@ from experiments.evaluation.map_consistency import (
 from experiments.evaluation.smoothed_robots import SmoothedRobot
 from experiments.evaluation.truth import degrees_of_freedom
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import FusedMap, Fusion
+from mapfusion.fusion.fusers import FusedMap, Fusion
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap

@@ -13,7 +13,7 @@ from experiments.pipeline.stage import Job
 from experiments.pipeline.stages.slam import ROBOTS_KEPT, RobotFolders, folders_of_both, stored_maps
 from mapfusion.errors import InputError
 from mapfusion.robot_log import read_log
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 
 WRITES = ("errors.parquet", "fusion.parquet")
 # Tables of the stage `align`, in the order of the arguments of `join_map_pairs`.
@@ -24,7 +24,7 @@ ALIGNED = ("estimates", "correspondences", "rivals")
 class EvaluationSettings:
     """Settings of the evaluation of alignments."""
 
-    judge: Judge
+    judge: Verifier
     merge: MergeSettings
     true_pair_radius_m: float
 

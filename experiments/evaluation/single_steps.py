@@ -30,13 +30,12 @@ from mapfusion.datasets.log_consistency import Finding, check_log, gate_finding,
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
-from mapfusion.fusion.fused_map import AlignedPair, Fusion, name_order
-from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.fusers import AlignedPair, Fusion, make_fuser, name_order
 from mapfusion.fusion.merge import merge as merge_maps
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
-from mapfusion.registration import Registration
 from mapfusion.robot_log import read_log, read_odometry_covariance, read_true_poses
+from mapfusion.verification.registration import Registration
 from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
 
@@ -245,8 +244,8 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         done = ready.register(rng)
         false_alarms = done.verdict.log10_false_alarms
         pairs.append(AlignedPair(a, b, done.applied, offered, false_alarms))
-        if done.applied.status is Status.AMBIGUOUS and ready.judge is not None:
-            rivals = ready.judge.rivals_of(done.refined)
+        if done.applied.status is Status.AMBIGUOUS and ready.verifier is not None:
+            rivals = ready.verifier.rivals_of(done.refined)
             pairs += [AlignedPair(a, b, rival, offered, false_alarms) for rival in rivals]
     chosen = settings.merge
     fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))

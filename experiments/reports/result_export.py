@@ -1,10 +1,8 @@
 """Export of a result: trajectories, pose graphs, point clouds, recordings for Rerun.
 
-The timeline `frame` is the iteration. `experiments/docs/export.md` lists the entities. The package
-of the viewer (500 MB) is optional and imported only here.
-
-Everything comes from the result folder. `experiments/docs/export.md` describes files, keys and
-frames.
+Everything comes from the result folder. `mapfusion docs export` describes files, keys, frames and
+the recording's entities. The timeline `frame` is the iteration. The package of the Rerun viewer
+(500 MB) is optional and imported only here.
 """
 
 import re
@@ -26,8 +24,8 @@ from experiments.reports.figures.style import FUSED_COLOUR
 from experiments.scenario.world_settings import NAME_PATTERN
 from mapfusion.datasets.export import G2oGraph, ply_text
 from mapfusion.datasets.kitti import kitti_text
-from mapfusion.datasets.tum import tum_text
-from mapfusion.errors import InputError
+from mapfusion.datasets.text_files import tum_text
+from mapfusion.errors import InputError, not_installed
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import POSE_FIELDS, write_whole
 from mapfusion.geometry import se2
@@ -44,8 +42,7 @@ _TIMELINE = "frame"
 def write_rerun(data: ResultTables, path: Path) -> None:
     """Write the recording; raises InputError if the viewer's package is not installed."""
     if find_spec("rerun") is None:
-        remedy = "pip install 'mapfusion[rerun]' installs it"
-        raise InputError(f"--format rerun: the package rerun-sdk is not installed; {remedy}")
+        raise InputError(f"--format rerun: {not_installed('rerun-sdk', 'rerun')}")
     name = data.folder.resolve().name
 
     def write(temporary: Path) -> None:

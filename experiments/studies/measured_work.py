@@ -33,12 +33,12 @@ from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import POSE_FIELDS, float_fields, named_columns, schema
-from mapfusion.fusion.fused_map import FusedMap
+from mapfusion.fusion.fusers import FusedMap
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, write_map
-from mapfusion.registration import Registration
 from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance, write_log
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.registration import Registration
+from mapfusion.verification.verdict import Verifier
 
 FILTER, SMOOTHING, ALIGNMENT, FUSION = "filter", "smoothing", "alignment", "fusion"
 # Messages of a robot, as files in our own formats. A filter's map: landmarks with their own
@@ -241,7 +241,7 @@ def _align(settings: PairCostSettings, map_a: LandmarkMap, map_b: LandmarkMap) -
     own = settings.aligner
     aligner = callable_aligner(own.method, own.parameters, own.time_limit_s)
     registration = Registration(
-        aligner, own.refinement, Judge(own.acceptance, own.evidence, own.refinement)
+        aligner, own.refinement, Verifier(own.acceptance, own.evidence, own.refinement)
     )
     rng, meter = generator(own.seed, "align", map_a.name, map_b.name), Meter()
     pairs = match(map_a, map_b, settings.match)

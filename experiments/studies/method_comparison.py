@@ -254,6 +254,10 @@ class Standing:
     shown: dict[str, float]
 
 
+# An aligner with a lower rate, at the upper end of its interval, fails more often than it succeeds.
+_RELIABLE_RATE = 0.5
+
+
 @dataclass(frozen=True)
 class Recommendation:
     """Recommended aligner.
@@ -279,6 +283,11 @@ class Recommendation:
     n_scenarios: int
     oracle_m: float
     oracle_rad: float
+
+    @property
+    def reliable(self) -> bool:
+        """True if the best aligner succeeds often enough to be used."""
+        return self.best is not None and self.best.high >= _RELIABLE_RATE
 
 
 def aligner_summary(

@@ -28,13 +28,13 @@ from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.files import schema
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.registration import Registration
 from mapfusion.verification.false_alarms import (
     Acceptance,
     IndependentPairs,
     fewest_false_alarms,
     independent_pairs,
 )
+from mapfusion.verification.registration import Registration
 
 N_PAIRS_OF_MAPS = 5000
 N_CORRESPONDENCES = 40
@@ -306,9 +306,9 @@ def _answers(
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
         aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        registration = Registration(aligner, settings.refinement, judge=None)
+        registration = Registration(aligner, settings.refinement, verifier=None)
         refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
-        verdict = judged.judge(refined)
+        verdict = judged.verify(refined)
         error = refined.T_a_b - case.T_true
         found = {
             "aligner": entry.name,

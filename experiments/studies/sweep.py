@@ -27,6 +27,7 @@ from experiments.pipeline.stages.memory import require_memory
 from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded
+from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import scenarios_of
 from experiments.scenario.yaml_files import parse_value, read_mapping
 from experiments.studies.sweep_tables import (
@@ -39,6 +40,7 @@ from experiments.studies.sweep_tables import (
 )
 from mapfusion.errors import InputError
 from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whole
+from sim.renderer import require_pybullet
 
 _EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
 _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
@@ -47,28 +49,28 @@ _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
 Axes = Mapping[str, tuple[str, ...]]
 
 
-def parse_axes(entries: Sequence[str]) -> Axes:
-    """Parse `--set KEY=VALUE,VALUE,...`; raises InputError that shows the correct form."""
+def parse_axes(entries: Sequence[str], option: str = "--set") -> Axes:
+    """Parse `OPTION KEY=VALUE,VALUE,...`; raises InputError that shows the correct form."""
     axes: dict[str, tuple[str, ...]] = {}
     for entry in entries:
         key, _, listed = entry.partition("=")
         if not key or not listed.strip():
-            raise InputError(f"--set {entry}: {_EXPECTED}")
+            raise InputError(f"{option} {entry}: {_EXPECTED}")
         if key in _FIXED:
-            raise InputError(f"--set {entry}: {key} cannot be set here; use {_FIXED[key]}")
+            raise InputError(f"{option} {entry}: {key} cannot be set here; use {_FIXED[key]}")
         if key in axes:
-            raise InputError(f"--set {key}: given twice; write its values as {key}=A,B")
-        values = parse_value(f"[{listed}]", f"--set {entry}: {_EXPECTED}")
+            raise InputError(f"{option} {key}: given twice; write its values as {key}=A,B")
+        values = parse_value(f"[{listed}]", f"{option} {entry}: {_EXPECTED}")
         # Text stays as it is unless YAML would read another type; everything else becomes JSON.
         axes[key] = tuple(
             value
-            if isinstance(value, str) and parse_value(value, "--set") == value
+            if isinstance(value, str) and parse_value(value, option) == value
             else json.dumps(value, default=str)
             for value in values
         )
         for value in axes[key]:
             if axes[key].count(value) > 1:
-                raise InputError(f"--set {entry}: {value} is given twice")
+                raise InputError(f"{option} {entry}: {value} is given twice")
     return axes
 
 
@@ -79,7 +81,8 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     is reported before anything is computed.
 
     Raises:
-        InputError: a scenario, key or value is wrong, or two scenarios have the same name.
+        InputError: a scenario, key or value is wrong, two scenarios have the same name, or PyBullet
+            is not installed.
     """
     choices = ([(key, value) for value in values] for key, values in axes.items())
     combinations = list(itertools.product(*choices))
@@ -87,8 +90,10 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     names: dict[str, Path] = {}
     for path in paths:
         content = read_mapping(path)
-        first = (SweepRun(path, "", seeds[0], each, content) for each in combinations)
-        (name,) = {run.load().name for run in first}
+        loaded = [SweepRun(path, "", seeds[0], each, content).load() for each in combinations]
+        if any(isinstance(scenario, Simulation) for scenario in loaded):
+            require_pybullet()
+        (name,) = {scenario.name for scenario in loaded}
         if names.setdefault(name, path) != path:
             raise InputError(f"{path}: is named {name}, as {names[name]} is; names must differ")
         runs += [

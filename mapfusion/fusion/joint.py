@@ -21,7 +21,7 @@ from mapfusion.fusion.aligned_landmarks import (
     CandidatePairs,
     cluster_landmarks,
 )
-from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
+from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint_estimate import (
     JointEstimate,
     JointMap,

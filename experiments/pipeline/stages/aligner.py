@@ -26,10 +26,10 @@ from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Refinement
-from mapfusion.registration import EstimateVerifier, PairRegistration
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.registration import PairRegistration, VerifiedRefinement
+from mapfusion.verification.verdict import Verifier
 
 LABEL, WRITES = match.LABEL, match.WRITES[:1]
 _BATCHES_KEPT = 2  # batches in memory of a process: the present one and the next one
@@ -55,7 +55,7 @@ class AlignerSettings:
 def run(settings: AlignerSettings, job: Job) -> None:
     """Run the aligner at one batch of iterations on the correspondences of the match stage."""
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
-    judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
+    judge = Verifier(settings.acceptance, settings.evidence, settings.refinement)
     inputs = tuple(job.inputs.items())
     rows = []
     for k, verifier in _verifiers(inputs, job.part, judge, settings.iterations):
@@ -70,8 +70,8 @@ def run(settings: AlignerSettings, job: Job) -> None:
 
 @functools.lru_cache(maxsize=_BATCHES_KEPT)
 def _verifiers(
-    inputs: tuple[tuple[str, Path], ...], part: str, judge: Judge, iterations: tuple[int, ...]
-) -> Sequence[tuple[int, EstimateVerifier]]:
+    inputs: tuple[tuple[str, Path], ...], part: str, judge: Verifier, iterations: tuple[int, ...]
+) -> Sequence[tuple[int, VerifiedRefinement]]:
     """Return iterations of a batch with the data that complete an estimate of any aligner.
 
     Tasks of several aligners follow each other, so the last batches stay in memory. The name of a
@@ -84,5 +84,5 @@ def _verifiers(
     for k, map_a, map_b in match.pairs_of_maps(job, iterations):
         pairs = Pairs(map_a, map_b, correspondences_of(at_iteration(offered, k)))
         evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), judge.evidence)
-        verifiers.append((k, EstimateVerifier(pairs, judge.refinement, judge, evidence)))
+        verifiers.append((k, VerifiedRefinement(pairs, judge.refinement, judge, evidence)))
     return verifiers

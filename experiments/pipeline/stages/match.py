@@ -24,7 +24,7 @@ from mapfusion.align.refinement import Refinement
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters, ViewedMap
-from mapfusion.verification.verdict import Judge, why_not_sought
+from mapfusion.verification.verdict import Verifier, why_not_sought
 
 # Evaluated iterations per part: small enough that an interruption loses little and all cores end at
 # about the same time, large enough that reading the maps is fast compared to their alignment.
@@ -48,7 +48,7 @@ class MatchSettings:
 def run(settings: MatchSettings, job: Job) -> None:
     """Find correspondences and rival motions of one batch of iterations."""
     made, rivals = [], []
-    judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
+    judge = Verifier(settings.acceptance, settings.evidence, settings.refinement)
     for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
         pairs = match(map_a, map_b, settings.match)
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}

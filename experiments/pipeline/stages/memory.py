@@ -57,13 +57,18 @@ def require_memory(pipeline: Pipeline, jobs: int, machine_bytes: float | None = 
     """
     has = memory_bytes() if machine_bytes is None else machine_bytes
     need = max(needs(pipeline), key=lambda need: need.n_bytes)
-    wanted = jobs * (need.n_bytes + _PROCESS_BYTES)
+    wanted = jobs * process_bytes(pipeline)
     if wanted > has:
         processes = f" in each of {jobs} processes (--jobs 1 needs least)" if jobs > 1 else ""
         raise InputError(
             f"{need.setting}: {need.why} take about {need.n_bytes / _GB:.1f} GB{processes}, this "
             f"machine has {has / _GB:.1f} GB"
         )
+
+
+def process_bytes(pipeline: Pipeline) -> float:
+    """Return the memory of a process that does the largest task of a run, in bytes."""
+    return _PROCESS_BYTES + max(need.n_bytes for need in needs(pipeline))
 
 
 def needs(pipeline: Pipeline) -> Iterator[Need]:

@@ -27,16 +27,15 @@ from experiments.pipeline.stages import (
     smooth,
 )
 from experiments.pipeline.stages.faces import Walls
-from experiments.plugins.discovery import Kind, find_method, fingerprint
+from experiments.plugins.discovery import find_method, fingerprint
 from experiments.scenario.settings import AnyScenario, Recording, Scenario, Simulation
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section
 from mapfusion.errors import InputError
-from mapfusion.fusion.fused_map import name_order
-from mapfusion.fusion.fusers import FUSERS, target_of
+from mapfusion.fusion.fusers import FUSERS, name_order, target_of
 from mapfusion.robot_log import read_log
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.vision.front_end import FrontEndParameters
-from sim.renderer import renderer_name
+from sim.renderer import renderer_name, require_pybullet
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,8 @@ def build_pipeline(scenario: AnyScenario) -> Pipeline:
     """Return the stages of a scenario; names and lengths of recorded logs are read.
 
     Raises:
-        InputError: a recorded log cannot be read, or names of robots are invalid.
+        InputError: a recorded log cannot be read, names of robots are invalid, or a simulated
+            world cannot be driven because PyBullet is not installed.
     """
     recorded = isinstance(scenario, Recording)
     robots = tuple(_recorded(scenario) if recorded else _simulated(scenario))
@@ -135,6 +135,7 @@ def _stage(module: ModuleType, *sections: Section, own: dict[str, Any], **more: 
 
 def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
     """Yield the stages of simulated robots."""
+    require_pybullet()  # here rather than in a worker, after the first stages
     world, render, keep = scenario.world, scenario.render, scenario.keep
     lines = tuple(tuple(wall.points) for wall in world.walls)
     walls = Walls(lines, world.wall_height_m, world.wall_thickness_m)
@@ -241,16 +242,13 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
     estimates: dict[str, Stage] = {}
     for entry in scenario.align.aligners:
         method = find_method(entry.method)
-        module = method.target.partition(":")[0]
-        if method.kind is Kind.PLUG_IN:
-            module = "mapfusion.align"  # a plug-in may import any of its modules
         estimates[entry.name] = _stage(
             aligner,
             *(scenario, scenario.align, entry),
             own=own | {"origin": method.origin()},
             before=maps | {"match": matched},
             parts=parts,
-            loads=(module,),
+            loads=(method.own_module,),
             # fusing waits for the merging aligner only
             shares="" if entry.name == scenario.merge.aligner else f"estimates on {matched.key}",
         )

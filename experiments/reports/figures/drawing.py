@@ -301,6 +301,14 @@ def draw_all(
         return Drawing(pool, again=True).finish(result, on_progress)
 
 
+def remove_figures(result: Path) -> None:
+    """Remove the figures of an earlier run from a result folder."""
+    for name in FIGURES:
+        for picture in _pictures(result, name):
+            picture.unlink(missing_ok=True)
+    (result / "figures" / _RECORD).unlink(missing_ok=True)
+
+
 def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Drawn:
     """Draw one of `FIGURES` into a folder, by default `figures` in the folder of the result.
 

@@ -54,22 +54,15 @@ from experiments.reports.report.map_view import MAP_TABLES, map_figure
 from experiments.reports.study_files import claims_table
 from experiments.reports.terminal.run_screen import team_lines
 from experiments.scenario.settings import Bound
+from experiments.studies.comparison import natural_key
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
 from experiments.studies.paper_claims import SCENARIOS, compare_with_paper
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, install_command
 
 _SOURCE_DIGITS = 16
-
-
-def _natural(text: object) -> tuple[float, str]:
-    """Return a sorting key that puts 50 before 200."""
-    try:
-        return float(str(text)), ""
-    except ValueError:
-        return math.inf, str(text)
 
 
 def _provenance(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
@@ -112,7 +105,7 @@ def _provenance(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
     # Three or more consecutive whole numbers are written as `--seeds` takes them.
     shown: dict[str, str] = {}
     for name, different in values.items():
-        texts = sorted(different, key=_natural)
+        texts = sorted(different, key=natural_key)
         shown[name] = ", ".join(texts)
         if len(texts) > 2 and all(text.isdigit() for text in texts):
             first, last = int(texts[0]), int(texts[-1])
@@ -270,7 +263,7 @@ def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]
 
 def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield the runs of each scenario and setting with a label."""
-    ordered = sorted(configurations(spread), key=lambda each: [*map(_natural, each[0].values())])
+    ordered = sorted(configurations(spread), key=lambda each: [*map(natural_key, each[0].values())])
     for labels, rows in ordered:
         scenario = labels.pop("scenario")
         if scenario == ALL_SCENARIOS:
@@ -376,6 +369,6 @@ def templates() -> jinja2.Environment:
     )
     environment.globals |= {"text": formatting, "criteria": criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
-    environment.globals["gross_m"] = GROSS_M
+    environment.globals |= {"gross_m": GROSS_M, "install_command": install_command}
     environment.tests["nan"] = math.isnan
     return environment

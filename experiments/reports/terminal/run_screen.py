@@ -1,7 +1,9 @@
 """Screens of `run`, `check`, `align`, `merge` and `import`."""
 
 import math
+import shlex
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +22,19 @@ from experiments.evaluation.criteria import (
     merged_robots,
     methods_in,
     right_refined,
+    summarise_alignments,
 )
 from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.map_consistency import GROSS_M
 from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.result import renderer
+from experiments.evaluation.run_plan import RunPlan
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.evaluation.tables import SHOWN
 from experiments.evaluation.team_errors import is_used_by_team
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
-from experiments.reports.formatting import listed, two_digits
+from experiments.reports.formatting import listed, metres, percent, radians, two_digits
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
     columns,
@@ -38,10 +43,10 @@ from experiments.reports.terminal.layout import (
     print_skipped,
     print_table,
 )
-from experiments.studies.method_comparison import aligner_summary
+from experiments.studies.method_comparison import Recommendation, aligner_summary, recommend
 from experiments.studies.statistics import ROBOT_PAIR, error_bands
 from mapfusion.align.alignment import NOT_RUN, Status
-from mapfusion.fusion.fused_map import FusedMap
+from mapfusion.fusion.fusers import FusedMap
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.se2 import motion_sigma
 
@@ -84,8 +89,92 @@ def edge_lines(edges: pd.DataFrame) -> Iterator[str]:
 _SEEDS_SHOWN = 3  # one by one, in a table of checks
 
 
-def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
-    """Print the tables of a run, and the folders of tables and figures."""
+def print_plan(plan: RunPlan, results: Path, jobs: int) -> None:
+    """Print the tasks of a planned run, and an estimate of its time and memory."""
+    frames = sorted(set(plan.n_frames.values()))
+    n_frames = f"{frames[0]}" + (f" to {frames[-1]}" if len(frames) > 1 else "")
+    n_robots, source = len(plan.n_frames), renderer(plan.scenario)
+    shown = columns("", name="stage") | columns("d", finished="finished", to_do="to do")
+    shown |= columns(".1f", work_s="work, s")
+    basis = "typical rates of two cores; this machine may need half or twice as long"
+    if plan.n_earlier:
+        runs = "1 earlier run" if plan.n_earlier == 1 else f"{plan.n_earlier} earlier runs"
+        basis = f"the rates of {runs} in {results}"
+    processes = "1 process" if jobs == 1 else f"{jobs} processes"
+    memory_gb = jobs * plan.process_bytes / 1e9
+    print_frame(
+        pd.DataFrame(map(asdict, plan.stages)),
+        shown,
+        f"{plan.scenario.name}, seed {plan.scenario.seed}: {n_robots} robots, {n_frames} frames "
+        f"each; images: {source}",
+    )
+    print_lines(
+        [
+            f"Estimate: {plan.elapsed_s:.0f} s with {processes} ({plan.work_s:.0f} s of work), "
+            f"{memory_gb:.1f} GB of memory at most.",
+            f"  It uses {basis}. Nothing was run.",
+        ]
+    )
+
+
+def closing_lines(result: Path) -> tuple[str, str]:
+    """Return two lines: the method to use, and the command that opens the report."""
+    errors = tables.read(tables.table_path(result, "errors"), "errors")
+    if errors.empty:
+        advice = _advice_without_truth(result)
+    else:
+        timings = tables.read(tables.table_path(result, "aligner_timings"), "aligner_timings")
+        run = errors.assign(run_id="this", scenario="this", seed=0)
+        advice = method_advice(recommend(summarise_alignments(run), timings, methods_in(errors)))
+    return advice, f"Open the report: mapfusion report {shlex.quote(str(result))} --open"
+
+
+def method_advice(found: Recommendation) -> str:
+    """Say in one line which aligner to use, how accurate it was, and how sure that is."""
+    best, hint = found.best, "One run is a hint; a sweep over seeds decides."
+    if not found.n_common:
+        wrong = [standing.aligner for standing in found.standings if standing.n_false]
+        merged = f"but {listed(wrong)} accepted a wrong alignment" if wrong else "and all refused"
+        return f"Method to use: none. No two maps share ground, {merged}. {hint}"
+    if best is None:
+        tried = f"No method was right on the {found.n_common} pairs of maps with common ground."
+        return f"Method to use: none. {tried} {hint}"
+    name = best.aligner if found.reliable else f"none is reliable. The best is {best.aligner}"
+    how = (
+        f"It was right on {percent(best.rate)} of {best.n_maps} pairs of maps with common ground, "
+        f"median error {metres(best.refined_m)} and {radians(best.refined_rad)}"
+    )
+    if best.n_false:
+        how += f", but {best.n_false} of {best.n_accepted} accepted alignments were wrong"
+    elif not best.n_accepted:
+        how += ", but none of its alignments was accepted"
+    if found.equals:
+        verb = "does" if len(found.equals) == 1 else "do"
+        hint = f"{listed(found.equals)} {verb} as well as far as this run can tell. {hint}"
+    return f"Method to use: {name}. {how}. {hint}"
+
+
+def _advice_without_truth(result: Path) -> str:
+    """Say in one line which aligners' last alignments were accepted."""
+    estimates = tables.read(tables.table_path(result, "estimates"), "estimates")
+    if estimates.empty:
+        return "Method to use: unknown. There are no two maps to align."
+    last = at_the_end(estimates)
+    last = last[last["repetition"] == 0]
+    accepted = last.groupby("aligner", sort=False)["accepted"].agg(["sum", "count"])
+    n_pairs = int(accepted["count"].max())
+    most = accepted.index[accepted["sum"] == accepted["sum"].max()].tolist()
+    n_most = int(accepted["sum"].max())
+    if not n_most:
+        return "Method to use: unknown. No alignment was accepted, and no truth is known."
+    return (
+        f"Method to use: {listed(most)} had {n_most} of {n_pairs} pairs of maps accepted; "
+        "no truth is known, so errors are not."
+    )
+
+
+def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
+    """Print the tables of a run, and the folders of tables and figures; None: no figures."""
 
     def table(name: str) -> pd.DataFrame:
         return tables.read(tables.table_path(result, name), name)
@@ -139,8 +228,9 @@ def print_result(result: Path, skipped_figures: Sequence[str]) -> None:
     print_frame(times, shown, "Work by stage", note)
     told = team_lines(table("fused_motions"), table("team"), pairs)
     print_lines(f"  {line}" for line in (*told, *edge_lines(table("team_edges"))))
-    print_lines([f"Figures: {result / 'figures'}   tables: {result / 'tables'}"])
-    print_skipped(skipped_figures)
+    drawn = [] if skipped_figures is None else [f"Figures: {result / 'figures'}"]
+    print_lines(["   ".join([*drawn, f"Tables: {result / 'tables'}"])])
+    print_skipped(skipped_figures or ())
 
 
 def _print_smoother(rows: pd.DataFrame) -> None:

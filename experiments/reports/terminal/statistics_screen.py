@@ -20,7 +20,7 @@ from experiments.reports.formatting import interval, number
 from experiments.reports.terminal import layout
 from experiments.reports.terminal.layout import columns
 from experiments.studies import comparison
-from experiments.studies.intervals import FEW_RUNS, MAPS_OF_ONE_RUN
+from experiments.studies.intervals import FEW_RUNS, MAPS_OF_ONE_RUN, RUN
 from experiments.studies.statistics import ALL_SCENARIOS, Summary
 
 _MAX_CONFIGURATIONS = 6  # on the screen; the files have all
@@ -220,6 +220,7 @@ def print_comparison(
         "verdict", key=lambda names: names.map(order.index), kind="stable"
     )
     shown = [("method", ""), ("metric", ""), ("first", ">"), ("second", ">"), ("change", ">")]
+    shown.append(("better\nin", ">"))
     cells: list[list[str | Text]] = []
     for row in rows.to_dict("records"):
         value = {"share": ".0%"}.get(row["scale"], ".3g")
@@ -227,10 +228,13 @@ def print_comparison(
         is_same = row["verdict"] == comparison.SAME
         changed_by = interval(row["change"], row["low"], row["high"], change)
         texts = [row["method"], row["metric"], number(row["a"], value), number(row["b"], value)]
-        cells.append([*texts, "" if is_same else changed_by, Text(*_VERDICTS[row["verdict"]])])
+        counted = f"{row['n_better']} of {row['n_units']}"
+        texts += ["" if is_same else changed_by, counted]
+        cells.append([*texts, Text(*_VERDICTS[row["verdict"]])])
     title = "Second version against the first"
     note = "change: factor, or difference; (95 %, Student's t); verdict: 5 % over "
-    note += f"{table['p'].notna().sum()} tests"
+    note += f"{table['p'].notna().sum()} tests\nbetter in: number of "
+    note += "runs" if found.unit == RUN else found.unit
     layout.print_table([*shown, ("verdict", "")], cells, title, note)
     counts = table["verdict"].value_counts().reindex(order, fill_value=0)
     tally = (

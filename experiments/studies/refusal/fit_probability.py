@@ -26,8 +26,8 @@ from mapfusion.align.alignment import Pairs
 from mapfusion.files import write_whole
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.registration import Registration
 from mapfusion.verification import fitted
+from mapfusion.verification.registration import Registration
 
 # Pulls weights of scaled features towards 0: a kind of world may have none of a sign.
 _RIDGE = 1e-3
@@ -73,9 +73,9 @@ def _of_world(world: MappedWorld) -> list[tuple[Float, bool, str]]:
         for entry in settings.aligners:
             rng = generator(scenario.seed, "fit", world.name, a.name, b.name, k, entry.name)
             aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-            registration = Registration(aligner, settings.refinement, judge=None)
+            registration = Registration(aligner, settings.refinement, verifier=None)
             refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
-            verdict = judged.judge(refined)
+            verdict = judged.verify(refined)
             signs = judged.features(refined) if np.isfinite(verdict.probability) else None
             if signs is not None:
                 error = refined.T_a_b - case.T_true

@@ -19,7 +19,7 @@ from experiments.studies import refusal_cases
 from experiments.studies.refusal.fitting_command import worlds_asked_for
 from experiments.studies.refusal_cases import MappedWorld
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.oracle import Oracle
+from mapfusion.align.refinement import Oracle
 from mapfusion.files import write_whole
 from mapfusion.geometry.numerics import Float
 from mapfusion.verification import fitted_rates

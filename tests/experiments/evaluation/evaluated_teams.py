@@ -3,8 +3,7 @@
 from experiments.evaluation.alignment_errors import EvaluatedRobot
 from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.truth import PathTruth
-from mapfusion.fusion.fused_map import MergeParameters
-from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.fusers import MergeParameters, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.robot_log import RobotTruth
 from tests.mapfusion.fusion.drawn_maps import DrawnTeam

@@ -17,7 +17,7 @@ from experiments.plugins.discovery import callable_aligner, require_usable
 from experiments.plugins.isolated_process import end_children, process_for
 from experiments.scenario.seeds import generator
 from mapfusion.align.alignment import Alignment, Status
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 from tests.helpers.answered_here import answered_here
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again

@@ -401,7 +401,7 @@ def test_without_the_package_it_is_one_line(
 ) -> None:
     monkeypatch.setattr(result_export, "find_spec", lambda _: None)
     reply = command(capsys, "export", tiny_result, "--format", "rerun", "-o", tmp_path / "out")
-    assert_refused(reply, "rerun-sdk", "mapfusion[rerun]")
+    assert_refused(reply, "rerun-sdk", "mapfusion-bench[rerun]")
     assert not (tmp_path / "out").exists()
 
 

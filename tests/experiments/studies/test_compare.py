@@ -1,3 +1,4 @@
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -6,7 +7,7 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation.criteria import ERROR_COLUMNS
-from experiments.studies.comparison import BETTER, NOISE, SAME, WORSE, compare
+from experiments.studies.comparison import BETTER, NOISE, SAME, WORSE, compare, compare_values
 from experiments.studies.intervals import holm
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, write_json
@@ -167,6 +168,39 @@ def test_runs_are_matched_apart_from_a_setting_that_is_named(tmp_path: Path) -> 
     both = write_sweep(tmp_path / "d", seeds, [few, many])
     with pytest.raises(InputError, match=r"d: world seed 0 .* is there more than once"):
         compare(a, both, ["slam.particles"])
+
+
+def test_two_values_within_one_sweep_are_compared_as_two_sweeps(tmp_path: Path) -> None:
+    seeds, key = range(8), "slam.particles"
+    changed = {seed: scaled(0.5, "ransac")(seed, tables_of(seed)) for seed in seeds}
+    few, many = ({"drive.frames": "9", key: each} for each in ("50", "200"))
+    apart = [
+        write_sweep(tmp_path / "few", seeds, [few]),
+        write_sweep(tmp_path / "many", seeds, [many], made=changed),
+    ]
+    both = write_sweep(tmp_path / "both", seeds, [few, many], made=changed)
+    for file in (tmp_path / "few").glob("*/world-*-0.parquet"):  # few particles, unchanged
+        shutil.copy(file, both / file.parent.name)
+    within, expected = compare_values(both, key, "50", "200"), compare(*apart, [key])
+    pd.testing.assert_frame_equal(within.table, expected.table)
+    assert within.notes == expected.notes
+    assert (within.n_runs, within.unit) == (8, "run")
+    row = within.table.set_index(["metric", "method"]).loc[("estimated error, m", "ransac")]
+    assert (row["verdict"], row["n_better"], row["n_units"]) == (BETTER, 8, 8)
+    back = compare_values(both, key, "200", "50").table.set_index(["metric", "method"])
+    assert back.loc[("estimated error, m", "ransac"), "verdict"] == WORSE
+    for wrong, message in (
+        (
+            ("slam.particle", "50", "200"),
+            r"did not vary slam\.particle; it varied: slam\.particles",
+        ),
+        ((key, "50", "100"), r"no finished run has slam\.particles=100; there are: 50, 200$"),
+        (("drive.frames", "9", "10"), r"did not vary drive\.frames"),
+    ):
+        with pytest.raises(InputError, match=message):
+            compare_values(both, *wrong)
+    with pytest.raises(InputError, match="is one run"):
+        compare_values(write_result(tmp_path, 0, tables_of(0)), key, "50", "200")
 
 
 def test_other_settings_under_the_same_name_are_told(tmp_path: Path) -> None:

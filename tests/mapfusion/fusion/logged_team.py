@@ -7,7 +7,7 @@ import numpy as np
 
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.fused_map import AlignedPair, Component, FusedMap
+from mapfusion.fusion.fusers import AlignedPair, Component, FusedMap
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap

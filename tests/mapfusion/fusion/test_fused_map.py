@@ -2,7 +2,7 @@
 
 import pytest
 
-from mapfusion.fusion.fused_map import name_order
+from mapfusion.fusion.fusers import name_order
 
 
 @pytest.mark.parametrize(

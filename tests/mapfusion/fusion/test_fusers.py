@@ -54,9 +54,9 @@ def test_others_are_found_and_ours_come_first() -> None:
     [
         (
             "from mapfusion.fuse.component import Component",
-            "mapfusion.fuse.component is now mapfusion.fusion.fused_map",
+            "mapfusion.fuse.component is now mapfusion.fusion.fusers",
         ),
-        ("import mapfusion.fused_map", "mapfusion.fused_map is now mapfusion.fusion.fused_map"),
+        ("import mapfusion.fused_map", "mapfusion.fused_map is now mapfusion.fusion.fusers"),
         ("from mapfusion import se2", "mapfusion.se2 is now mapfusion.geometry.se2"),
     ],
 )

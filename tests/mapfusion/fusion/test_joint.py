@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import FusedMap, MergeParameters
+from mapfusion.fusion.fusers import FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.fusion.joint_estimate import JointMap, estimate_jointly
 from mapfusion.fusion.kalman import KalmanDrift

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapfusion.fusion.fused_map import MergeParameters
+from mapfusion.fusion.fusers import MergeParameters
 from mapfusion.fusion.kalman import KalmanAsPrinted
 from mapfusion.fusion.kalman import kalman_update as fuse
 from mapfusion.fusion.kalman import kalman_update_as_printed as fuse_as_printed
