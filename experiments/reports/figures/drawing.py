@@ -304,7 +304,7 @@ def draw_all(
 def remove_figures(result: Path) -> None:
     """Remove the figures of an earlier run from a result folder."""
     for name in FIGURES:
-        for picture in _pictures(result, name):
+        for picture in _files(result, name):
             picture.unlink(missing_ok=True)
     (result / "figures" / _RECORD).unlink(missing_ok=True)
 
