@@ -17,6 +17,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 from scipy.spatial import KDTree
 
+from experiments.evaluation.loop_closures import WINDOW_FRAMES, loop_closures
 from experiments.pipeline.tables import unpacked
 from experiments.reports.figures import floor_plan as plan
 from experiments.reports.figures.result_tables import (
@@ -57,27 +58,29 @@ _ROBOT_MARKERS = ("*", "^", "v", "x", "d")
 
 
 def draw_two_maps(data: ResultTables) -> Figure:
-    """Draw landmarks with ellipses, both paths and the last particles of two unaligned maps."""
-    robots = [robot for robot in data.robots if len(data.landmarks_of(robot)[0])][:2]
-    if not robots:
-        raise NothingToDraw("no robot has a landmark in its map")
+    """Draw landmarks with ellipses, both paths and the particles of two unaligned maps.
+
+    If one robot has closed a loop while another has not, the maps are those of this time.
+    """
+    robots, k, about = choose_two_maps(data)
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
+    figure.set_label(about)
     panels = figure.subplots(1, len(robots), squeeze=False)[0]
-    particles: dict[str, Float] = {}  # of the last iteration, shape (M, 2)
-    for robot in robots:
-        clouds = data.of_robot("clouds", robot)
-        last = clouds["iteration"] == clouds["iteration"].max()
-        particles[robot] = clouds.loc[last, ["x_m", "y_m"]].to_numpy()
-    extent_m = min(
-        float(np.ptp(data.landmarks_of(robot)[0][:, :2], axis=0).max()) for robot in robots
-    )
+    clouds = data.table("clouds")
+    stored = clouds.loc[clouds["iteration"] <= k, "iteration"].max()
+    now = clouds[clouds["iteration"] == stored]
+    particles: dict[str, Float] = {
+        robot: now.loc[now["robot"] == robot, ["x_m", "y_m"]].to_numpy() for robot in robots
+    }
+    maps = {robot: data.plan_at(robot, k) for robot in robots}
+    extent_m = min(float(np.ptp(maps[robot][0], axis=0).max()) for robot in robots)
     widest_m = max(
         (float(np.ptp(p, axis=0).max()) for p in particles.values() if len(p)), default=0
     )
     magnification = plan.magnification(extent_m, widest_m)
     for axes, robot in zip(panels, robots, strict=True):
-        position, covariance = data.landmarks_of(robot)
-        path, colour, own = data.path_of(robot), data.colours[robot], particles[robot]
+        position, covariance = maps[robot]
+        path, colour, own = data.path_of(robot)[: k + 1], data.colours[robot], particles[robot]
         walls = plan.start_plan(axes, data, robot)
         points = {"marker": ".", "markersize": 1.5, "color": colour, "zorder": 2}
         plan.add_points(axes, position, label="landmarks", **points)
@@ -86,22 +89,58 @@ def draw_two_maps(data: ResultTables) -> Figure:
         axes.plot(*path.T, color=GRAY, label="path of the best particle", zorder=3)
         if len(smoothed := data.smoothed_path_of(robot)):
             line = {"color": BLACK, "linewidth": 0.5, "zorder": 4}
-            axes.plot(*smoothed.T, label="path of the smoother", **line)
+            axes.plot(*smoothed[: k + 1].T, label="path of the smoother", **line)
         start = {"linestyle": "none", "marker": "o", "color": BLACK}
         axes.plot(0, 0, label="start pose, the map's frame", **start)
         mean = own.mean(axis=0) if len(own) else 0.0
         points = {"marker": ".", "markersize": 2.5, "markeredgewidth": 0, "color": BLACK}
-        label = "particles at the end"
+        label = f"particles at k = {stored}"
         label += f", spread x{magnification}" if magnification > 1 else ""
         plan.add_points(axes, mean + magnification * (own - mean), label=label, zorder=5, **points)
         plan.add_frame(axes)
         n_landmarks = plan.set_view(axes, position, path, walls)
-        axes.set_title(f"{robot}: {n_landmarks}\n({data.sightings})")
+        axes.set_title(f"{robot}, k = {k}: {n_landmarks}\n({data.sightings})")
     plan.set_one_scale(panels)
     handles, _ = panels[0].get_legend_handles_labels()
     handles.insert(1, plan.ellipse_handle(data.colours[robots[0]]))
     plan.finish_plans(figure, panels, handles, 3)
     return figure
+
+
+def choose_two_maps(data: ResultTables) -> tuple[list[str], int, str]:
+    """Return two robots, an evaluated iteration, and what the caption says about their loops.
+
+    The first robot has closed a loop and the second has not, at the first evaluated iteration for
+    which this holds, a window after the closure. Else the first two robots at the end are chosen.
+
+    Raises:
+        NothingToDraw: no robot has a landmark.
+    """
+    history = data.table("map_history")
+    robots = [robot for robot in data.robots if (history["robot"] == robot).any()]
+    if not robots:
+        raise NothingToDraw("no robot has a landmark in its map")
+    last = int(history["iteration"].max())
+    if not data.has("sightings"):
+        return robots[:2], last, "The result was made before loop closures were stored."
+    closed_at: dict[str, int] = {}
+    for closure in loop_closures(data.rows("sightings"), data.table("robots")):
+        closed_at.setdefault(closure.robot, closure.iteration)
+    evaluated = np.sort(history["iteration"].unique())
+    for robot, closed in sorted(closed_at.items(), key=lambda each: each[1]):
+        later = evaluated[evaluated >= closed + WINDOW_FRAMES]
+        open_robots = [
+            name
+            for name in robots
+            if len(later) and name != robot and closed_at.get(name, last + 1) > later[0]
+        ]
+        if open_robots:
+            other = open_robots[0]
+            about = f"{robot} has closed a loop at k = {closed}, {other} has not closed one yet."
+            return [robot, other], int(later[0]), about
+    named = [f"{name} at k = {k}" for name, k in closed_at.items()]
+    told = f"First loop closures: {', '.join(named)}." if named else "No robot closes a loop."
+    return robots[:2], last, told
 
 
 def draw_correspondences(data: ResultTables) -> Figure:
