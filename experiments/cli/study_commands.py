@@ -275,9 +275,13 @@ def paper(
     from experiments.studies import paper_claims
     from experiments.studies.benchmark import run_benchmark
     from experiments.studies.run_tables import find_runs
+    from mapfusion.errors import InputError
 
     require_folder(output, paths)
-    values = paper_claims.compare_with_paper(find_runs(paths))
+    values = paper_claims.compare_with_paper([find_runs(path) for path in paths])
+    if values.empty:
+        wanted = " or ".join(paper_claims.SCENARIOS)
+        raise InputError(f"{', '.join(map(str, paths))}: no run of the scenario {wanted}")
     folder = output or results / "study-paper"
     require_folder(folder)
     with layout.progress() as show:

@@ -9,7 +9,7 @@ Measures read the tables of results only.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -43,6 +43,7 @@ from experiments.studies.benchmark import (
 )
 from experiments.studies.intervals import RUN, Clusters, median_interval
 from experiments.studies.run_tables import Runs
+from mapfusion.errors import InputError
 from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, schema
 
 SCENARIOS = ("paper_as_printed", "paper")
@@ -785,37 +786,39 @@ def verdict(claim: Claim, value: float, low: float, high: float) -> Verdict:
     return Verdict.REFUTED if high < first or low > last else Verdict.PARTLY
 
 
-def compare_with_paper(runs: Runs) -> pd.DataFrame:
-    """Return the table of claims (VALUES) for runs of the scenarios in SCENARIOS.
+def compare_with_paper(sources: Sequence[Runs]) -> pd.DataFrame:
+    """Return the table of claims (VALUES) for the runs of the scenarios in SCENARIOS.
 
     Runs of other scenarios are left out.
+
+    Raises:
+        InputError: a run of one scenario, seed and renderer was given twice.
     """
-    rows = {name: runs.read(name) for name in _TABLES if runs.has(name)}
-    described = runs.described
-    groups = list(_groups(described.assign(renderer=described["run_id"].map(runs.renderers))))
-    tables = {run: TablesOfRun(rows, run) for *_, run_ids in groups for run in run_ids}
+    groups: dict[tuple[str, str], dict[str, TablesOfRun]] = {}
+    for runs in sources:
+        described = runs.described[runs.described["scenario"].isin(SCENARIOS)]
+        rows = {name: runs.read(name) for name in _TABLES if len(described) and runs.has(name)}
+        for run_id, scenario in zip(described["run_id"], described["scenario"], strict=True):
+            renderer = runs.renderers[run_id]
+            group = groups.setdefault((scenario, renderer), {})
+            if run_id in group:
+                raise InputError(f"run {run_id}: was given twice with the renderer {renderer}")
+            group[run_id] = TablesOfRun(rows, run_id)
+    ordered = sorted(groups, key=lambda key: (SCENARIOS.index(key[0]), key[1]))
     found = []
     for claim in CLAIMS:
         about = {"name": claim.name, "where": claim.where, "claim": claim.text}
         about |= {"measure": claim.measure, "unit": claim.unit, "why": claim.why}
         about |= dict(zip(("confirms_from", "confirms_to"), claim.confirms, strict=True))
-        for scenario, renderer, run_ids in groups:
-            values = np.array([_value(claim, tables[run]) for run in run_ids])
+        for scenario, renderer in ordered:
+            values = np.array([_value(claim, of) for of in groups[scenario, renderer].values()])
             known = values[~np.isnan(values)]
             clusters = Clusters(np.arange(len(known)), len(known), RUN)
             interval = median_interval(known, clusters, generator(0, "paper claims", claim.name))
-            of = {"scenario": scenario, "renderer": renderer, "n_runs": len(known)}
+            of_group = {"scenario": scenario, "renderer": renderer, "n_runs": len(known)}
             judged = {"verdict": str(verdict(claim, *interval))}
-            found.append(about | of | interval.columns("value") | judged)
+            found.append(about | of_group | interval.columns("value") | judged)
     return pd.DataFrame(found, columns=pd.Index(VALUES.names))
-
-
-def _groups(described: pd.DataFrame) -> Iterator[tuple[str, str, Sequence[str]]]:
-    """Yield scenario, renderer and runs, in the order of SCENARIOS."""
-    for scenario in SCENARIOS:
-        own = described[described["scenario"] == scenario]
-        for renderer, rows in own.groupby("renderer", sort=True):
-            yield scenario, str(renderer), rows["run_id"].tolist()
 
 
 def _value(claim: Claim, of: TablesOfRun) -> float:

@@ -236,7 +236,7 @@ def _claims(runs: Runs) -> list[dict[Any, Any]]:
     """Return the table of the paper's claims for runs of the paper's experiment; else nothing."""
     if not set(SCENARIOS) & set(runs.described["scenario"]):
         return []
-    return claims_table(compare_with_paper(runs)).to_dict("records")
+    return claims_table(compare_with_paper([runs])).to_dict("records")
 
 
 def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]:
