@@ -50,7 +50,7 @@ def refusal(
     from experiments.scenario.seeds import parse_seeds
     from experiments.studies import refusal_rates, refusal_trial
     from experiments.studies.refusal_cases import worlds_of
-    from experiments.studies.refusal_rates import judged_answers, reliability
+    from experiments.studies.refusal_rates import answers_with_probability, reliability
     from experiments.studies.refusal_trial import PairsDrawn
 
     require_folder(output, worlds)
@@ -61,7 +61,7 @@ def refusal(
     study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
     kinds = refusal_rates.by_kind(refusals)
     study_screen.print_kinds(kinds)
-    answers = judged_answers(refusals)
+    answers = answers_with_probability(refusals)
     held = reliability(answers, np.random.default_rng(0)) if len(answers) else None
     if held is not None:
         study_screen.print_reliability(held)

@@ -7,19 +7,10 @@ from pydantic import BaseModel, ValidationError
 
 from experiments.evaluation.tables import table_path
 from experiments.pipeline.store import FileEntry, require_unchanged
-from experiments.scenario.settings import Bound
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.files import read_json, require_version
 
 RESULT_SCHEMA_VERSION = 1
-
-
-class _ResolvedScenario(BaseModel):
-    name: str
-    seed: int
-    description: str = ""
-    expect: dict[str, Bound] = {}
-    merge: dict[str, Any] = {}
 
 
 class _World(BaseModel):
@@ -36,6 +27,15 @@ class _Provenance(BaseModel):
 
 def read_scenario(path: Path) -> dict[str, Any]:
     """Return `scenario.json` of a result; raises DamagedFileError."""
+    from experiments.scenario.settings import Bound  # imports all methods
+
+    class _ResolvedScenario(BaseModel):
+        name: str
+        seed: int
+        description: str = ""
+        expect: dict[str, Bound] = {}
+        merge: dict[str, Any] = {}
+
     return _checked(path, "resolved scenario", _ResolvedScenario)
 
 

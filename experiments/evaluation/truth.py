@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
@@ -83,8 +83,8 @@ def common_landmarks(points_a: Float, points_b: Float, radius_m: float) -> int:
     known_a, known_b = (own[np.isfinite(own).all(axis=1)] for own in (points_a, points_b))
     if not len(known_a) or not len(known_b):
         return 0
-    distance, nearest_b = KDTree(known_b).query(known_a)
-    _, nearest_a = KDTree(known_a).query(known_b)
+    distance, nearest_b = scipy.spatial.KDTree(known_b).query(known_a)
+    _, nearest_a = scipy.spatial.KDTree(known_a).query(known_b)
     mutual = np.asarray(nearest_a)[nearest_b] == np.arange(len(known_a))
     return int(np.sum(mutual & (distance <= radius_m)))
 

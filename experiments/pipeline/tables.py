@@ -7,22 +7,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 
-from mapfusion.align.alignment import Alignment, Status
-from mapfusion.align.correspondences import Correspondences
 from mapfusion.files import covariances_from, read_table, schema, write_table
-from mapfusion.geometry.numerics import Float
-from mapfusion.landmark_map import LandmarkMap
-from mapfusion.verification.false_alarms import Verdict
-from mapfusion.verification.likelihood import TwinShares
-from mapfusion.verification.regions import EvidenceParameters
-from mapfusion.verification.rivals import RepeatedLandmarks
-from mapfusion.verification.verdict import PairEvidence, RivalMotion
 
+# Commands that only read tables are quicker without pandas and the library's methods.
 if TYPE_CHECKING:
     import pandas as pd
+
+    from mapfusion.align.alignment import Alignment
+    from mapfusion.align.correspondences import Correspondences
+    from mapfusion.geometry.numerics import Float
+    from mapfusion.landmark_map import LandmarkMap
+    from mapfusion.verification.false_alarms import Verdict
+    from mapfusion.verification.regions import EvidenceParameters
+    from mapfusion.verification.verdict import PairEvidence
 
 
 TEXT, INT, FLOAT, BOOL = pa.string(), pa.int32(), pa.float64(), pa.bool_()
@@ -175,6 +174,9 @@ def covariances_of(rows: pd.DataFrame) -> Float:
 
 def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
     """Return the refined alignment of a row of `estimates`, with the status of the verdict."""
+    from mapfusion.align.alignment import Alignment, Status
+    from mapfusion.verification.false_alarms import Verdict
+
     covariance = np.empty((3, 3))
     covariance[_UPPER] = covariance.T[_UPPER] = [row[name] for name in COVARIANCE]
     sureness, reason = row["log10_false_alarms"], row["acceptance_reason"]
@@ -209,6 +211,10 @@ def evidence_of(
     rows: pd.DataFrame, maps: Sequence[LandmarkMap], parameters: EvidenceParameters
 ) -> PairEvidence:
     """Return the evidence in rows of `rivals` of one pair and iteration; empty without rows."""
+    from mapfusion.verification.likelihood import TwinShares
+    from mapfusion.verification.rivals import RepeatedLandmarks
+    from mapfusion.verification.verdict import PairEvidence, RivalMotion
+
     n_a, n_b = map(len, maps)
     motions = tuple(
         RivalMotion(
@@ -232,6 +238,8 @@ def evidence_of(
 
 def correspondences_of(rows: pd.DataFrame) -> Correspondences:
     """Return the correspondences in rows of one pair and iteration."""
+    from mapfusion.align.correspondences import Correspondences
+
     return Correspondences(
         rows["index_a"].to_numpy(dtype=np.int64),
         rows["index_b"].to_numpy(dtype=np.int64),

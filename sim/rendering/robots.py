@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull
+import scipy
 
 from mapfusion.geometry.numerics import Float, kernel
 from sim.rendering.walls import Pinhole, VisibleWalls, inverse_depths
@@ -118,7 +118,7 @@ def _shape(visual: ElementTree.Element, place_m: Float) -> tuple[Float, _Hull]:
         radius, half_m = float(cylinder.attrib["radius"]), float(cylinder.attrib["length"]) / 2
         corners = _cylinder_corners(radius, half_m)
     # edges between two triangles, seen from outside with the first triangle to the left
-    hull = ConvexHull(corners)
+    hull = scipy.spatial.ConvexHull(corners)
     a, b, c = np.moveaxis(corners[hull.simplices], 1, 0)
     normals = hull.equations[:, :3]
     turned = np.sum(np.cross(b - a, c - a) * normals, axis=1) < 0

@@ -140,7 +140,7 @@ def test_renderers_and_scenarios_have_their_own_medians_over_runs() -> None:
     ]
     assert own["value"].tolist() == pytest.approx([0.03, 0.05, 0.05])
     assert own["n_runs"].tolist() == [1, 9, 1]
-    low, high = own.loc["paper", "raycast"][["value_low", "value_high"]]
+    low, high = (own[name].tolist()[1] for name in ("value_low", "value_high"))
     assert 0.01 <= low < 0.05 < high <= 0.09
     assert own["value_low"].isna().tolist() == [True, False, True]
     with pytest.raises(InputError, match="run paper-5: was given twice with the renderer tiny"):
@@ -164,7 +164,8 @@ def value_rows() -> pd.DataFrame:
 
 
 def test_a_cell_has_verdict_value_and_interval() -> None:
-    printed, _ = value_rows().to_dict("records")
+    records: Any = value_rows().to_dict("records")
+    printed, _ = records
     assert claim_text(printed) == "**refuted**: 2.6 (1.5 to 6.1)"
     assert claims_table(value_rows()).columns.tolist() == [
         "claim",
