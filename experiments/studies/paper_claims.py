@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import KDTree
+import scipy
 
 from experiments.evaluation.criteria import (
     MERGEABLE_PAIRS,
@@ -190,7 +190,7 @@ def _sigma_by_distance(of: TablesOfRun) -> float:
     paths, correlations = of("paths"), []
     for robot, own in of("landmarks").groupby("robot"):
         path = paths.loc[paths["robot"] == robot, ["final_x_m", "final_y_m"]].to_numpy()
-        nearest_m, _ = KDTree(path).query(own[POSITION_FIELDS[:2]].to_numpy())
+        nearest_m, _ = scipy.spatial.KDTree(path).query(own[POSITION_FIELDS[:2]].to_numpy())
         correlations.append(_rank_correlation(pd.Series(nearest_m), _sigma_m(own)))
     return float(np.median(correlations))
 

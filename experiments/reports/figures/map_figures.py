@@ -417,9 +417,8 @@ def choose_zoom(position_m: Float, covariance_m2: Float) -> Zoom:
     middle = (low + high) / 2
     some = np.unique(np.linspace(0, len(middle) - 1, _MAX_CANDIDATES).round().astype(int))
     count = min(_ZOOM_LANDMARKS, len(middle))
-    near = np.reshape(
-        scipy.spatial.KDTree(middle).query(middle[some], k=count)[1], (len(some), count)
-    )
+    tree = scipy.spatial.KDTree(middle)
+    near = np.reshape(tree.query(middle[some], k=count)[1], (len(some), count))
     ends = low[near].min(axis=1), high[near].max(axis=1)
     side = _ZOOM_MARGIN * (ends[1] - ends[0]).max(axis=1)
     corner = (ends[0] + ends[1] - side[:, None]) / 2
@@ -430,7 +429,7 @@ def choose_zoom(position_m: Float, covariance_m2: Float) -> Zoom:
     # Ellipses that overlap are hard to tell apart: the size of an ellipse over the distance to the
     # nearest neighbour, median over the neighbours.
     extent = (high - low).max(axis=1)
-    apart = KDTree(middle).query(middle[near], k=min(2, len(middle)))[0].reshape(*near.shape, -1)
+    apart = tree.query(middle[near], k=min(2, len(middle)))[0].reshape(*near.shape, -1)
     overlap = np.median(extent[near] / np.maximum(apart[..., -1], _LEAST_DISTANCE_M), axis=1)
     best = int(np.argmin(n_cut + side / np.median(side) + overlap))
     return Zoom(corner[best], float(side[best]), whole[best], int(n_cut[best]))
