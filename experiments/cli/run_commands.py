@@ -34,7 +34,7 @@ def run(
     be used.
     """
     from experiments.cli.options import require_result_folder
-    from experiments.evaluation.checks import load_checked
+    from experiments.evaluation.metrics import load_checked
     from experiments.scenario.suite import scenarios_of
 
     require_result_folder(output)
@@ -152,7 +152,7 @@ def check(
     scenario cannot be run. No scenario runs if one of them cannot be read.
     """
     from experiments.cli.options import DOCUMENT, JUNIT, require_file
-    from experiments.evaluation.checks import CheckedScenario, check_all
+    from experiments.evaluation.metrics import CheckedScenario, check_all
     from experiments.reports import json_document
     from experiments.reports.junit import write_junit
     from experiments.reports.terminal import layout, run_screen

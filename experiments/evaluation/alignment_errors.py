@@ -1,139 +1,36 @@
-"""Errors of alignments: the table `errors`."""
+"""Errors of alignments: the table `errors`, and the stage that evaluates the alignments of a pair."""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from experiments.evaluation import tables
 from experiments.evaluation.criteria import COMMON_LANDMARKS, ORACLE
+from experiments.evaluation.fused_landmarks import MergeSettings, fusion_rows
 from experiments.evaluation.truth import (
-    PathTruth,
+    EvaluatedRobot,
+    MapPair,
     common_landmarks,
+    join_map_pairs,
+    load_robot,
     squared_mahalanobis,
-    true_pairs,
 )
-from experiments.pipeline.stages.match import latest_at
-from experiments.pipeline.tables import (
-    MOTION,
+from experiments.pipeline.stage import Job, StageKind
+from experiments.pipeline.stages.align import (
     alignment_of,
-    correspondences_of,
     estimate_row,
     evidence_of,
-    records,
 )
+from experiments.pipeline.stages.slam import folders_of_both
+from experiments.pipeline.tables import MOTION
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.oracle import Oracle
-from mapfusion.fusion.fused_map import AlignedPair
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.verdict import Judge
-
-_MAP_PAIR = ["robot_a", "robot_b", "iteration"]
-
-
-@dataclass(frozen=True)
-class EvaluatedRobot:
-    """Maps of one robot with the truth.
-
-    Attributes:
-        name: name of the robot.
-        maps: maps by iteration.
-        points_world_m: true points of the landmarks of each map, shape (N, 3).
-        path: true path.
-    """
-
-    name: str
-    maps: Mapping[int, LandmarkMap]
-    points_world_m: dict[int, Float]
-    path: PathTruth
-
-    def at(self, iteration: int) -> tuple[LandmarkMap, Float]:
-        """Return map and true points at an iteration; the last ones if the log ended earlier."""
-        return latest_at(self.maps, iteration), latest_at(self.points_world_m, iteration)
-
-    def in_map_frame(self, points_world_m: Float) -> Float:
-        """Transform world points (..., 3) into the frame of this robot's maps."""
-        return se2.transform_points(se2.inverse(self.path.T_world_map), points_world_m)
-
-
-@dataclass(frozen=True)
-class MapPair:
-    """Maps of two robots at one iteration, with correspondences and estimates.
-
-    Attributes:
-        a: first robot.
-        b: second robot.
-        iteration: iteration of the maps.
-        maps: maps of a and b.
-        points_world_m: true points of their landmarks, shapes (N, 3) and (M, 3).
-        offered: correspondences that all aligners were given.
-        estimates: rows of the table `estimates`.
-        rivals: rows of the table `rivals`: other motions that align the maps as well.
-    """
-
-    a: EvaluatedRobot
-    b: EvaluatedRobot
-    iteration: int
-    maps: tuple[LandmarkMap, LandmarkMap]
-    points_world_m: tuple[Float, Float]
-    offered: Correspondences
-    estimates: Sequence[Mapping[str, Any]]
-    rivals: pd.DataFrame
-
-    @property
-    def keys(self) -> dict[str, Any]:
-        """Values of the columns that identify this pair of maps."""
-        return dict(zip(_MAP_PAIR, (self.a.name, self.b.name, self.iteration), strict=True))
-
-    def is_true(self, radius_m: float) -> np.ndarray:
-        """Return, shape (N,), True for correspondences of the same world point."""
-        pairs = self.offered
-        return true_pairs(*self.points_world_m, pairs.index_a, pairs.index_b, radius_m)
-
-    def aligned(self, aligner: str, a: int, b: int) -> AlignedPair:
-        """Return the alignment that a merge uses: the first repetition of an aligner.
-
-        Args:
-            aligner: name of the aligner.
-            a: index of the first map among the maps that are merged.
-            b: index of the second map.
-        """
-        rows = (row for row in self.estimates if row["aligner"] == aligner)
-        row = next(row for row in rows if row["repetition"] == 0)
-        alignment = alignment_of(row, len(self.offered))
-        return AlignedPair(a, b, alignment, self.offered, row["log10_false_alarms"])
-
-
-def join_map_pairs(
-    robots: Sequence[EvaluatedRobot],
-    estimates: pd.DataFrame,
-    correspondences: pd.DataFrame,
-    rivals: pd.DataFrame,
-) -> list[MapPair]:
-    """Return all pairs of maps of the tables `estimates`, `correspondences` and `rivals`.
-
-    The order is that of `estimates`.
-    """
-    by_name = {robot.name: robot for robot in robots}
-    offered, rival = (dict(iter(rows.groupby(_MAP_PAIR))) for rows in (correspondences, rivals))
-    estimated: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
-    for row in records(estimates):  # much faster than `groupby` for many small groups
-        estimated.setdefault((row["robot_a"], row["robot_b"], row["iteration"]), []).append(row)
-    map_pairs = []
-    for key, rows in estimated.items():
-        name_a, name_b, iteration = key
-        a, b = by_name[name_a], by_name[name_b]
-        (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
-        pairs = correspondences_of(offered.get(key, correspondences.iloc[:0]))
-        maps, points = (map_a, map_b), (points_a, points_b)
-        others = rival.get(key, rivals.iloc[:0])
-        map_pairs.append(MapPair(a, b, iteration, maps, points, pairs, rows, others))
-    return map_pairs
 
 
 def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> Float:
@@ -213,3 +110,32 @@ def first_shared_iteration(robots: Sequence[EvaluatedRobot], radius_m: float) ->
             if common_landmarks(a, b, radius_m) >= COMMON_LANDMARKS:
                 return k
     return None
+
+
+# Tables of the stage `align`, in the order of the arguments of `join_map_pairs`.
+ALIGNED = ("estimates", "correspondences", "rivals")
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """Settings of the evaluation of alignments."""
+
+    judge: Judge
+    merge: MergeSettings
+    true_pair_radius_m: float
+
+
+def run_evaluation(settings: EvaluationSettings, job: Job) -> None:
+    """Write the pair's `errors.parquet` and `fusion.parquet`."""
+    robots = [load_robot(folders) for folders in folders_of_both(job)]
+    aligned = [tables.read(job.inputs["align"] / f"{name}.parquet", name) for name in ALIGNED]
+    map_pairs, radius_m = join_map_pairs(robots, *aligned), settings.true_pair_radius_m
+    errors = pd.concat([error_rows(pair, settings.judge, radius_m) for pair in map_pairs])
+    tables.write(job.output / "errors.parquet", "errors", errors)
+    fusion = fusion_rows(map_pairs, settings.merge, radius_m)
+    tables.write(job.output / "fusion.parquet", "fusion", fusion)
+
+
+EVALUATION_STAGE = StageKind(
+    "judge", "compare with the truth", run_evaluation, ("errors.parquet", "fusion.parquet")
+)

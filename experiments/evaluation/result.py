@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import fused_landmarks, tables
-from experiments.evaluation.alignment_errors import EvaluatedRobot
+from experiments.evaluation.alignment_errors import ALIGNED
 from experiments.evaluation.evaluated_run import TABLES_PART, EvaluatedRun, finding_rows
 from experiments.evaluation.fused_landmarks import (
     FusedTeam,
@@ -26,13 +26,22 @@ from experiments.evaluation.fused_landmarks import (
     map_history_rows,
     true_pair_rows,
 )
-from experiments.evaluation.fused_map_errors import EvaluatedFusion, coverage_rows
-from experiments.evaluation.pair_evaluation import ALIGNED
-from experiments.evaluation.path_errors import path_statistics_rows, robot_paths
-from experiments.evaluation.result_files import RESULT_SCHEMA_VERSION, require_tables
-from experiments.evaluation.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
-from experiments.evaluation.team_errors import team_pair_rows, team_rows
-from experiments.pipeline.code_version import library_versions
+from experiments.evaluation.map_errors import (
+    EvaluatedFusion,
+    SmoothedRobot,
+    coverage_rows,
+    smoothed_path_rows,
+    smoother_rows,
+)
+from experiments.evaluation.path_errors import (
+    path_statistics_rows,
+    robot_paths,
+    team_pair_rows,
+    team_rows,
+)
+from experiments.evaluation.tables import RESULT_SCHEMA_VERSION, require_tables
+from experiments.evaluation.truth import EvaluatedRobot
+from experiments.pipeline.stage import library_versions
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
 from experiments.pipeline.stages.smooth import map_files, read_smoothed_path

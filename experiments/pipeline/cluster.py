@@ -21,7 +21,7 @@ import dask.config
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
-from experiments.pipeline.code_version import library_versions, source_hash, use_kernel_cache
+from experiments.pipeline.stage import library_versions, source_hash, use_kernel_cache
 from experiments.pipeline.workers import blocked_interrupts, describe_defect
 from mapfusion.errors import DamagedFileError, InputError
 

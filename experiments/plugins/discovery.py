@@ -16,11 +16,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from experiments.plugins.isolated_process import (
-    IsolatedAligner,
-    ProcessFailedError,
-    process_for,
-)
+from experiments.plugins.isolated_process import IsolatedAligner, ProcessFailedError, process_for
 from mapfusion.align.aligners import ALIGNERS, PEERS, construct
 from mapfusion.errors import did_you_mean
 from mapfusion.registration import Aligner, as_aligner

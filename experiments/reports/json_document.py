@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.checks import CheckedScenario
+from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.pipeline.tables import COVARIANCE, MOTION
 from experiments.reports.export import write_text

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from experiments.evaluation.checks import CheckedScenario
+from experiments.evaluation.metrics import CheckedScenario
 from experiments.reports.formatting import plain
 from mapfusion.files import write_whole
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.pipeline.tables import alignment_of
+from experiments.pipeline.stages.align import alignment_of
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.reports.figures.style import FUSED_COLOUR
 from mapfusion.errors import InputError

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pandas as pd
 
 from experiments.evaluation.criteria import has_common_ground, merged_robots, right_refined
-from experiments.evaluation.team_errors import is_used_by_team
+from experiments.evaluation.path_errors import is_used_by_team
 from experiments.reports.formatting import listed, two_digits
 from mapfusion.fusion.team_graph import EdgeStatus
 

@@ -29,10 +29,9 @@ from experiments.evaluation.criteria import (
     right_refined,
     setting_columns,
 )
-from experiments.evaluation.fused_map_errors import last_fused
-from experiments.evaluation.path_errors import path_rms
-from experiments.evaluation.result_files import read_scenario
-from experiments.evaluation.team_errors import is_used_by_team
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.path_errors import is_used_by_team, path_rms
+from experiments.evaluation.tables import read_scenario
 from experiments.studies import intervals
 from experiments.studies.error_bands import ROBOT_PAIR
 from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN

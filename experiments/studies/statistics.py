@@ -19,9 +19,8 @@ from experiments.evaluation.criteria import (
     with_common_ground_at_any_time,
 )
 from experiments.evaluation.fused_landmarks import mean_nees_band
-from experiments.evaluation.fused_map_errors import last_fused
-from experiments.evaluation.path_errors import STATISTICS
-from experiments.evaluation.team_errors import is_used_by_team
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.path_errors import STATISTICS, is_used_by_team
 from experiments.scenario.seeds import generator
 from experiments.studies import intervals
 from experiments.studies.error_bands import ROBOT_PAIR, error_bands, medians_of_run, time_bands

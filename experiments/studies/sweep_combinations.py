@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.evaluation.checks import load_checked
+from experiments.evaluation.metrics import load_checked
 from experiments.scenario.settings import AnyScenario
 from experiments.scenario.yaml_files import parse_value, read_mapping
 from mapfusion.errors import InputError

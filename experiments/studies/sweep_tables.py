@@ -30,7 +30,7 @@ from pydantic import BaseModel, ValidationError
 
 from experiments.evaluation import tables
 from experiments.evaluation.criteria import absolute_errors, answerable
-from experiments.pipeline.code_version import library_versions, source_hash
+from experiments.pipeline.stage import library_versions, source_hash
 from experiments.pipeline.tables import FLOAT, TEXT, fields
 from experiments.studies.sweep_combinations import SweepRun
 from mapfusion.errors import DamagedFileError, InputError, StoreRepairWarning

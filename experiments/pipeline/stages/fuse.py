@@ -13,8 +13,9 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.pipeline.stage import Job
-from experiments.pipeline.stages import match
+from experiments.pipeline.stage import Job, StageKind
+from experiments.pipeline.stages import align
+from experiments.pipeline.stages.align import alignment_of, correspondences_of
 from experiments.pipeline.stages.slam import RobotFolders, log_as_filtered, stored_maps
 from experiments.pipeline.stages.smooth import (
     log_until,
@@ -29,8 +30,6 @@ from experiments.pipeline.tables import (
     FLOAT,
     INT,
     TEXT,
-    alignment_of,
-    correspondences_of,
     covariances_of,
     fields,
     read_rows,
@@ -56,7 +55,6 @@ from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.smoother.joint_smoothing import AssociatedLog
 from mapfusion.smoother.smooth import SmootherParameters
 
-LABEL = "fuse the maps"
 WRITES = ("landmarks.parquet", "parents.parquet", "motions.parquet", "map.parquet")
 _OF = {"iteration": INT, "component": INT}  # component 1 has the most robots
 LANDMARKS = schema("fuse.landmarks", 1, [*fields(**_OF, count=INT), *point_fields()])
@@ -128,6 +126,9 @@ def run(settings: FuseSettings, job: Job) -> dict[str, float]:
     return times
 
 
+FUSE_STAGE = StageKind("fuse", "fuse the maps", run, WRITES)
+
+
 def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTeam]]:
     """Yield each iteration with the maps to be fused and their alignments."""
     takes_smoothed = make_fuser(settings.fuser).smoothed
@@ -173,8 +174,8 @@ class _Alignments:
 
     def __init__(self, settings: FuseSettings, job: Job, name_a: str, name_b: str) -> None:
         self._a, self._b = (settings.robots.index(name) for name in (name_a, name_b))
-        self._offered = match.read_batches(job.inputs[f"match {name_a} {name_b}"], CORRESPONDENCES)
-        rows = match.read_batches(job.inputs[f"aligner {name_a} {name_b}"], ESTIMATES)
+        self._offered = align.read_batches(job.inputs[f"match {name_a} {name_b}"], CORRESPONDENCES)
+        rows = align.read_batches(job.inputs[f"aligner {name_a} {name_b}"], ESTIMATES)
         self._rows = rows[rows["repetition"] == 0].sort_values("iteration")
 
     def at(self, iteration: int) -> AlignedPair | None:

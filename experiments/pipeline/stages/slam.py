@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.pipeline.stage import Job
+from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows
 from experiments.scenario.seeds import generator
 from mapfusion.attitude import read_attitude
@@ -66,7 +66,6 @@ FINDINGS = schema(
 # Path of the most probable particle at each evaluated iteration, from which its map was computed.
 PATHS = schema("slam.paths", 1, [*fields(evaluated=INT), *_ITERATION, *float_fields(POSE_FIELDS)])
 
-LABEL = "FastSLAM"
 WRITES = (
     "snapshots.parquet",
     "associations.parquet",
@@ -152,6 +151,9 @@ def run(settings: SlamSettings, job: Job) -> None:
     gate = gate_finding(log, counted)
     findings = [*found.findings, *([] if gate is None else [gate])]
     write_findings(job.output, findings, found.jumps)
+
+
+SLAM_STAGE = StageKind("slam", "FastSLAM", run, WRITES)
 
 
 def write_findings(slam: Path, findings: Sequence[Finding], jumps: Sequence[Jump]) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from experiments.pipeline.stage import Job
+from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages.slam import (
     Associations,
     evaluated_iterations,
@@ -45,7 +45,6 @@ PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIEL
 # Observations whose landmark differs from that of the filter.
 PARTED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
 
-LABEL = "smooth the logs"
 WRITES = ("parted_{part}.parquet", "path_{part}.parquet")
 # Further files of a smoothed log; `PATH` tells if it was smoothed.
 _MAP_FILES = (
@@ -107,6 +106,9 @@ def run(settings: SmoothSettings, job: Job) -> None:
     rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
     attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
     write_table(_path_path(job.output, job.part), rows, PATH, attributes)
+
+
+SMOOTH_STAGE = StageKind("smooth", "smooth the logs", run, WRITES)
 
 
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:

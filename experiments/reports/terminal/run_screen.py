@@ -10,7 +10,6 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.evaluation import tables
-from experiments.evaluation.checks import CheckedScenario
 from experiments.evaluation.criteria import (
     ANSWERABLE_PAIRS,
     ORACLE,
@@ -18,8 +17,9 @@ from experiments.evaluation.criteria import (
     at_the_end,
     methods_in,
 )
-from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.map_consistency import GROSS_M
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.path_errors import path_rms
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.evaluation.tables import SHOWN

@@ -15,13 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.checks import load_checked
 from experiments.evaluation.criteria import MERGEABLE_PAIRS
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.pair_evaluation import load_robot
+from experiments.evaluation.metrics import load_checked
 from experiments.evaluation.result import require_result
-from experiments.evaluation.truth import common_landmarks, true_pairs
+from experiments.evaluation.truth import EvaluatedRobot, common_landmarks, load_robot, true_pairs
 from experiments.pipeline.stages.slam import RobotFolders, evaluated_iterations, stored_maps
 from experiments.pipeline.store import Store
 from experiments.scenario.seeds import parse_seeds

@@ -8,19 +8,16 @@ import pandas as pd
 import pytest
 from scipy.stats import chi2
 
-from experiments.evaluation import aligner_timing
-from experiments.evaluation.aligner_timing import AlignerTiming
+from experiments.evaluation import alignment_errors
 from experiments.evaluation.alignment_errors import (
-    EvaluatedRobot,
-    MapPair,
+    AlignerTiming,
     alignment_nees,
     error_rows,
     first_shared_iteration,
-    join_map_pairs,
 )
 from experiments.evaluation.path_errors import robot_paths
-from experiments.evaluation.truth import PathTruth
-from experiments.pipeline.tables import alignment_of, estimate_row, unpacked
+from experiments.evaluation.truth import EvaluatedRobot, MapPair, PathTruth, join_map_pairs
+from experiments.pipeline.stages.align import alignment_of, estimate_row, unpacked
 from mapfusion.align.alignment import Alignment, Status, degenerate
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.geometry import se2
@@ -275,7 +272,7 @@ def test_compilation_does_not_count_and_first_and_last_maps_do(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clocks = {"icp": Clockwork(), "svd": Clockwork()}
-    monkeypatch.setattr(aligner_timing, "callable_aligner", lambda method, *_: clocks[method])
+    monkeypatch.setattr(alignment_errors, "callable_aligner", lambda method, *_: clocks[method])
     evaluate = SimpleNamespace(timing_points=3, timing_repeats=11, true_pair_radius_m=0.1)
     entries = [
         SimpleNamespace(name=name, method=name, parameters={}, time_limit_s=1.0) for name in clocks

@@ -2,7 +2,7 @@ import math
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from experiments.evaluation.checks import CheckedScenario, Outcome
+from experiments.evaluation.metrics import CheckedScenario, Outcome
 from experiments.reports.junit import write_junit
 from experiments.scenario.settings import Bound
 

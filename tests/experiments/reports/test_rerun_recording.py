@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.pipeline.tables import alignment_of
+from experiments.pipeline.stages.align import alignment_of
 from experiments.reports import rerun_recording
 from experiments.reports.figures.result_tables import ResultTables, of_pair
 from tests.helpers.tiny_scenario import assert_refused, command

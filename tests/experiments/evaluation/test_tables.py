@@ -1,4 +1,4 @@
-"""A result folder is whole: every table that the run wrote is there, by one version, of one run."""
+"""Tests of `experiments.evaluation.tables`."""
 
 import json
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import pytest
 
 from experiments.evaluation import tables
 from experiments.evaluation.result import require_result
-from experiments.evaluation.result_files import read_provenance, read_scenario, read_world
+from experiments.evaluation.tables import read_provenance, read_scenario, read_world
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.reports.report.document import contents_of
 from experiments.reports.result_export import export_result
