@@ -1,4 +1,4 @@
-"""Errors of alignments: the table `errors`, and the stage that evaluates the alignments of a pair."""
+"""Errors of alignments: the table `errors`, and the stage that evaluates pairs of robots."""
 
 import itertools
 from collections.abc import Sequence
