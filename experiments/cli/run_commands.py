@@ -153,8 +153,7 @@ def check(
     """
     from experiments.cli.options import DOCUMENT, JUNIT, require_file
     from experiments.evaluation.metrics import CheckedScenario, check_all
-    from experiments.reports import json_document
-    from experiments.reports.junit import write_junit
+    from experiments.reports import export
     from experiments.reports.terminal import layout, run_screen
     from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.settings import AnyScenario
@@ -176,10 +175,10 @@ def check(
                 options.print_to_stderr(checked.error)
         if not as_json:
             run_screen.print_checks(checks)
-        json_document.publish("check", json_document.of_checks(checks), as_json, output)
+        export.publish_json("check", export.check_document(checks), as_json, output)
     finally:
         if junit is not None:
-            write_junit(junit, checks)
+            export.write_junit(junit, checks)
     if not all(check.passed for check in checks):
         is_bad = any(check.error for check in checks)
         raise typer.Exit(options.EXIT_BAD_INPUT if is_bad else options.EXIT_FAILED)

@@ -59,7 +59,7 @@ def slam(
     """
     from experiments.cli.options import require_map_file
     from experiments.evaluation import single_steps as single
-    from experiments.reports import json_document
+    from experiments.reports import export
     from experiments.reports.terminal import layout
     from experiments.scenario.suite import settings_of
 
@@ -69,8 +69,8 @@ def slam(
         made = single.slam(log, settings, show)
     landmarks = made.landmarks
     single.save_map(output, landmarks)
-    told = json_document.of_map(output, log, settings.seed, landmarks, made.findings)
-    json_document.publish("slam", told, as_json)
+    told = export.map_document(output, log, settings.seed, landmarks, made.findings)
+    export.publish_json("slam", told, as_json)
     if not as_json:
         layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
     for finding in made.findings:
@@ -95,7 +95,7 @@ def align(
     """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`."""
     from experiments.cli.options import DOCUMENT, require_file
     from experiments.evaluation import single_steps as single
-    from experiments.reports import json_document
+    from experiments.reports import export
     from experiments.reports.terminal.run_screen import print_estimates, print_verdict
     from experiments.scenario.suite import settings_of
 
@@ -106,8 +106,8 @@ def align(
         rows.append(row)
         if not as_json:
             print_verdict(row)
-    found = json_document.of_alignment((map_a, map_b), settings.seed, rows)
-    json_document.publish("align", found, as_json, output)
+    found = export.alignment_document((map_a, map_b), settings.seed, rows)
+    export.publish_json("align", found, as_json, output)
     if not as_json:
         print_estimates(rows)
 
@@ -128,7 +128,7 @@ def merge(
     """
     from experiments.cli.options import require_map_file
     from experiments.evaluation import single_steps as single
-    from experiments.reports import json_document
+    from experiments.reports import export
     from experiments.reports.terminal.run_screen import print_fused, print_unmerged
     from experiments.scenario.suite import settings_of
 
@@ -136,8 +136,8 @@ def merge(
     settings = settings_of(scenario, overrides, seed)
     merged = single.merge(maps, settings)
     paths = single.save_fused(output, merged)
-    found = json_document.of_fusion(paths, settings.seed, merged, maps)
-    json_document.publish("merge", found, as_json)
+    found = export.fusion_document(paths, settings.seed, merged, maps)
+    export.publish_json("merge", found, as_json)
     if not paths:
         if not as_json:
             print_unmerged(merged, maps)

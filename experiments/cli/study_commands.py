@@ -46,18 +46,18 @@ def refusal(
     from experiments.reports.study_files import draw_refusals, write_kinds
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.seeds import parse_seeds
-    from experiments.studies.refusal import rates, refusal_trial
-    from experiments.studies.refusal.cases import worlds_of
-    from experiments.studies.refusal.rates import judged_answers, reliability
-    from experiments.studies.refusal.refusal_trial import PairsDrawn
+    from experiments.studies import refusal_rates, refusal_trial
+    from experiments.studies.refusal_cases import worlds_of
+    from experiments.studies.refusal_rates import judged_answers, reliability
+    from experiments.studies.refusal_trial import PairsDrawn
 
     require_folder(output, worlds)
     mapped, drawn = worlds_of(worlds, parse_seeds(seeds), results), PairsDrawn(pairs, every)
     with layout.progress() as show:
         false_alarms = refusal_trial.run(mapped, output, drawn, jobs, show)
     refusals, calibration = (refusal_trial.read(output, name) for name in refusal_trial.TABLES)
-    study_screen.print_refusals(rates.summary(refusals), false_alarms)
-    kinds = rates.by_kind(refusals)
+    study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
+    kinds = refusal_rates.by_kind(refusals)
     study_screen.print_kinds(kinds)
     answers = judged_answers(refusals)
     held = reliability(answers, np.random.default_rng(0)) if len(answers) else None
@@ -252,7 +252,7 @@ def independence(
     from experiments.scenario.loading import load_scenario
     from experiments.scenario.seeds import parse_seeds
     from experiments.scenario.suite import one_scenario
-    from experiments.studies.independence import independence_trial
+    from experiments.studies import independence_trial
 
     require_folder(output, [scenario])
     path = one_scenario(scenario)
@@ -280,7 +280,7 @@ def calibrate(
     """Calibrate and correct odometry of logs: `mapfusion study calibrate raw/robot* -o logs`."""
     from experiments.cli.options import require_folder
     from experiments.evaluation.single_steps import calibrate_logs
-    from experiments.reports import json_document
+    from experiments.reports import export
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of
 
@@ -290,6 +290,6 @@ def calibrate(
         found = calibrate_logs(logs, output, settings, show)
     written = [] if output is None else [output / each.robot for each in found.robots]
     made = study_screen.document(found, written)
-    json_document.publish("calibrate", made, as_json)
+    export.publish_json("calibrate", made, as_json)
     if not as_json:
         study_screen.print_calibration(found, written)

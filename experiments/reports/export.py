@@ -1,16 +1,33 @@
-"""Tables as CSV, Markdown and LaTeX, and the page that documents the columns of all files."""
+"""Output files: tables as CSV, Markdown and LaTeX, JSON documents, JUnit reports.
 
+Units are in the names. Unknown values are null. A refused estimate is null and has a `reason`. An
+infinite median error (most answers have no estimate) is null too.
+"""
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 
 from experiments.evaluation import tables
+from experiments.evaluation.metrics import CheckedScenario
+from experiments.evaluation.single_steps import MergeResult, final_status
+from experiments.pipeline.tables import COVARIANCE, MOTION
+from experiments.reports.formatting import plain
 from experiments.reports.inspect import unit_of
 from mapfusion import attitude, landmark_map, robot_log, viewing
+from mapfusion.align.alignment import Status
+from mapfusion.datasets.log_consistency import Finding
 from mapfusion.files import write_whole
 from mapfusion.geometry.joint_covariance import RANK
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.tables import HEIGHT, default_of, description_of
 
 _SIGNIFICANT_DIGITS = 4  # in Markdown and LaTeX; CSV files have all digits
@@ -94,21 +111,199 @@ def page(text: str) -> str:
                 absent = "required"
             else:
                 absent = "none" if np.isnan(default) else f"{default:g}"
-            lines.append(_row(field.name, field.type, absent, description_of(field)))
+            lines.append(_column_row(field.name, field.type, absent, description_of(field)))
     lines.append("\n## A result: `RESULT/tables/*.parquet`\n")
     lines.append(
         "`experiments/evaluation/tables.py` describes the rows. All columns are present.\n"
     )
     lines += ["| table | column | type | unit |", "|---" * 4 + "|"]
     for name, schema in tables.ALL.items():
-        lines += [f"| {name} {_row(field.name, field.type)}" for field in schema]
+        lines += [f"| {name} {_column_row(field.name, field.type)}" for field in schema]
     return "\n".join([*lines, ""])
 
 
-def _row(name: str, kind: pa.DataType, *more: str) -> str:
+def _column_row(name: str, kind: pa.DataType, *more: str) -> str:
     shown = f"{kind.list_size} × {kind.value_type}" if pa.types.is_fixed_size_list(kind) else kind
     return "| " + " | ".join([f"`{name}`", str(shown), unit_of(name), *more]) + " |"
 
 
 if __name__ == "__main__":
     write_text(PAGE, page(PAGE.read_text(encoding="utf-8")))
+
+
+JSON_SCHEMA_VERSION = 1
+_AXES = ("xx_m2", "xy_m2", "xt_m_rad", "yy_m2", "yt_m_rad", "tt_rad2")  # in the order of COVARIANCE
+
+
+def publish_json(
+    kind: str, content: Mapping[str, Any], shown: bool, path: Path | None = None
+) -> None:
+    """Print the document of a command if it is shown, and write it if there is a path."""
+    document = {"schema_version": JSON_SCHEMA_VERSION, "kind": kind} | _json_able(content)
+    text = json.dumps(document, indent=1, allow_nan=False) + "\n"
+    if path is not None:
+        write_text(path, text)
+    if shown:
+        sys.stdout.write(text)
+
+
+def _json_able(value: Any) -> Any:
+    """Convert a value to types of JSON; NaN and infinite values become None."""
+    if isinstance(value, pd.DataFrame):
+        return _json_able(value.to_dict("records"))
+    if isinstance(value, Mapping):
+        return {str(name): _json_able(held) for name, held in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_able(held) for held in value]
+    if isinstance(value, np.generic):
+        return _json_able(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _motion(values: Iterable[float]) -> dict[str, float] | None:
+    """Return the components of a motion by name; None if one is NaN."""
+    found = {str(name): float(x) for name, x in zip(MOTION, values, strict=True)}
+    return None if any(map(math.isnan, found.values())) else found
+
+
+def _covariance(upper: Iterable[float]) -> dict[str, float]:
+    """Return the covariance of a motion by name, from its upper half row by row."""
+    return {f"cov_{axes}": float(x) for axes, x in zip(_AXES, upper, strict=True)}
+
+
+def alignment_document(
+    maps: Sequence[Path], seed: int, rows: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return the document of `align`: T_a_b of every aligner, from one row each."""
+    aligners = []
+    for row in rows:
+        status, reason = final_status(row)
+        accepted, estimated = status is Status.ACCEPTED, row["status"] == Status.ACCEPTED
+        refined = {name: row[f"refined_{name}"] for name in MOTION}
+        refined |= _covariance([row[name] for name in COVARIANCE])
+        refined |= {"drift_sigma_m": row["drift_sigma_m"]}
+        answer = {"aligner": row["aligner"], "status": status, "reason": reason or None}
+        answer |= {"estimated": _motion([row[name] for name in MOTION]) if estimated else None}
+        answer |= {"estimated_status": row["status"], "estimated_reason": row["reason"] or None}
+        answer |= {"refined": refined if accepted else None}
+        numbers = ("n_inliers", "n_correspondences", "log10_false_alarms", "log10_evidence")
+        numbers += ("n_confirmed", "n_contradicted", "probability", "elapsed_s")
+        aligners.append(answer | {name: row[name] for name in numbers})
+    return {"map_a": maps[0], "map_b": maps[1], "seed": seed, "aligners": aligners}
+
+
+def map_document(
+    path: Path, log: Path, seed: int, landmarks: LandmarkMap, findings: Sequence[Finding] = ()
+) -> dict[str, Any]:
+    """Return the document of `slam`: the map and the findings about the log."""
+    observed = [
+        {
+            "check": finding.kind,
+            "iteration": finding.frame if finding.frame >= 0 else None,
+            "finding": finding.text,
+        }
+        for finding in findings
+    ]
+    found = {"robot": landmarks.name, "n_landmarks": len(landmarks), "findings": observed}
+    return {"log": log, "seed": seed, "map": path} | found
+
+
+def fusion_document(
+    paths: Sequence[Path], seed: int, merged: MergeResult, maps: Sequence[Path]
+) -> dict[str, Any]:
+    """Return the document of `merge`: the largest fused map, and the others.
+
+    `T_first_map` is null for a map that was left out. Without `paths` nothing was merged, and `map`
+    is null.
+    """
+    pairs = [
+        {"map_a": maps[a], "map_b": maps[b], "merged": not reason, "reason": reason or None}
+        for (a, b), reason in merged.reasons().items()
+    ]
+    documents: list[dict[str, Any]] = []
+    for path, fused in zip(paths or [None], merged.fusion.fused, strict=True):
+        reasons = (reason for _, reason in fused.left_out)
+        sources = []
+        for name, T, S in zip(maps, fused.T_first_map, fused.motion_covariance, strict=True):
+            motion = _motion(T)
+            covariance = _covariance(S[np.triu_indices(3)]) if motion else None
+            reason = None if motion else next(reasons)
+            source = {"map": name, "T_first_map": motion, "covariance": covariance}
+            sources.append(source | {"reason": reason})
+        several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
+        found = {"n_landmarks": len(fused.landmarks), "n_fused_of_several": several}
+        found |= {"duplicate_share": fused.duplicate_share}
+        documents.append({"map": path, "maps": sources} | found)
+    first, *others = documents
+    if not paths:
+        first |= {"n_landmarks": 0, "n_fused_of_several": 0, "duplicate_share": None}
+    return {"seed": seed, **first, "others": others, "pairs": pairs}
+
+
+def check_document(checks: Sequence[CheckedScenario]) -> dict[str, Any]:
+    """Return the document of `check`: expected and measured values, and failed runs."""
+    scenarios = []
+    for check in checks:
+        outcomes = [
+            {"metric": each.metric, "value": each.value, "min": each.bound.min}
+            | {"max": each.bound.max, "passed": each.passed, "by_seed": each.per_seed}
+            for each in check.outcomes
+        ]
+        scenario = {
+            "scenario": check.scenario,
+            "passed": check.passed,
+            "error": check.error or None,
+        }
+        scenario |= {"merged_nothing": list(check.unmerged)}
+        scenarios.append(scenario | {"elapsed_s_by_seed": check.elapsed_s, "outcomes": outcomes})
+    return {"passed": all(each.passed for each in checks), "scenarios": scenarios}
+
+
+def write_junit(path: Path, checks: Sequence[CheckedScenario]) -> None:
+    """Write one suite for each scenario, with a case for each run and for each expectation."""
+    root = ET.Element("testsuites", name="mapfusion check")
+    for check in checks:
+        suite = ET.SubElement(root, "testsuite", name=plain(check.scenario))
+        seeds = list(check.elapsed_s)
+        for seed in seeds or [None]:
+            elapsed_s = check.elapsed_s.get(seed, 0.0) if seed is not None else 0.0
+            case = _add_case(
+                suite, check, "run" if seed is None else f"run, seed {seed}", elapsed_s
+            )
+            if check.error and seed == (seeds[-1] if seeds else None):
+                ET.SubElement(case, "error", message=plain(check.error))
+            elif seed is None:
+                ET.SubElement(case, "skipped", message="another scenario cannot be read")
+            elif seed in check.unmerged:
+                ET.SubElement(case, "failure", message=check.unmerged[seed].text)
+        for outcome in check.outcomes:
+            case = _add_case(suite, check, outcome.metric)
+            by_seed = ", ".join(f"{seed}: {value:.4g}" for seed, value in outcome.per_seed.items())
+            text = f"{outcome.value:.6g}, expected {outcome.bound_text}; by seed {by_seed}"
+            if outcome.passed:
+                ET.SubElement(case, "system-out").text = text
+            else:
+                ET.SubElement(case, "failure", message=text)
+        _add_totals(suite)
+    _add_totals(root)
+    document = ET.ElementTree(root)
+    write_whole(path, lambda file: document.write(file, encoding="utf-8", xml_declaration=True))
+
+
+def _add_case(
+    suite: ET.Element, check: CheckedScenario, name: str, elapsed_s: float = 0.0
+) -> ET.Element:
+    """Add a test case to a suite."""
+    named = {"classname": plain(check.scenario), "name": name}
+    return ET.SubElement(suite, "testcase", named, time=f"{elapsed_s:.3f}")
+
+
+def _add_totals(node: ET.Element) -> None:
+    """Count cases, failures and seconds of the elements below."""
+    cases = list(node.iter("testcase"))
+    node.set("tests", str(len(cases)))
+    for plural, tag in (("failures", "failure"), ("errors", "error"), ("skipped", "skipped")):
+        node.set(plural, str(sum(case.find(tag) is not None for case in cases)))
+    node.set("time", f"{sum(float(case.get('time', 0)) for case in cases):.3f}")

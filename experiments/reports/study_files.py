@@ -15,22 +15,21 @@ from experiments.evaluation.tables import table_path
 from experiments.pipeline.stage import library_versions
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, write_rows
 from experiments.plugins.discovery import find_method
-from experiments.reports.export import to_markdown, write_tables, write_text
+from experiments.reports.export import publish_json, to_markdown, write_tables, write_text
 from experiments.reports.figures import study_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
-from experiments.reports.json_document import publish
 from experiments.reports.terminal.statistics_screen import print_summary
 from experiments.scenario.settings import AnyScenario
 from experiments.studies.benchmark import SIGMA_M, SIZE_M, SUMMARY, TRIALS, BenchmarkDesign
-from experiments.studies.independence.independence_trial import (
+from experiments.studies.independence_trial import (
     COSTS,
     STRATEGIES,
     TEAMS,
     Independence,
     at_the_end,
 )
-from experiments.studies.refusal.rates import (
+from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,
     Reliability,
@@ -64,7 +63,9 @@ def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = F
     if as_json:
         contents = {"n_runs": summary.n_runs, "n_configurations": summary.n_configurations}
         contents |= {"missing_tables": summary.missing, "failed_runs": summary.failed}
-        publish("statistics", contents | {"written": output, "tables": summary.tables}, shown=True)
+        publish_json(
+            "statistics", contents | {"written": output, "tables": summary.tables}, shown=True
+        )
     else:
         print_summary(summary, output, skipped)
 

@@ -33,9 +33,9 @@ from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.path_errors import is_used_by_team, path_rms
 from experiments.evaluation.tables import read_scenario
 from experiments.studies import intervals
-from experiments.studies.error_bands import ROBOT_PAIR
 from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.studies.run_tables import RunPath, Runs, find_runs, match_names
+from experiments.studies.statistics import ROBOT_PAIR
 from mapfusion.errors import InputError
 
 EACH_METHOD = "each method"  # fusers too

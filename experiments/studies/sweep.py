@@ -1,13 +1,14 @@
 """Sweep: run all combinations of settings and seeds on all cores or a cluster."""
 
 import itertools
+import json
 import pickle
 import shutil
 import tempfile
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence, Sized
+from collections.abc import Callable, Collection, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -27,16 +28,76 @@ from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded
 from experiments.scenario.suite import scenarios_of
-from experiments.studies.sweep_combinations import SweepRun, parse_axes, runs_of
+from experiments.scenario.yaml_files import parse_value, read_mapping
 from experiments.studies.sweep_tables import (
     ALIGNER_TIMINGS,
     RUN_TIMES,
     JoinedTables,
     SweepDataset,
+    SweepRun,
     locked_folder,
 )
 from mapfusion.errors import InputError
 from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whole
+
+_EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
+_FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
+
+# Values of each dotted key, as YAML in one spelling (0.10 is 0.1).
+Axes = Mapping[str, tuple[str, ...]]
+
+
+def parse_axes(entries: Sequence[str]) -> Axes:
+    """Parse `--set KEY=VALUE,VALUE,...`; raises InputError that shows the correct form."""
+    axes: dict[str, tuple[str, ...]] = {}
+    for entry in entries:
+        key, _, listed = entry.partition("=")
+        if not key or not listed.strip():
+            raise InputError(f"--set {entry}: {_EXPECTED}")
+        if key in _FIXED:
+            raise InputError(f"--set {entry}: {key} cannot be set here; use {_FIXED[key]}")
+        if key in axes:
+            raise InputError(f"--set {key}: given twice; write its values as {key}=A,B")
+        values = parse_value(f"[{listed}]", f"--set {entry}: {_EXPECTED}")
+        # Text stays as it is unless YAML would read another type; everything else becomes JSON.
+        axes[key] = tuple(
+            value
+            if isinstance(value, str) and parse_value(value, "--set") == value
+            else json.dumps(value, default=str)
+            for value in values
+        )
+        for value in axes[key]:
+            if axes[key].count(value) > 1:
+                raise InputError(f"--set {entry}: {value} is given twice")
+    return axes
+
+
+def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[SweepRun]:
+    """Return all combinations; runs that share many stages follow each other.
+
+    Each scenario file is read once. It is loaded with every combination of values, so a wrong value
+    is reported before anything is computed.
+
+    Raises:
+        InputError: a scenario, key or value is wrong, or two scenarios have the same name.
+    """
+    choices = ([(key, value) for value in values] for key, values in axes.items())
+    combinations = list(itertools.product(*choices))
+    runs: list[SweepRun] = []
+    names: dict[str, Path] = {}
+    for path in paths:
+        content = read_mapping(path)
+        first = (SweepRun(path, "", seeds[0], each, content) for each in combinations)
+        (name,) = {run.load().name for run in first}
+        if names.setdefault(name, path) != path:
+            raise InputError(f"{path}: is named {name}, as {names[name]} is; names must differ")
+        runs += [
+            SweepRun(path, name, *each, content) for each in itertools.product(seeds, combinations)
+        ]
+    if len({run.run_id for run in runs}) < len(runs):
+        raise InputError("--set: two combinations of values have the same hash; split the sweep")
+    return runs
+
 
 _LONGEST_NAME = 80
 _TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")

@@ -11,13 +11,14 @@ file is always replaced as a whole: readers never find half a file or the rows o
 """
 
 import fcntl
+import hashlib
 import json
 import os
 import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,10 @@ from pydantic import BaseModel, ValidationError
 
 from experiments.evaluation import tables
 from experiments.evaluation.criteria import absolute_errors, answerable
+from experiments.evaluation.metrics import load_checked
 from experiments.pipeline.stage import library_versions, source_hash
 from experiments.pipeline.tables import FLOAT, TEXT, fields
-from experiments.studies.sweep_combinations import SweepRun
+from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import DamagedFileError, InputError, StoreRepairWarning
 from mapfusion.files import (
     read_json,
@@ -43,6 +45,7 @@ from mapfusion.files import (
     write_whole,
 )
 
+_HASH_LENGTH = 8  # hexadecimal digits of a run's values: 32 bits, and clashes are refused
 SCHEMA_VERSION = 3  # since 3 the row groups of a file are those of `joined_tables`
 RUNS, RUN_TIMES, ALIGNER_TIMINGS = "runs", "run_times", "aligner_timings"
 Rows = pd.DataFrame | list[dict[str, Any]]
@@ -60,6 +63,39 @@ _OWN_FIELDS = {
     # elapsed_s, or its part rendering_s. Only this table and `aligner_timings` contain times.
     RUN_TIMES: fields(stage=TEXT, key=TEXT, figure=TEXT, seconds=FLOAT),
 }
+
+
+@dataclass(frozen=True)
+class SweepRun:
+    """One run of a sweep.
+
+    Attributes:
+        path: file of the scenario.
+        scenario: its name.
+        seed: of the run.
+        settings: key and value of each `--set`.
+        content: content of the file when the sweep began, one object for all runs of a scenario.
+            So a later change of the file does not change the runs.
+    """
+
+    path: Path
+    scenario: str
+    seed: int
+    settings: tuple[tuple[str, str], ...] = ()
+    content: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    @property
+    def run_id(self) -> str:
+        """Name of the run; the same scenario, seed and values give the same name."""
+        if not self.settings:
+            return f"{self.scenario}-{self.seed}"
+        digest = hashlib.sha256(json.dumps(sorted(self.settings)).encode()).hexdigest()
+        return f"{self.scenario}-{self.seed}-{digest[:_HASH_LENGTH]}"
+
+    def load(self) -> AnyScenario:
+        """Return the scenario of this run; raises InputError."""
+        overrides = [f"{key}={value}" for key, value in self.settings]
+        return load_checked(self.path, overrides, self.seed, self.content)
 
 
 @dataclass(frozen=True)

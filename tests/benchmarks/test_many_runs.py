@@ -11,8 +11,7 @@ from experiments.pipeline import cluster
 from experiments.pipeline.cluster import dask_client
 from experiments.pipeline.tables import TEXT
 from experiments.pipeline.tasks import Task
-from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import JoinedTables, SweepDataset
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset, SweepRun
 
 N_TASKS, N_RUNS = 200, 500
 

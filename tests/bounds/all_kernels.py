@@ -23,7 +23,7 @@ from sim.floorplan import FloorPlan, Wall
 from sim.rendering.ray_caster import RayCaster
 from sim.stereo_head import RadiometricNoise, depth_at, expose
 from sim.world import write_faces
-from tests.experiments.studies.refusal.test_refusal import (
+from tests.experiments.studies.test_refusal_trial import (
     test_calibration_counts_every_motion_of_two_pairs,
 )
 from tests.mapfusion.align.map_pairs import given_pairs

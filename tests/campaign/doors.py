@@ -14,8 +14,7 @@ from experiments.evaluation.tables import read_provenance
 from experiments.pipeline.store import StageFolder, require_undamaged
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.studies.run_tables import find_runs
-from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import JoinedTables, SweepDataset
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset, SweepRun
 from mapfusion.datasets.mrclam import MrclamSettings, import_mrclam
 from mapfusion.files import write_json
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map

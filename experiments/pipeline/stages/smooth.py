@@ -38,7 +38,7 @@ from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 
 # Attributes describe the result: `n_steps`, the degrees of freedom of the Student-t distributions
 # of observations and offsets (`observation_dof`, `offset_dof`), the estimated factor on the stated
-# covariances of observations (`observation_scale`), and `not_smoothed`, the reason for a missing
+# covariances of observations (`observation_level`), and `not_smoothed`, the reason for a missing
 # path (else empty).
 PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
 
@@ -55,7 +55,7 @@ _MAP_FILES = (
 )
 # Default number of evenly spaced iterations at which maps are fused, including the last.
 _FUSED_ITERATIONS = 5
-_ENDED = ("n_steps", "observation_dof", "offset_dof", "observation_scale", "not_smoothed")
+_ENDED = ("n_steps", "observation_dof", "offset_dof", "observation_level", "not_smoothed")
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def smoothed_owners(smooth: Path, slam: Path, iteration: int, n_observations: in
 def read_endings(folder: Path) -> pd.DataFrame:
     """Read the outcome of smoothing, one row per iteration.
 
-    Columns: iteration, n_steps, observation_dof, offset_dof, observation_scale, not_smoothed.
+    Columns: iteration, n_steps, observation_dof, offset_dof, observation_level, not_smoothed.
     """
     ends = {k: read_table(_path_path(folder, str(k)), PATH)[1] for k in _iterations(folder)}
     rows = pd.DataFrame([{name: end[name] for name in _ENDED} for end in ends.values()])

@@ -30,7 +30,7 @@ from experiments.reports.figures.style import (
     plain_numbers,
     write_plainly,
 )
-from experiments.studies.error_bands import TIME_GROUPS, error_bands, scarce_spans, time_bands
+from experiments.studies.statistics import TIME_GROUPS, error_bands, scarce_spans, time_bands
 
 # Figures 4 and 5
 _PANEL_HEIGHT_IN, _EXTRA_HEIGHT_IN = 1.9, 0.9  # the latter for legend and common x label

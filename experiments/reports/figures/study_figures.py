@@ -14,9 +14,9 @@ from experiments.evaluation.tables import UNKNOWN
 from experiments.reports.figures import style
 from experiments.reports.figures.result_tables import NothingToDraw
 from experiments.reports.figures.style import BLACK, GRAY
-from experiments.studies.independence.independence_trial import STRATEGIES
-from experiments.studies.refusal.cases import FEW, POSTER_RADII_M
-from experiments.studies.refusal.rates import (
+from experiments.studies.independence_trial import STRATEGIES
+from experiments.studies.refusal_cases import FEW, POSTER_RADII_M
+from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,
     Reliability,

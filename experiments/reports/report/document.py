@@ -38,22 +38,25 @@ from experiments.reports.figures.result_tables import (
 )
 from experiments.reports.figures.style import ROBOT_COLOURS, aligner_styles
 from experiments.reports.report.charts import (
+    NEUTRAL,
+    chart_style,
+    chart_template,
+    css_name,
     error_curves,
     error_figure,
+    palette,
     success_curves,
     success_figure,
     time_curves,
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
-from experiments.reports.report.theme import NEUTRAL, chart_style, chart_template, css_name, palette
-from experiments.reports.team_text import team_lines
+from experiments.reports.terminal.run_screen import team_lines
 from experiments.scenario.settings import Bound
-from experiments.studies.error_bands import BAND
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
 from experiments.studies.run_tables import Runs, find_runs
-from experiments.studies.statistics import ALL_SCENARIOS, configurations, reduced_errors
+from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
 from mapfusion.errors import InputError
 
 _SOURCE_DIGITS = 16

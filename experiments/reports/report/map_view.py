@@ -19,8 +19,7 @@ from experiments.reports.figures.floor_plan import LEVEL_TEXT, semi_axes
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.reports.figures.style import ORANGE
 from experiments.reports.formatting import metres, radians
-from experiments.reports.report.charts import Attributes, Styles, escaped, thinned
-from experiments.reports.report.theme import NEUTRAL, faint
+from experiments.reports.report.charts import NEUTRAL, Attributes, Styles, escaped, faint, thinned
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
 

@@ -1,7 +1,7 @@
 """Screens of `run`, `check`, `align`, `merge` and `import`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +15,20 @@ from experiments.evaluation.criteria import (
     ORACLE,
     answerable,
     at_the_end,
+    has_common_ground,
+    merged_robots,
     methods_in,
+    right_refined,
 )
 from experiments.evaluation.map_consistency import GROSS_M
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import CheckedScenario
-from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.path_errors import is_used_by_team, path_rms
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.evaluation.tables import SHOWN
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
-from experiments.reports.formatting import two_digits
-from experiments.reports.team_text import edge_lines, team_lines
+from experiments.reports.formatting import listed, two_digits
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
     columns,
@@ -35,11 +37,48 @@ from experiments.reports.terminal.layout import (
     print_skipped,
     print_table,
 )
-from experiments.studies.error_bands import ROBOT_PAIR, error_bands
 from experiments.studies.method_comparison import aligner_summary
+from experiments.studies.statistics import ROBOT_PAIR, error_bands
 from mapfusion.align.alignment import NOT_RUN, Status
 from mapfusion.fusion.fused_map import FusedMap
+from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.se2 import motion_sigma
+
+
+def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -> Iterator[str]:
+    """Describe a team by the tables `fused_motions`, `team` and `team_pairs` of one run.
+
+    A single robot gives no lines. Without truth the last two tables have no rows, and their lines
+    are left out.
+    """
+    final = team[team["source"] == "final"]
+    for row in final[final["n_team"] > 1].to_dict("records"):
+        which = "are merged" if row["component"] == 1 else "make a map of their own"
+        off = f"their paths err by {two_digits(row['rmse'])} m (ATE, one rigid fit for all)"
+        yield f"{row['n_robots']} of {row['n_team']} robots {which}: {off}"
+    if len(motions) and not merged_robots(motions["tx_m"]):
+        alone = motions.loc[motions["tx_m"].notna(), "robot"].tolist()
+        yield f"no two maps were merged, the fused map is that of {listed(alone)}"
+    for robot, why in motions[["robot", "left_out"]].itertuples(index=False):
+        if why:
+            yield f"{robot} is left out of the fused map: {why}"
+    if len(pairs):
+        met, used, right = has_common_ground(pairs), is_used_by_team(pairs), right_refined(pairs)
+        found = (used & met & right).sum()
+        yield (
+            f"alignments believed: {used.sum()}, right: {found}; "
+            f"pairs with common ground: {met.sum()}, found: {found}"
+        )
+
+
+def edge_lines(edges: pd.DataFrame) -> Iterator[str]:
+    """Describe by `team_edges` how alignments agree; a single alignment gives no lines."""
+    if len(edges) > 1:
+        used = edges[edges["place"] != EdgeStatus.REFUSED]
+        for place, rows in used.groupby("place", sort=True):
+            names = (rows["robot_a"] + "-" + rows["robot_b"]).tolist()
+            yield f"alignments {place}: {listed(names)}"
+
 
 _SEEDS_SHOWN = 3  # one by one, in a table of checks
 

@@ -28,11 +28,16 @@ from experiments.reports.terminal.layout import (
     print_skipped,
     print_table,
 )
-from experiments.studies.independence.independence_trial import STRATEGIES
-from experiments.studies.refusal.rates import VERDICTS, Rate, Reliability, pooled, worst
+from experiments.studies.independence_trial import STRATEGIES
+from experiments.studies.refusal_rates import VERDICTS, Rate, Reliability, pooled, worst
 from experiments.studies.sweep import Survey, SweepProgress
-from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import ERRORS, GIVEN, SweepDataset, medians_over_runs
+from experiments.studies.sweep_tables import (
+    ERRORS,
+    GIVEN,
+    SweepDataset,
+    SweepRun,
+    medians_over_runs,
+)
 from mapfusion.align.alignment import Status
 from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
 from mapfusion.smoother.odometry_calibration import Calibration

@@ -18,10 +18,10 @@ from scipy.optimize import minimize
 from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
-from experiments.studies.refusal import cases
-from experiments.studies.refusal.cases import MappedWorld
+from experiments.studies import refusal_cases
 from experiments.studies.refusal.fitting_command import worlds_asked_for
-from experiments.studies.refusal.rates import calibration_error
+from experiments.studies.refusal_cases import MappedWorld
+from experiments.studies.refusal_rates import calibration_error
 from mapfusion.align.alignment import Pairs
 from mapfusion.files import write_whole
 from mapfusion.geometry import se2
@@ -68,7 +68,7 @@ def _of_world(world: MappedWorld) -> list[tuple[Float, bool, str]]:
     met = itertools.combinations(world.robots(), 2)
     every = EVERY if world.repeats else 1
     for (a, b), k in itertools.product(met, world.iterations[every - 1 :: every]):
-        case = cases.common(a, b, k, settings.match, radius_m)
+        case = refusal_cases.common(a, b, k, settings.match, radius_m)
         judged = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs))
         for entry in settings.aligners:
             rng = generator(scenario.seed, "fit", world.name, a.name, b.name, k, entry.name)

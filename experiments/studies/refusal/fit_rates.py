@@ -15,9 +15,9 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from experiments.evaluation.criteria import MERGEABLE_PAIRS
-from experiments.studies.refusal import cases
-from experiments.studies.refusal.cases import MappedWorld
+from experiments.studies import refusal_cases
 from experiments.studies.refusal.fitting_command import worlds_asked_for
+from experiments.studies.refusal_cases import MappedWorld
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.oracle import Oracle
 from mapfusion.files import write_whole
@@ -73,11 +73,11 @@ def regions_of(worlds: Sequence[MappedWorld]) -> tuple[Counts, Counts]:
     return _joined(right), _joined(wrong)
 
 
-def _cases(world: MappedWorld) -> list[cases.Case]:
+def _cases(world: MappedWorld) -> list[refusal_cases.Case]:
     settings, radius_m = world.scenario.align, world.scenario.evaluate.true_pair_radius_m
     two = itertools.combinations(world.robots(), 2)
     met = itertools.product(two, world.iterations[EVERY - 1 :: EVERY])
-    return [cases.common(a, b, k, settings.match, radius_m) for (a, b), k in met]
+    return [refusal_cases.common(a, b, k, settings.match, radius_m) for (a, b), k in met]
 
 
 def _joined(regions: list[Counts]) -> Counts:

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.special import logsumexp
 
-from experiments.studies.refusal import cases
-from experiments.studies.refusal.cases import MappedWorld
+from experiments.studies import refusal_cases
 from experiments.studies.refusal.fitting_command import worlds_asked_for
+from experiments.studies.refusal_cases import MappedWorld
 from mapfusion.align.alignment import Pairs
 from mapfusion.files import write_whole
 from mapfusion.geometry.numerics import Float
@@ -46,7 +46,7 @@ def regions_of(worlds: Sequence[MappedWorld]) -> list[Regions]:
         settings, radius_m = world.scenario.align, world.scenario.evaluate.true_pair_radius_m
         two = itertools.combinations(world.robots(), 2)
         for (a, b), k in itertools.product(two, world.iterations[EVERY - 1 :: EVERY]):
-            case = cases.common(a, b, k, settings.match, radius_m)
+            case = refusal_cases.common(a, b, k, settings.match, radius_m)
             pairs = Pairs(case.map_a, case.map_b, case.pairs)
             evidence = settings.judge.on(pairs).evidence
             if case.n_common or evidence is None:

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from experiments.scenario.seeds import parse_seeds
-from experiments.studies.refusal.cases import MappedWorld, worlds_of
+from experiments.studies.refusal_cases import MappedWorld, worlds_of
 
 
 def worlds_asked_for(description: str | None) -> tuple[list[MappedWorld], dict[str, str]]:

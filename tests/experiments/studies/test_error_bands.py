@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.studies.error_bands import error_bands, medians_of_run, scarce_spans, time_bands
+from experiments.studies.statistics import error_bands, medians_of_run, scarce_spans, time_bands
 
 KEYS = {"run_id": "x-0", "scenario": "x", "seed": 0, "robot_a": "A", "robot_b": "B"}
 

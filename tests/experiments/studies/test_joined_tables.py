@@ -12,8 +12,7 @@ import pytest
 from experiments.studies import sweep_tables as dataset_module
 from experiments.studies import sweep_tables as joined_module
 from experiments.studies.run_tables import find_runs
-from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import JoinedTables, SweepDataset, locked_folder
+from experiments.studies.sweep_tables import JoinedTables, SweepDataset, SweepRun, locked_folder
 from mapfusion.errors import InputError, StoreRepairWarning
 from mapfusion.files import write_json
 

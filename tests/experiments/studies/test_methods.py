@@ -7,13 +7,6 @@ import scipy.stats
 
 from experiments.evaluation.criteria import RICH_PAIRS, summarise_alignments
 from experiments.evaluation.metrics import compute
-from experiments.studies.error_bands import (
-    BAND,
-    error_bands,
-    medians_of_run,
-    scarce_spans,
-    time_bands,
-)
 from experiments.studies.intervals import (
     change_of_each_run,
     clusters_of,
@@ -22,6 +15,13 @@ from experiments.studies.intervals import (
     median_interval,
 )
 from experiments.studies.method_comparison import compare_methods, oracle_ratios
+from experiments.studies.statistics import (
+    BAND,
+    error_bands,
+    medians_of_run,
+    scarce_spans,
+    time_bands,
+)
 from tests.helpers.made_up_runs import many_errors
 
 

@@ -10,9 +10,8 @@ import pytest
 from experiments.reports import study_files
 from experiments.reports.export import to_latex, to_markdown, write_tables
 from experiments.reports.figures.result_tables import ResultTables
-from experiments.studies.error_bands import medians_of_run, time_bands
 from experiments.studies.run_tables import find_runs
-from experiments.studies.statistics import ALL_SCENARIOS, summarise
+from experiments.studies.statistics import ALL_SCENARIOS, medians_of_run, summarise, time_bands
 from tests.helpers.made_up_runs import (
     ITERATIONS,
     METHODS,

@@ -43,8 +43,7 @@ from experiments.studies.sweep import (
     plan_run,
     prepare,
 )
-from experiments.studies.sweep_combinations import SweepRun
-from experiments.studies.sweep_tables import RUN_TIMES, JoinedTables, SweepDataset
+from experiments.studies.sweep_tables import RUN_TIMES, JoinedTables, SweepDataset, SweepRun
 from mapfusion.errors import InputError, StoreRepairWarning
 from tests.helpers import acting
 from tests.helpers.killing import KilledCommand, same_rows

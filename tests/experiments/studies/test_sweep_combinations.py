@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.scenario.yaml_files import apply_overrides
-from experiments.studies.sweep_combinations import parse_axes, runs_of
+from experiments.studies.sweep import parse_axes, runs_of
 from mapfusion.errors import InputError
 from tests.helpers.tiny_scenario import TINY
 

@@ -8,12 +8,12 @@ import pyarrow as pa
 import pytest
 
 from experiments.evaluation import tables
-from experiments.studies.sweep_combinations import SweepRun
 from experiments.studies.sweep_tables import (
     ERRORS,
     GIVEN,
     JoinedTables,
     SweepDataset,
+    SweepRun,
     medians_over_runs,
 )
 

@@ -19,7 +19,7 @@ from experiments.reports.figures.error_figures import (
 )
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.reports.figures.style import aligner_styles
-from experiments.studies.error_bands import error_bands
+from experiments.studies.statistics import error_bands
 
 COLUMNS = {
     draw_translation_error: ("translation_error_m", "refined_translation_error_m"),

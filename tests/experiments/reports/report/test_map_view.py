@@ -11,8 +11,8 @@ from scipy.stats import chi2
 from experiments.evaluation import tables
 from experiments.reports.figures.result_tables import ResultTables, of_pair
 from experiments.reports.report import map_view as module
+from experiments.reports.report.charts import chart_style
 from experiments.reports.report.map_view import ellipse_ends, map_figure
-from experiments.reports.report.theme import chart_style
 from mapfusion.geometry.se2 import compose, transform_points
 from tests.helpers.report_page import numbers
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.studies.refusal.fit_probability import Answers, fit, left_out, stated
-from experiments.studies.refusal.rates import calibration_error
+from experiments.studies.refusal_rates import calibration_error
 
 MODEL = np.array([-0.5, 1.5, -2.0])
 

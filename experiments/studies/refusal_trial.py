@@ -21,8 +21,8 @@ from experiments.pipeline.workers import workers
 from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import Simulation
-from experiments.studies.refusal import cases
-from experiments.studies.refusal.cases import Case, MappedWorld
+from experiments.studies import refusal_cases
+from experiments.studies.refusal_cases import Case, MappedWorld
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.files import schema
@@ -252,10 +252,10 @@ def common_rows(scenario: Simulation, world: MappedWorld, every: int) -> Rows:
     for (a, b), iteration in itertools.product(
         itertools.combinations(world.robots(), 2), world.iterations[::-1][::every][::-1]
     ):
-        met = [cases.common(a, b, iteration, matching, radius_m)]
+        met = [refusal_cases.common(a, b, iteration, matching, radius_m)]
         if not world.repeats:
             rng = generator(scenario.seed, "few", world.name, a.name, b.name, iteration)
-            met += filter(None, [cases.few(met[0], rng)])
+            met += filter(None, [refusal_cases.few(met[0], rng)])
         for case in met:
             rows += _answers(scenario, case, (world, world), iteration)
     return rows
@@ -268,19 +268,23 @@ def apart_rows(scenario: Simulation, crossing: Crossing) -> Rows:
     rows: Rows = []
     for robot_a, robot_b, iteration in crossing.meetings:
         maps = latest_at(of_a(robot_a), iteration), latest_at(of_b(robot_b), iteration)
-        rows += _answers(scenario, cases.apart(*maps, matching), worlds, iteration)
+        rows += _answers(scenario, refusal_cases.apart(*maps, matching), worlds, iteration)
     if len(crossing.a.folders) < 2 or not crossing.hung:  # a poster needs a second robot in world a
         return rows
     in_a, in_b = ({robot.name: robot for robot in world.robots()} for world in worlds)
     last = min(world.iterations[-1] for world in worlds)
     first, partner, *_ = in_a.values()
-    source = cases.common(first, partner, last, matching, scenario.evaluate.true_pair_radius_m)
+    source = refusal_cases.common(
+        first, partner, last, matching, scenario.evaluate.true_pair_radius_m
+    )
     others = [latest_at(robot.maps, last) for robot in in_b.values()]
     for number in range(REPEATED_PER_WORLDS):
-        each, size = divmod(number, len(cases.POSTER_RADII_M))  # every robot with every size
+        each, size = divmod(
+            number, len(refusal_cases.POSTER_RADII_M)
+        )  # every robot with every size
         rng = generator(scenario.seed, "poster", crossing.a.name, crossing.b.name, number)
-        other, radius_m = others[each % len(others)], cases.POSTER_RADII_M[size]
-        case = cases.repeated(source, other, radius_m, matching, rng)
+        other, radius_m = others[each % len(others)], refusal_cases.POSTER_RADII_M[size]
+        case = refusal_cases.repeated(source, other, radius_m, matching, rng)
         if case is not None:
             rows += _answers(scenario, case, worlds, last)
     return rows

@@ -15,7 +15,7 @@ from experiments.reports.figures.study_figures import (
     draw_refusal_roc,
 )
 from experiments.reports.terminal.study_screen import print_kinds, print_reliability
-from experiments.studies.refusal.rates import (
+from experiments.studies.refusal_rates import (
     N_BINS,
     Rate,
     by_kind,
@@ -26,7 +26,7 @@ from experiments.studies.refusal.rates import (
     reliability,
     worst,
 )
-from experiments.studies.refusal.refusal_trial import crossings_of
+from experiments.studies.refusal_trial import crossings_of
 
 COLUMNS = ["world_a", "world_b", "iteration", "n_common", "n_true", "status", "beats", "error"]
 # Two runs of common ground (the second's is found late), and a crossing of them.

@@ -23,7 +23,7 @@ from experiments.evaluation.criteria import (
     right_refined,
 )
 from experiments.studies.intervals import Interval, percentile_interval, wilson
-from experiments.studies.refusal.cases import APART, COMMON, FEW, POSTER_RADII_M
+from experiments.studies.refusal_cases import APART, COMMON, FEW, POSTER_RADII_M
 from mapfusion.geometry.numerics import Float
 
 

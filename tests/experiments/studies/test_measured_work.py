@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.studies.independence import measured_work
-from experiments.studies.independence.measured_work import Cost, Meter
+from experiments.studies import measured_work
+from experiments.studies.measured_work import Cost, Meter
 
 MB = 1_000_000
 ROOM_MB = 8.0  # what else a process may take meanwhile

@@ -31,7 +31,7 @@ from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows
 from experiments.pipeline.tasks import OnProgress, run_tasks, tasks_of
 from experiments.pipeline.workers import workers
 from experiments.scenario.settings import AnyScenario, Recording, Scenario
-from experiments.studies.independence.measured_work import (
+from experiments.studies.measured_work import (
     ALIGNMENT,
     COSTS_FILE,
     FILTER,

@@ -1,1 +1,0 @@
-"""Costs of independence: maps fused from independent robots, against one smoother over all logs."""
