@@ -16,6 +16,7 @@ from experiments.evaluation.truth import (
     common_landmarks,
     join_map_pairs,
     load_robot,
+    motion_errors,
     squared_mahalanobis,
 )
 from experiments.pipeline.stage import Job, StageKind
@@ -66,9 +67,9 @@ def error_rows(map_pair: MapPair, judge: Judge, radius_m: float) -> pd.DataFrame
     inlier = np.array([alignment.inlier for alignment in alignments])
     covariance = np.array([alignment.covariance for alignment in alignments])
     T_estimated = np.array([[each[name] for name in MOTION] for each in rows])
-    error_m, error_rad = _motion_errors(T_estimated, T_true)
-    refined_m, refined_rad = _motion_errors(T_refined, T_true)
-    oracle_m, oracle_rad = _motion_errors(T_refined, oracle.T_a_b)
+    error_m, error_rad = motion_errors(T_estimated, T_true)
+    refined_m, refined_rad = motion_errors(T_refined, T_true)
+    oracle_m, oracle_rad = motion_errors(T_refined, oracle.T_a_b)
     n_inliers, n_hits = inlier.sum(axis=1), (inlier & is_true).sum(axis=1)
     errors = {
         "translation_error_m": error_m,
@@ -86,12 +87,6 @@ def error_rows(map_pair: MapPair, judge: Judge, radius_m: float) -> pd.DataFrame
     }
     # one DataFrame of all columns: adding columns one by one is slow in pandas
     return pd.DataFrame({name: [each[name] for each in rows] for name in row} | errors)
-
-
-def _motion_errors(T: Float, T_true: Float) -> tuple[Float, Float]:
-    """Return translation errors in m and signed rotation errors in rad of motions (N, 3)."""
-    error = T - T_true
-    return np.hypot(error[:, 0], error[:, 1]), se2.wrap(error[:, 2])
 
 
 def first_shared_iteration(robots: Sequence[EvaluatedRobot], radius_m: float) -> int | None:

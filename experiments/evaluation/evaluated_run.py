@@ -203,7 +203,10 @@ class EvaluatedRun:
     def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
         """Return the stored maps of all robots at an iteration, by robot."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
-        return {name: latest_at(stored_maps(each), iteration) for name, each in folders.items()}
+        return {
+            name: latest_at(stored_maps(each, viewing=True), iteration)
+            for name, each in folders.items()
+        }
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
         """Load the smoothed maps and paths of all robots with the truth."""

@@ -28,11 +28,11 @@ from experiments.evaluation.map_consistency import (
     relative_consistency,
     rmse,
 )
-from experiments.evaluation.path_errors import ate_m
 from experiments.evaluation.truth import (
     EvaluatedRobot,
     degrees_of_freedom,
     landmark_truth,
+    motion_errors,
     truth_or_unknown,
 )
 from experiments.pipeline.stages.slam import RobotFolders, final_path
@@ -93,6 +93,30 @@ class SmoothedRobot:
         instead = "FastSLAM's map" if at is None else f"its map until frame {at}"
         return at, f"{self.not_smoothed[lacking]}; {instead} stands in"
 
+    def row(self) -> dict[str, Any]:
+        """Return the row of the table `smoother`: last map and whole path."""
+        robot, last = self.robot, len(self.filter_path) - 1
+        path_m, filter_m = (
+            path_rmse_m(path, robot.path.T_map_robot) for path in (self.last_path, self.filter_path)
+        )
+        row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
+        row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | self.ending
+        row["not_smoothed"] = self.given_at(last)[1]
+        of_filter = fit_to_truth(robot.maps[last], robot.points_world_m[last])
+        row |= {
+            "filter_landmark_rmse_m": of_filter.rmse_m,
+            "filter_gross_share": of_filter.gross_share,
+        }
+        if last not in self.maps:
+            return row | {"n_landmarks": 0}
+        landmarks = self.maps[last]
+        fit = fit_to_truth(landmarks, self.points_world_m[last])
+        row |= {"landmark_rmse_m": fit.rmse_m, "gross_share": fit.gross_share}
+        row |= {"n_landmarks": len(landmarks)}
+        consistency = relative_consistency(landmarks, fit)
+        names = ("nees_per_dof", "marginal_nees_per_dof", "coverage_95")
+        return row | {name: getattr(consistency, name) for name in names}
+
 
 def load_smoothed(
     robot: EvaluatedRobot, folders: RobotFolders, log: RobotLog, smooth: Path
@@ -127,39 +151,13 @@ def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
     return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
 
 
-def smoother_rows(smoothed: Sequence[SmoothedRobot]) -> list[dict[str, Any]]:
-    """Return the rows of the table `smoother`: last maps and whole paths of the robots."""
-    return [_smoother_row(each) for each in smoothed]
-
-
-def _smoother_row(smoothed: SmoothedRobot) -> dict[str, Any]:
-    robot, last = smoothed.robot, len(smoothed.filter_path) - 1
-    path_m, filter_m = (
-        path_rmse_m(path, robot.path.T_map_robot)
-        for path in (smoothed.last_path, smoothed.filter_path)
-    )
-    row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
-    row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | smoothed.ending
-    row["not_smoothed"] = smoothed.given_at(last)[1]
-    of_filter = fit_to_truth(robot.maps[last], robot.points_world_m[last])
-    row |= {"filter_landmark_rmse_m": of_filter.rmse_m, "filter_gross_share": of_filter.gross_share}
-    if last not in smoothed.maps:
-        return row | {"n_landmarks": 0}
-    landmarks = smoothed.maps[last]
-    fit = fit_to_truth(landmarks, smoothed.points_world_m[last])
-    row |= {"landmark_rmse_m": fit.rmse_m, "gross_share": fit.gross_share}
-    row |= {"n_landmarks": len(landmarks)}
-    consistency = relative_consistency(landmarks, fit)
-    names = ("nees_per_dof", "marginal_nees_per_dof", "coverage_95")
-    return row | {name: getattr(consistency, name) for name in names}
-
-
 def path_rmse_m(path: Float, truth: Float) -> float:
     """Return the RMS position error without a fit; NaN if no pose is known in both paths."""
     known = np.isfinite(path).all(axis=1) & np.isfinite(truth).all(axis=1)
     if not known.any():
         return np.nan
-    return float(np.sqrt(np.mean(ate_m(path[known], truth[known], fit=False) ** 2)))
+    error_m = np.linalg.norm(path[known, :2] - truth[known, :2], axis=1)
+    return float(np.sqrt(np.mean(error_m**2)))
 
 
 _MOTION_FIGURES = ("alignment_error_m", "alignment_error_rad")
@@ -320,17 +318,13 @@ class EvaluatedFusion:
     def _motion_errors(self) -> dict[str, float]:
         """Return median errors, standard deviations and NEES of the motions of the robots' maps."""
         first, *others = self.fusion.members
-        errors = []
+        T_world_first, errors = self.given[first].robot.path.T_world_map, []
         for k in others:
-            T_true = se2.between(
-                self.given[first].robot.path.T_world_map, self.given[k].robot.path.T_world_map
-            )
-            error = self.fusion.T_first_map[k] - T_true
-            error[2] = se2.wrap(error[2])
-            covariance = self.fusion.motion_covariance[k]
-            nees = alignment_nees(self.fusion.T_first_map[k], covariance, T_true)
-            sigma = se2.motion_sigma(covariance)
-            errors.append([np.hypot(error[0], error[1]), abs(error[2]), *sigma, nees / 3])
+            T_true = se2.between(T_world_first, self.given[k].robot.path.T_world_map)
+            T, covariance = self.fusion.T_first_map[k], self.fusion.motion_covariance[k]
+            error_m, error_rad = motion_errors(T, T_true)
+            nees = alignment_nees(T, covariance, T_true)
+            errors.append([error_m, abs(error_rad), *se2.motion_sigma(covariance), nees / 3])
         medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
         return dict(zip(_MOTION_FIGURES, medians.tolist(), strict=True))
 

@@ -26,13 +26,16 @@ from experiments.evaluation import criteria, tables
 from experiments.evaluation.criteria import (
     ORACLE,
     NothingMerged,
+    edge_precision,
+    edge_recall,
     error_over_oracle,
     merged_robots,
     nothing_merged,
+    path_rms,
     rich,
+    rms,
     summarise_alignments,
 )
-from experiments.evaluation.path_errors import edge_precision, edge_recall, path_rms, rms
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import FUSER_METRICS, AnyScenario, Bound
 from experiments.scenario.suite import scenarios_of
@@ -379,34 +382,28 @@ def check_all(
     for each in loaded:
         if isinstance(each, CheckedScenario):
             yield each
-        elif unreadable:
-            yield CheckedScenario(each[0].name)
+            continue
+        name, folders, elapsed_s = each[0].name, dict[int, Path](), dict[int, float]()
+        if unreadable:
+            yield CheckedScenario(name)
+            continue
+        try:
+            for scenario in each:
+                started_s = time.perf_counter()
+                try:
+                    folders[scenario.seed] = run(scenario)
+                finally:
+                    elapsed_s[scenario.seed] = time.perf_counter() - started_s
+            outcomes = check(each[0], folders)
+            # a scenario may bound the number of merged robots itself
+            tested = {} if MERGED_ROBOTS in each[0].expect else folders
+            merges = {seed: nothing_merged(folder) for seed, folder in tested.items()}
+            unmerged = {seed: merge for seed, merge in merges.items() if merge and merge.failed}
+        except InputError as error:
+            yield CheckedScenario(name, error=str(error), elapsed_s=elapsed_s)
+        except Exception as error:
+            text = f"{type(error).__name__}: {error}"
+            yield CheckedScenario(name, error=text, elapsed_s=elapsed_s)
+            raise
         else:
-            yield from _run_and_check(each, run)
-
-
-def _run_and_check(
-    runs: Sequence[AnyScenario], run: Callable[[AnyScenario], Path]
-) -> Iterator[CheckedScenario]:
-    """Yield the outcomes of one scenario, given for each of its seeds."""
-    name, folders, elapsed_s = runs[0].name, dict[int, Path](), dict[int, float]()
-    try:
-        for scenario in runs:
-            started_s = time.perf_counter()
-            try:
-                folders[scenario.seed] = run(scenario)
-            finally:
-                elapsed_s[scenario.seed] = time.perf_counter() - started_s
-        outcomes, unmerged = check(runs[0], folders), dict[int, NothingMerged]()
-        if MERGED_ROBOTS not in runs[0].expect:  # else the scenario itself bounds this number
-            for seed, folder in folders.items():
-                nothing = nothing_merged(folder)
-                if nothing is not None and nothing.failed:
-                    unmerged[seed] = nothing
-    except InputError as error:
-        yield CheckedScenario(name, error=str(error), elapsed_s=elapsed_s)
-    except Exception as error:
-        yield CheckedScenario(name, error=f"{type(error).__name__}: {error}", elapsed_s=elapsed_s)
-        raise
-    else:
-        yield CheckedScenario(name, outcomes, elapsed_s=elapsed_s, unmerged=unmerged)
+            yield CheckedScenario(name, outcomes, elapsed_s=elapsed_s, unmerged=unmerged)

@@ -18,10 +18,9 @@ import pandas as pd
 
 from experiments.evaluation import criteria
 from experiments.evaluation.fused_landmarks import FusedTeam, team_edge_rows
-from experiments.evaluation.truth import PathTruth
+from experiments.evaluation.truth import PathTruth, motion_errors
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.files import POSE_FIELDS
-from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 
@@ -39,31 +38,6 @@ STATISTICS: dict[str, Callable[[Float], float]] = {
 def seven_statistics(errors: Float) -> dict[str, float]:
     """Return the statistics of evo of errors (N,); NaN for N = 0. `std` is the population's."""
     return {name: of(errors) if len(errors) else np.nan for name, of in STATISTICS.items()}
-
-
-def rms(values: pd.Series) -> float:
-    """Return the root mean square of the known values; NaN if none is known."""
-    return float(np.sqrt(np.mean(np.square(values.dropna())))) if values.notna().any() else np.nan
-
-
-def path_rms(robots: pd.DataFrame, by: Sequence[str] = ("robot",)) -> pd.DataFrame:
-    """Return RMS position errors of FastSLAM's online paths and of odometry alone.
-
-    Args:
-        robots: rows of the table `robots`.
-        by: columns that identify a robot of a run.
-
-    Returns:
-        One row for each robot. Columns: those of `by`, path_m, odometry_m, over_odometry (their
-        ratio), n_landmarks at the end and n_frames.
-    """
-    groups = robots.groupby(list(by), sort=False)
-    path_m, odometry_m = (groups[f"{of}_error_m"].agg(rms) for of in ("path", "odometry"))
-    columns = {"path_m": path_m, "odometry_m": odometry_m, "n_frames": groups.size()}
-    columns |= {"over_odometry": path_m / odometry_m.where(odometry_m > 0)}
-    if "n_landmarks" in robots:
-        columns |= {"n_landmarks": groups["n_landmarks"].last()}
-    return pd.DataFrame(columns).reset_index()
 
 
 def ate_m(path: Float, truth: Float, fit: bool = True) -> Float:
@@ -287,30 +261,10 @@ def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.Da
     a, b = rows[_PAIR].map(index.get).to_numpy().T
     # errors of T_a_b in the fused maps; NaN for robots in different maps
     T_world_map = np.array([robot.path.T_world_map for robot in team.robots])
-    T_true, errors_of_team = (
-        se2.between(T_world_map[a], T_world_map[b]),
-        np.full((2, len(a)), np.nan),
-    )
+    T_true = se2.between(T_world_map[a], T_world_map[b])
+    errors_of_team = np.full((2, len(a)), np.nan)
     for T_first_map in _placements(team):
-        error = se2.between(T_first_map[a], T_first_map[b]) - T_true
-        found = np.stack([np.hypot(error[:, 0], error[:, 1]), se2.wrap(error[:, 2])])
+        found = np.stack(motion_errors(se2.between(T_first_map[a], T_first_map[b]), T_true))
         errors_of_team = np.where(np.isfinite(found), found, errors_of_team)
     translation_m, rotation_rad = errors_of_team
     return rows.assign(team_translation_error_m=translation_m, team_rotation_error_rad=rotation_rad)
-
-
-def is_used_by_team(pairs: pd.DataFrame) -> pd.Series:
-    """Return True for rows of `team_pairs` whose alignment moved maps in the fusion."""
-    return pairs["place"].isin([EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE])
-
-
-def edge_precision(pairs: pd.DataFrame) -> float:
-    """Return the share of right alignments among those that the team uses; NaN if it uses none."""
-    used = pairs[is_used_by_team(pairs)]
-    return float(1 - criteria.is_false_merge(used).mean())
-
-
-def edge_recall(pairs: pd.DataFrame) -> float:
-    """Return the share of pairs with common ground whose right alignment the team uses."""
-    overlapping = pairs[criteria.has_common_ground(pairs)]
-    return float((criteria.right_refined(overlapping) & is_used_by_team(overlapping)).mean())

@@ -31,7 +31,6 @@ from experiments.evaluation.map_errors import (
     SmoothedRobot,
     coverage_rows,
     smoothed_path_rows,
-    smoother_rows,
 )
 from experiments.evaluation.path_errors import (
     path_statistics_rows,
@@ -195,7 +194,7 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
     return makers | {
         "frame_times": frame_times,
         "findings": lambda: finding_rows(run),
-        "smoother": lambda: smoother_rows(smoothed()),
+        "smoother": lambda: [each.row() for each in smoothed()],
         "team_edges": lambda: fused_landmarks.team_edge_rows(team),
         "timings": timings,
     }

@@ -40,7 +40,6 @@ from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.registration import Registration
 from mapfusion.robot_log import (
     TRUTH_FILES,
-    RobotLog,
     read_log,
     read_odometry_covariance,
     read_true_poses,
@@ -355,14 +354,27 @@ def calibrate_logs(
     for path, name in zip(logs, names, strict=True):
         if names.count(name) > 1:
             raise InputError(f"{path}: robot {name} has more than one log here")
-    associations = [_associations(log, settings, on_progress) for log in loaded]
+    landmarks, paths = [], list[Float | None]()
+    for log in loaded:
+        label, frame = log.observations.label, None
+        if label is not None and not np.any(label == NO_LABEL):
+            landmarks.append(label.astype(np.int64))
+            paths.append(None)
+            continue
+        rng = generator(settings.seed, "slam", log.robot)
+        for frame in run_log(log, settings.slam.filter, rng):
+            on_progress(f"FastSLAM of {log.robot}", frame.iteration + 1, len(log))
+        if frame is None:
+            raise InputError(f"log {log.robot}: holds no frame")
+        landmarks.append(frame.slam.best_associations())
+        paths.append(frame.slam.best_path())
     parameters = SmootherParameters(
         stray_m=settings.smooth.stray_m, min_count=settings.slam.min_count
     )
     calibration = calibrate(
         loaded,
-        [landmark for landmark, _ in associations],
-        [path for _, path in associations],
+        landmarks,
+        paths,
         parameters,
         lambda done, most: on_progress("calibrate", done, most),
     )
@@ -391,22 +403,3 @@ def filter_settings(calibration: Calibration) -> dict[str, Any]:
         "lateral_slip_m_per_rad",
     }
     return {"slam": {"filter": {"motion": {k: v for k, v in motion.items() if k in wanted}}}}
-
-
-def _associations(
-    log: RobotLog, settings: Scenario, on_progress: OnProgress
-) -> tuple[np.ndarray, Float | None]:
-    """Return the landmark of each observation, shape (N,), and FastSLAM's path, shape (T, 3).
-
-    The path is None if all observations have a label.
-    """
-    label = log.observations.label
-    if label is not None and not np.any(label == NO_LABEL):
-        return label.astype(np.int64), None
-    frame = None
-    rng = generator(settings.seed, "slam", log.robot)
-    for frame in run_log(log, settings.slam.filter, rng):
-        on_progress(f"FastSLAM of {log.robot}", frame.iteration + 1, len(log))
-    if frame is None:
-        raise InputError(f"log {log.robot}: holds no frame")
-    return frame.slam.best_associations(), frame.slam.best_path()

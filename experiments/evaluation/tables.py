@@ -175,16 +175,14 @@ _COLUMNS = {
 }
 
 
-def _schema(name: str) -> pa.Schema:
-    types = {column: kind for kind, names in _NAMES.items() for column in names.split()}
-    types |= _OTHER_TYPES.get(name, {})
-    columns = {column: types.get(column, tables.FLOAT) for column in _COLUMNS[name].split()}
-    return schema(f"result.{name}", _VERSIONS.get(name, 1), tables.fields(**columns))
-
-
 ALL = {"estimates": ESTIMATES, "correspondences": CORRESPONDENCES, "rivals": RIVALS}
 ALL |= {"tracks": TRACKS}
-ALL |= {name: _schema(name) for name in _COLUMNS}
+_TYPES = {column: kind for kind, names in _NAMES.items() for column in names.split()}
+for _name, _columns in _COLUMNS.items():
+    _own = dict.fromkeys(_columns.split(), tables.FLOAT)
+    _own |= {column: _TYPES[column] for column in _own if column in _TYPES}
+    _fields = tables.fields(**(_own | _OTHER_TYPES.get(_name, {})))
+    ALL[_name] = schema(f"result.{_name}", _VERSIONS.get(_name, 1), _fields)
 
 
 class Shown(NamedTuple):

@@ -136,6 +136,12 @@ def degrees_of_freedom(landmarks: LandmarkMap) -> int:
     return 2 if landmarks.planar else 3
 
 
+def motion_errors(T: Float, T_true: Float) -> tuple[Float, Float]:
+    """Return translation errors in m and signed rotation errors in rad of motions (..., 3)."""
+    error = T - T_true
+    return np.hypot(error[..., 0], error[..., 1]), se2.wrap(error[..., 2])
+
+
 def squared_mahalanobis(error: Float, covariance: Float) -> Float:
     """Return squared Mahalanobis lengths of errors (..., D) with covariances (..., D, D)."""
     return np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])
@@ -261,6 +267,6 @@ def load_robot(folders: RobotFolders, viewing: bool = True) -> EvaluatedRobot:
         if len(true) != len(logged):
             counts = f"{len(true)} rows, the log has {len(logged)} of them"
             raise InputError(f"{folders.log / file}.parquet: {counts}")
-    maps = stored_maps(folders, viewing)
+    maps = stored_maps(folders, viewing=viewing)
     points = landmark_truth(truth, maps.associations.at, maps)
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))

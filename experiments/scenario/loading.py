@@ -98,7 +98,19 @@ def load_scenario(
     data = apply_overrides(read_mapping(path) if content is None else content, overrides)
     if seed is not None:
         data["seed"] = seed
-    scenario = scenario_of(data, str(path), functools.partial(_place, path, overrides))
+
+    def place(location: Location) -> str:
+        """Return the line of the file or the override that gives the value at a location."""
+        for override in reversed(overrides):
+            own = override.partition("=")[0].split(".")
+            beginning = [str(part) for part in location[: len(own)]]
+            if beginning and own[: len(beginning)] == beginning:
+                return f", --set {override}"
+        above = (location[:n] for n in range(len(location), 0, -1))
+        line = next((_lines(path)[each] for each in above if each in _lines(path)), None)
+        return "" if line is None else f", line {line}"
+
+    scenario = scenario_of(data, str(path), place)
     _warn_of_name_clashes(scenario.align)
     if not isinstance(scenario, Recording):
         return scenario
@@ -116,18 +128,6 @@ def load_scenario(
 
 # Each wrong key of a file needs the lines.
 _lines = functools.lru_cache(maxsize=1)(lines_of_keys)
-
-
-def _place(path: Path, overrides: Sequence[str], location: Location) -> str:
-    """Return the line of the file or the override that gives the value at a location."""
-    for override in reversed(overrides):
-        own = override.partition("=")[0].split(".")
-        told = [str(part) for part in location[: len(own)]]
-        if told and own[: len(told)] == told:
-            return f", --set {override}"
-    above = (location[:n] for n in range(len(location), 0, -1))
-    line = next((_lines(path)[each] for each in above if each in _lines(path)), None)
-    return "" if line is None else f", line {line}"
 
 
 def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> AnyScenario:

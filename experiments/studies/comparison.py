@@ -25,12 +25,13 @@ from experiments.evaluation.criteria import (
     RICH_PAIRS,
     RUN_KEYS,
     is_false_merge,
+    is_used_by_team,
     methods_in,
+    path_rms,
     right_refined,
     setting_columns,
 )
 from experiments.evaluation.map_errors import last_fused
-from experiments.evaluation.path_errors import is_used_by_team, path_rms
 from experiments.evaluation.tables import read_scenario
 from experiments.studies import intervals
 from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN

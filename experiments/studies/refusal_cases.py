@@ -161,7 +161,7 @@ class MappedWorld:
 
     def maps(self, robot: str) -> Mapping[int, LandmarkMap]:
         """Return the maps of one robot by iteration, without the truth."""
-        return stored_maps(self.folders[robot])
+        return stored_maps(self.folders[robot], viewing=True)
 
     def robots(self) -> list[EvaluatedRobot]:
         """Return the maps of all robots with the truth."""

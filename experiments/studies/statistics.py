@@ -18,6 +18,7 @@ from experiments.evaluation.criteria import (
     absolute_errors,
     has_common_ground,
     is_false_merge,
+    is_used_by_team,
     right_refined,
     setting_columns,
     summarise_alignments,
@@ -25,7 +26,7 @@ from experiments.evaluation.criteria import (
 )
 from experiments.evaluation.fused_landmarks import mean_nees_band
 from experiments.evaluation.map_errors import last_fused
-from experiments.evaluation.path_errors import STATISTICS, is_used_by_team
+from experiments.evaluation.path_errors import STATISTICS
 from experiments.scenario.seeds import generator
 from experiments.studies import intervals
 from experiments.studies.method_comparison import (

@@ -93,7 +93,7 @@ MATCH_STAGE = StageKind("match", _LABEL, run_match, (_BATCH_FILE, _RIVALS_FILE))
 @functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
 def _viewed_map(folders: RobotFolders, iteration: int) -> ViewedMap:
     """Return a robot's map with its cached queries, which all pairs of the robot share."""
-    return ViewedMap(latest_at(stored_maps(folders), iteration))
+    return ViewedMap(latest_at(stored_maps(folders, viewing=True), iteration))
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
@@ -119,7 +119,7 @@ def rivals_path(folder: Path, part: str) -> Path:
 
 def maps_of_both(job: Job) -> list[Snapshots]:
     """Return all maps of the job's two robots, by iteration."""
-    return [stored_maps(folders) for folders in folders_of_both(job)]
+    return [stored_maps(folders, viewing=True) for folders in folders_of_both(job)]
 
 
 def pairs_of_maps(

@@ -17,6 +17,7 @@ from ruamel.yaml import YAML
 from experiments.evaluation import criteria, metrics, tables
 from experiments.evaluation.criteria import (
     methods_in,
+    path_rms,
     setting_columns,
     with_common_ground_at_any_time,
 )
@@ -24,7 +25,6 @@ from experiments.evaluation.evaluated_run import finding_row_lines
 from experiments.evaluation.map_consistency import GROSS_M
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import Outcome
-from experiments.evaluation.path_errors import path_rms
 from experiments.evaluation.result import require_result
 from experiments.evaluation.tables import read_provenance
 from experiments.reports import formatting

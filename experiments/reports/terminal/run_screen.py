@@ -16,14 +16,15 @@ from experiments.evaluation.criteria import (
     answerable,
     at_the_end,
     has_common_ground,
+    is_used_by_team,
     merged_robots,
     methods_in,
+    path_rms,
     right_refined,
 )
 from experiments.evaluation.map_consistency import GROSS_M
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import CheckedScenario
-from experiments.evaluation.path_errors import is_used_by_team, path_rms
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.evaluation.tables import SHOWN
 from experiments.pipeline.stereo_import import ImportedRecording

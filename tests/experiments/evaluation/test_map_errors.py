@@ -22,7 +22,6 @@ from experiments.evaluation.map_errors import (
     SmoothedRobot,
     coverage_rows,
     smoothed_path_rows,
-    smoother_rows,
 )
 from experiments.evaluation.result import run_scenario
 from experiments.evaluation.truth import EvaluatedRobot
@@ -260,7 +259,7 @@ def smoothed_robot() -> SmoothedRobot:
 
 def test_a_row_tells_of_the_last_map_and_the_whole_path() -> None:
     smoothed = smoothed_robot()
-    (row,) = smoother_rows([smoothed])
+    row = smoothed.row()
     assert row["path_rmse_m"] == pytest.approx(0.01)
     assert row["filter_path_rmse_m"] == pytest.approx(0.04)
     assert row["filter_over_smoother"] == pytest.approx(4)
@@ -275,7 +274,7 @@ def test_frames_of_unknown_truth_are_left_out_of_path_errors() -> None:
     smoothed = smoothed_robot()
     smoothed.paths[ITERATION][2, 0] = 9.0
     smoothed.robot.path.T_map_robot[2] = np.nan
-    (row,) = smoother_rows([smoothed])
+    row = smoothed.row()
     assert row["path_rmse_m"] == pytest.approx(0.01)
 
 
@@ -284,7 +283,7 @@ def test_a_robot_that_is_not_smoothed_to_its_end_has_the_reason() -> None:
     del smoothed.maps[ITERATION], smoothed.paths[ITERATION]
     smoothed.ending["not_smoothed"] = "takes 3.0 GB"
     smoothed = replace(smoothed, not_smoothed={ITERATION: "takes 3.0 GB"})
-    (row,) = smoother_rows([smoothed])
+    row = smoothed.row()
     told = "takes 3.0 GB; its map until frame 3 stands in"
     assert (row["n_landmarks"], row["not_smoothed"]) == (0, told)
     assert np.isnan(row["path_rmse_m"])

@@ -11,16 +11,14 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 from scipy.optimize import least_squares
 
+from experiments.evaluation.criteria import edge_precision, edge_recall, path_rms
 from experiments.evaluation.fused_landmarks import FusedTeam
 from experiments.evaluation.path_errors import (
     SOURCES,
     STATISTICS,
     ate_m,
-    edge_precision,
-    edge_recall,
     pairs_by_frames,
     pairs_by_length,
-    path_rms,
     path_statistics_rows,
     rpe,
     seven_statistics,
