@@ -1,8 +1,16 @@
-# Everything from a fresh checkout: CPython 3.11 and make are all that is needed.
-PYTHON ?= python3.11
+# Everything from a fresh checkout: CPython 3.11, 3.12 or 3.13 and make are all that is needed.
+
+# The first of these that starts. 3.11 comes first because PyBullet has wheels for it: pip compiles PyBullet
+# for the others, which takes a C++ compiler and minutes. `make demo PYTHON=python3.13` chooses another.
+PYTHON ?= $(shell for each in python3.11 python3.12 python3.13; do \
+    $$each -c "" 2>/dev/null && { echo $$each; exit; }; done; echo python3)
 VENV := .venv
 BIN := $(VENV)/bin
-STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+PINNED := $(PIP) --require-hashes --no-build-isolation
+# What a user has, and with the tools for work on the source.
+INSTALLED := $(VENV)/.installed
+DEVELOPING := $(VENV)/.developing
 
 # Where this is set, each of the many processes that tests and runs start would compile our source anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -10,53 +18,62 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: wheel-test browser-test clean-kernels lock demo test campaign seeded-faults lint check bench paper \
     install clean
 
-install: $(STAMP)
+install: $(DEVELOPING)
 
-# The stamp is newer than the lock file and the project file once all is installed, so a second call does nothing.
-$(STAMP): requirements.lock pyproject.toml
+# A stamp is newer than the lock files and the project file once all is installed, so a second call does
+# nothing. NumPy comes first: PyBullet is compiled with it, and would else draw pictures at half the speed.
+$(INSTALLED): requirements-build.lock requirements.lock pyproject.toml
+	@$(PYTHON) -c "import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))" || \
+	    { echo "CPython 3.11, 3.12 or 3.13 is needed: make PYTHON=FILE names one" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	$(PINNED) -r requirements-build.lock
+	$(PINNED) -r requirements.lock
+	$(PIP) --no-deps --no-build-isolation -e .
 	touch $@
 
-demo: $(STAMP)
+$(DEVELOPING): $(INSTALLED) requirements-dev.lock
+	$(PINNED) -r requirements-dev.lock
+	touch $@
+
+demo: $(INSTALLED)
 	$(BIN)/mapfusion run scenarios/quick.yaml
 
 # Two tests at a time, a file's tests one after another: they share what they need. Kernels come first
 # (`tests/conftest.py`), all others as they stand.
-test: $(STAMP)
+test: $(DEVELOPING)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # Thousands of broken inputs, and kills; up to an hour. ONLY=PART for one part.
 SEED ?= 0
-campaign: $(STAMP)
+campaign: $(DEVELOPING)
 	$(BIN)/python -m tests.campaign --seed $(SEED) $(if $(ONLY),--only $(ONLY))
 
-# The wheel in a fresh environment, which takes minutes to install.
-wheel-test: $(STAMP)
+# The wheel in a fresh environment of each version of Python that is here; minutes. COMPILE=1: PyBullet, too,
+# where pip compiles it.
+wheel-test: $(DEVELOPING)
 	$(BIN)/python -m pytest tests/installed_wheel.py -s
 
 # One fault of the source at a time: does a test notice? Hours; `--only NAME` for some.
-seeded-faults: $(STAMP)
+seeded-faults: $(DEVELOPING)
 	$(BIN)/python -m tests.seeded_faults
 
 # Installs Debian's chromium where it is missing (needs root for that).
-browser-test: $(STAMP)
+browser-test: $(DEVELOPING)
 	PYTHON=$(BIN)/python tests/experiments/reports/report/report_in_browser.sh $(RESULT)
 
-lint: $(STAMP)
+lint: $(DEVELOPING)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-check: $(STAMP)
+check: $(INSTALLED)
 	$(BIN)/mapfusion check scenarios/quick.yaml --seeds 0 --junit results/junit.xml
 
-bench: $(STAMP)
+bench: $(DEVELOPING)
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-columns=min,median,max,rounds
 
-paper: $(STAMP)
+paper: $(INSTALLED)
 	$(BIN)/mapfusion run scenarios/paper.yaml
 
 # Compiled kernels of an earlier state of the source, where the command did not keep them apart.
@@ -66,11 +83,12 @@ clean-kernels:
 clean:
 	rm -rf $(VENV) *.egg-info .pytest_cache .ruff_cache
 
-# Renew the pins (hashes, no host names). Needs network.
+# Renew the pins (hashes, no host names) for all versions of Python at once. Needs network.
+LOCK := $(VENV)-lock/bin/uv pip compile --quiet --universal --generate-hashes --no-header --no-annotate
 lock:
 	$(PYTHON) -m venv $(VENV)-lock
-	$(VENV)-lock/bin/python -m pip install --quiet pip-tools
-	$(VENV)-lock/bin/pip-compile --quiet --upgrade --generate-hashes --strip-extras --allow-unsafe --all-extras \
-	    --no-header --no-emit-index-url --no-emit-trusted-host --no-emit-find-links --no-emit-options \
-	    -o requirements.lock pyproject.toml
+	$(VENV)-lock/bin/python -m pip install --quiet uv
+	$(LOCK) --upgrade --extra sim --extra peers pyproject.toml -o requirements.lock
+	$(LOCK) --upgrade --group build -c requirements.lock -o requirements-build.lock
+	$(LOCK) --upgrade --group dev -c requirements.lock -c requirements-build.lock -o requirements-dev.lock
 	rm -rf $(VENV)-lock

@@ -5,7 +5,7 @@ Frames are right-handed: x forward, y left, z up; metres, radians, seconds.
 
 The names below are the public interface. Each is imported at its first use, so that
 `import mapfusion` is fast; `__init__.pyi` declares them for editors and type checkers.
-`experiments/docs/library.md` has an example.
+`mapfusion docs library` shows an example.
 """
 
 import importlib
@@ -13,66 +13,26 @@ from typing import Any
 
 _NAMES_OF = {
     "align.aligners": ("make_aligner",),
-    "align.alignment": (
-        "Alignment",
-        "Status",
-    ),
-    "align.correspondences": (
-        "Correspondences",
-        "MatchParameters",
-        "match",
-    ),
+    "align.alignment": ("Alignment", "Status"),
+    "align.correspondences": ("Correspondences", "MatchParameters", "match"),
     "align.refinement": ("Refinement",),
-    "datasets.formats": (
-        "import_recording",
-        "read_recording",
-    ),
+    "datasets.formats": ("import_recording", "read_recording"),
     "errors": ("InputError",),
     "fastslam.association": ("Association",),
-    "fastslam.filter": (
-        "FastSlam",
-        "FastSlamParameters",
-        "StepResult",
-    ),
-    "fastslam.mapping": (
-        "build_map",
-        "run_log",
-    ),
+    "fastslam.filter": ("FastSlam", "FastSlamParameters", "StepResult"),
+    "fastslam.mapping": ("build_map", "run_log"),
     "fastslam.motion": ("MotionNoise",),
     "fastslam.proposal": ("Proposal",),
-    "fusion.fused_map": (
-        "AlignedPair",
-        "FusedMap",
-        "Fusion",
-        "MergeParameters",
-    ),
-    "fusion.fusers": ("make_fuser",),
+    "fusion.fusers": ("AlignedPair", "FusedMap", "Fusion", "MergeParameters", "make_fuser"),
     "fusion.merge": ("merge_maps",),
-    "fusion.team_graph": (
-        "EdgeStatus",
-        "TeamParameters",
-        "Unconfirmed",
-    ),
-    "landmark_map": (
-        "LandmarkMap",
-        "read_map",
-        "write_map",
-    ),
-    "registration": (
-        "Aligner",
-        "Registered",
-        "Registration",
-    ),
-    "robot_log": (
-        "Observations",
-        "RobotLog",
-        "read_log",
-        "write_log",
-    ),
+    "fusion.team_graph": ("EdgeStatus", "TeamParameters", "Unconfirmed"),
+    "landmark_map": ("LandmarkMap", "read_map", "write_map"),
+    "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
     "smoother.joint_smoothing": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),
     "verification.regions": ("EvidenceParameters",),
-    "verification.verdict": ("Judge",),
+    "verification.registration": ("Aligner", "Registered", "Registration"),
+    "verification.verdict": ("Verifier",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 _CALLED_THERE = {"merge_maps": "merge"}
@@ -84,7 +44,9 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         from importlib.metadata import version
 
-        return version("mapfusion")
+        from mapfusion.errors import DISTRIBUTION
+
+        return version(DISTRIBUTION)
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = importlib.import_module(f"{__name__}.{_MODULE_OF[name]}")

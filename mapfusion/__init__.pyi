@@ -16,10 +16,10 @@ from mapfusion.fastslam.mapping import build_map as build_map
 from mapfusion.fastslam.mapping import run_log as run_log
 from mapfusion.fastslam.motion import MotionNoise as MotionNoise
 from mapfusion.fastslam.proposal import Proposal as Proposal
-from mapfusion.fusion.fused_map import AlignedPair as AlignedPair
-from mapfusion.fusion.fused_map import FusedMap as FusedMap
-from mapfusion.fusion.fused_map import Fusion as Fusion
-from mapfusion.fusion.fused_map import MergeParameters as MergeParameters
+from mapfusion.fusion.fusers import AlignedPair as AlignedPair
+from mapfusion.fusion.fusers import FusedMap as FusedMap
+from mapfusion.fusion.fusers import Fusion as Fusion
+from mapfusion.fusion.fusers import MergeParameters as MergeParameters
 from mapfusion.fusion.fusers import make_fuser as make_fuser
 from mapfusion.fusion.merge import merge as _merge
 from mapfusion.fusion.team_graph import EdgeStatus as EdgeStatus
@@ -28,9 +28,6 @@ from mapfusion.fusion.team_graph import Unconfirmed as Unconfirmed
 from mapfusion.landmark_map import LandmarkMap as LandmarkMap
 from mapfusion.landmark_map import read_map as read_map
 from mapfusion.landmark_map import write_map as write_map
-from mapfusion.registration import Aligner as Aligner
-from mapfusion.registration import Registered as Registered
-from mapfusion.registration import Registration as Registration
 from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log
@@ -38,7 +35,10 @@ from mapfusion.robot_log import write_log as write_log
 from mapfusion.smoother.joint_smoothing import AssociatedLog as AssociatedLog
 from mapfusion.verification.false_alarms import Acceptance as Acceptance
 from mapfusion.verification.regions import EvidenceParameters as EvidenceParameters
-from mapfusion.verification.verdict import Judge as Judge
+from mapfusion.verification.registration import Aligner as Aligner
+from mapfusion.verification.registration import Registered as Registered
+from mapfusion.verification.registration import Registration as Registration
+from mapfusion.verification.verdict import Verifier as Verifier
 
 merge_maps = _merge  # `merge` is the module
 __version__: str

@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+DISTRIBUTION = "mapfusion-bench"  # on the Python package index; the import package is `mapfusion`
 MOST_CHARACTERS = 500  # of a message: enough for the longest one with two long paths
 _MAX_WORD = 120  # characters of a word, usually a path
 _GAP = "..."
@@ -77,6 +78,16 @@ class NameClashWarning(TellingWarning):
     """Warning that two methods have the same name; the message tells which one is used."""
 
 
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra of our distribution."""
+    return f"pip install '{DISTRIBUTION}[{extra}]'"
+
+
+def not_installed(package: str, extra: str) -> str:
+    """Return a sentence that a package of an extra is missing, and how to install it."""
+    return f"the package {package} is not installed; {install_command(extra)} installs it"
+
+
 def did_you_mean(wrong: str, known: Iterable[str]) -> str:
     """Return the end of a message about an unknown name: similar known names, or nothing."""
     like = difflib.get_close_matches(wrong, list(known), _MAX_SUGGESTIONS, _MIN_SIMILARITY)
@@ -92,7 +103,13 @@ def one_line(text: str) -> str:
     escaped = "".join(
         c if c.isprintable() or c.isspace() else c.encode("unicode_escape").decode() for c in text
     )
-    words = [_shortened(word) for word in escaped.split()]
+    first = 2 * _MAX_WORD // 3  # of a word that is too long; its end stays, too
+    words = [
+        word
+        if len(word) <= _MAX_WORD
+        else word[:first] + _GAP + word[len(word) - _MAX_WORD + first + len(_GAP) :]
+        for word in escaped.split()
+    ]
     line = " ".join(words)
     if len(line) <= MOST_CHARACTERS:
         return line
@@ -105,14 +122,6 @@ def _first_of(words: Sequence[str], most: int) -> list[str]:
     """Return as many of the first words as fit into `most` characters, with blanks between."""
     ends = itertools.accumulate(len(word) + 1 for word in words)
     return [word for word, end in zip(words, ends, strict=True) if end - 1 <= most]
-
-
-def _shortened(word: str) -> str:
-    """Return the beginning and the end of a word that is too long."""
-    if len(word) <= _MAX_WORD:
-        return word
-    first = 2 * _MAX_WORD // 3
-    return word[:first] + _GAP + word[len(word) - _MAX_WORD + first + len(_GAP) :]
 
 
 # New modules, and the former modules that plug-ins may import; all names without `mapfusion.`.
@@ -129,10 +138,8 @@ _FORMER_MODULES = {
     "attitude": "attitude_drift",
     "landmark_map": "joint_files",
     "viewing": "viewing_files",
-    "registration": "align.registration align.supported align.completion",
-    "align.alignment": "align.result align.pairs",
+    "align.alignment": "align.result align.pairs align.method align.degeneracy",
     "align.rigid_motion": "align.rigid",
-    "align.method": "align.degeneracy",
     "align.correspondences": "align.nearest_descriptors",
     "align.mahalanobis_gate": "align.near_pairs align.leverage",
     "align.drift": "align.calibration_part",
@@ -140,7 +147,9 @@ _FORMER_MODULES = {
     "align.clique": "align.max_clique",
     "align.nearest_neighbours": "align.box_tree align.nearest_points align.closest",
     "align.icp": "align.impicp",
-    "align.refinement": "align.refine",
+    "align.refinement": "align.refine align.oracle",
+    "align.ransac": "align.ransac_mahalanobis",
+    "align.peers": "align.peers.opencv align.peers.kiss_matcher",
     "align.aligners": "align.registry",
     "verification": "evidence",
     "verification.false_alarms": "align.false_alarms align.named_landmarks align.acceptance",
@@ -148,11 +157,16 @@ _FORMER_MODULES = {
     "verification.regions": "evidence.found evidence.regions evidence.parameters",
     "verification.rivals": "evidence.copies evidence.twins evidence.rivals",
     "verification.likelihood": "evidence.likelihood evidence.probability",
+    "verification.registration": (
+        "registration align.registration align.supported align.completion"
+    ),
     "verification.verdict": "evidence.precision evidence.pair_evidence evidence.judge",
     "fusion": "fuse team",
     "fusion.aligned_landmarks": "aligned_landmarks same_point fuse.clusters",
-    "fusion.fused_map": "fused_map name_order fuse.parameters fuse.component",
-    "fusion.fusers": "fuse.fuser fuse.registry",
+    "fusion.fusers": (
+        "fuse.fuser fuse.registry fuse.parameters fuse.component fusion.fused_map fused_map "
+        "name_order"
+    ),
     "fusion.kalman": "fuse.sequential fuse.kalman fuse.kalman_drift",
     "fusion.covariance_intersection": "fuse.covariance_intersection",
     "fusion.joint": "fuse.jointly_fused fuse.joint",

@@ -4,7 +4,7 @@ A file of another program needs no metadata and may omit columns that have a def
 have any width, and lists any list type. In CSV, a list consists of columns NAME_0, NAME_1, ... (or
 from NAME_1 on). Data without any height column (z_m and its covariances) are planar. A column whose
 name is similar to a known name is rejected, since an omitted column may change the meaning of the
-data. `experiments/docs/formats.md` lists all columns.
+data. `mapfusion docs formats` lists all columns.
 """
 
 import re
@@ -113,7 +113,7 @@ def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict
     planar = not set(HEIGHT) & set(names)
     found = {field.name: _column(path, table, field, planar) for field in table_schema}
     if missing := [name for name, values in found.items() if values is None]:
-        remedy = f"experiments/docs/formats.md describes the columns of a {kind} table"
+        remedy = f"`mapfusion docs formats` describes the columns of a {kind} table"
         if here := [f"{name} for {similar[name]}" for name in missing if name in similar]:
             more = ", ..." if len(here) > _MAX_NAMED else ""
             remedy = f"did you mean {', '.join(here[:_MAX_NAMED])}{more}?"

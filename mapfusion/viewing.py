@@ -62,6 +62,23 @@ class FieldOfView:
         require_shape("range_m", self.range_m, (2,))
         require_shape("height_m", self.height_m, (RANGES, 2))
 
+    @classmethod
+    def of(cls, bearing_rad: Float, range_m: Float, height_m: Float) -> "FieldOfView":
+        """Return the field of view of observations (n,); an empty one without observations."""
+        heights = np.tile([1.0, 0.0], (RANGES, 1))
+        if not len(range_m):
+            return cls(np.zeros(2), np.zeros(2), heights)
+        nearest, farthest = _ends(range_m)
+        # Outliers beyond the greatest range are in step RANGES, which has no height limits.
+        step = np.minimum(np.floor(range_m / max(farthest, 1e-9) * RANGES), RANGES).astype(np.int8)
+        by_step = height_m[np.argsort(step, kind="stable")]
+        starts = np.concatenate([[0], np.cumsum(np.bincount(step, minlength=RANGES))])
+        for k in range(RANGES):
+            own = by_step[starts[k] : starts[k + 1]]
+            if len(own) >= _MIN_SIGHTINGS:
+                heights[k] = _ends(own)
+        return cls(_ends(bearing_rad), np.array([nearest, farthest]), heights)
+
 
 @dataclass(frozen=True)
 class Viewing:
@@ -133,7 +150,7 @@ class LogSightings(NamedTuple):
         """Return the viewing evidence of a map; for the arguments see `viewing_of_log`."""
         n_seen = min(int(np.searchsorted(self.frame, len(path))), len(landmark))
         bearing, range_m, height = (part[:n_seen] for part in self[1:])
-        field = _field_of_view(bearing, range_m, height)
+        field = FieldOfView.of(bearing, range_m, height)
         n = len(source_observation)
         owner, row_of = landmark[:n_seen], np.full(len(self.frame) + 1, -1, dtype=np.int64)
         row_of[source_observation] = np.arange(n)
@@ -175,23 +192,6 @@ def bearing_bin(bearing_rad: Float, field: FieldOfView) -> np.ndarray:
     low, high = field.bearing_rad
     part = np.floor((bearing_rad - low) / max(high - low, 1e-9) * BEARINGS)
     return np.clip(part, 0, BEARINGS - 1).astype(np.int64)
-
-
-def _field_of_view(bearing_rad: Float, range_m: Float, height_m: Float) -> FieldOfView:
-    """Return the field of view of observations (n,); an empty one without observations."""
-    heights = np.tile([1.0, 0.0], (RANGES, 1))
-    if not len(range_m):
-        return FieldOfView(np.zeros(2), np.zeros(2), heights)
-    nearest, farthest = _ends(range_m)
-    # Outliers beyond the greatest range are in step RANGES, which has no height limits.
-    step = np.minimum(np.floor(range_m / max(farthest, 1e-9) * RANGES), RANGES).astype(np.int8)
-    by_step = height_m[np.argsort(step, kind="stable")]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(step, minlength=RANGES))])
-    for k in range(RANGES):
-        own = by_step[starts[k] : starts[k + 1]]
-        if len(own) >= _MIN_SIGHTINGS:
-            heights[k] = _ends(own)
-    return FieldOfView(_ends(bearing_rad), np.array([nearest, farthest]), heights)
 
 
 def _ends(values: Float) -> Float:

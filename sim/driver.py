@@ -257,7 +257,8 @@ class _Driver:
         self._speed_m_s = 0.0
         self._turn_rad_s = 0.0
         self._nearest_m = np.inf
-        self._progress_s = 0.0
+        # time at which it last came nearer to its waypoint or visited one
+        self.progress_s = 0.0
         self._turning = False
         self.yields_to: int | None = None  # index of the robot that it stops for
         # no robot beyond this distance blocks it, with a margin for rounding
@@ -293,15 +294,6 @@ class _Driver:
         for each in self._holds:
             self._holding_for |= each.waits_for(came, now, clearance_m)
 
-    def excuse_until(self, time_s: float) -> None:
-        """Do not count the time until `time_s` as time without progress."""
-        self._progress_s = max(self._progress_s, time_s)
-
-    @property
-    def progress_s(self) -> float:
-        """Time at which the robot last came nearer to its waypoint or visited one."""
-        return self._progress_s
-
     def control(self, time_s: float, pose: Pose, others: Iterable[_Other]) -> None:
         """Perform one control step, given the poses of all robots."""
         settings = self._settings
@@ -328,15 +320,15 @@ class _Driver:
             if self._target == len(self._waypoints_m):
                 self.finished = not self._route.loop
                 self._target = 0
-            self._nearest_m, self._progress_s = np.inf, time_s
+            self._nearest_m, self.progress_s = np.inf, time_s
             distance = self._distance_m(pose)
         if self.finished or self._holding_for or distance < self._nearest_m - PROGRESS_M:
-            self._nearest_m, self._progress_s = distance, time_s
-        if time_s - self._progress_s > self._settings.patience_s:
+            self._nearest_m, self.progress_s = distance, time_s
+        if time_s - self.progress_s > self._settings.patience_s:
             why = "waits for another robot" if self.yields_to is not None else "is stuck"
             raise InputError(
                 f"robot {self._route.robot}: {why} at {format_point(pose)} since t = "
-                f"{self._progress_s:.1f} s, on the way to waypoint {self._target + 1} "
+                f"{self.progress_s:.1f} s, on the way to waypoint {self._target + 1} "
                 f"{format_point(self._waypoints_m[self._target])}"
             )
 
@@ -428,7 +420,8 @@ class _DeadlockMonitor:
         self._deadlock = deadlock
         for i in waits_for.keys() - set(deadlock):
             ahead = [self._drivers[k] for k in waits_for[i] if not self._drivers[k].finished]
-            self._drivers[i].excuse_until(max((each.progress_s for each in ahead), default=0))
+            driver = self._drivers[i]
+            driver.progress_s = max([driver.progress_s, *(each.progress_s for each in ahead)])
         if self._n_steps != DEADLOCK_S * CONTROL_HZ or len(self._holds) == self._most_holds:
             return None
         self.record(now)

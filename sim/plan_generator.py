@@ -253,7 +253,7 @@ class GeneratedWorld:
     Attributes:
         plan: rooms, doors and walls.
         routes: one route per robot.
-        overlap: achieved overlap, see `ground_overlap`; mean over the pairs of robots.
+        overlap: achieved overlap, see `ground_overlaps`; mean over the pairs of robots.
     """
 
     plan: GeneratedPlan
@@ -312,8 +312,19 @@ def _best_routes(
     if not all(per_wing):
         return None
     offered = per_wing if len(per_wing) > 1 else per_wing * parameters.robots
-    choices = _draw_choices([len(loops) for loops in offered], rng)
-    shared = _pairwise_overlap(
+    # loop indices of each robot, shape (C, R), with at most MOST_CHOICES rows
+    n_offered = [len(loops) for loops in offered]
+    if math.prod(n_offered) > MOST_LISTED:
+        shape = MOST_CHOICES, len(n_offered)
+        drawn = rng.integers(n_offered, size=shape)
+        # robots share some of the drawn loops, so the sets cover the range of overlaps
+        n_taken = rng.integers(1, len(n_offered), size=MOST_CHOICES, endpoint=True)
+        taken = rng.integers(n_taken[:, None], size=shape)
+        choices = np.take_along_axis(drawn, taken, axis=1) % n_offered
+    else:
+        choices = np.array(list(itertools.product(*map(range, n_offered))))
+        choices = choices[rng.permutation(len(choices))[:MOST_CHOICES]]
+    shared = ground_overlaps(
         [np.concatenate([loop, loop[:1]]) for loops in per_wing for loop in loops]
     )
     first = (
@@ -334,19 +345,6 @@ def _best_routes(
                 best_miss = abs(overlap - parameters.overlap)
                 best = GeneratedWorld(plan, routes, overlap)
     return best
-
-
-def _draw_choices(n_offered: list[int], rng: np.random.Generator) -> np.ndarray:
-    """Return loop indices of each robot, shape (C, R), with at most MOST_CHOICES rows."""
-    if math.prod(n_offered) > MOST_LISTED:
-        shape = MOST_CHOICES, len(n_offered)
-        drawn = rng.integers(n_offered, size=shape)
-        # robots share some of the drawn loops, so the sets cover the range of overlaps
-        n_taken = rng.integers(1, len(n_offered), size=MOST_CHOICES, endpoint=True)
-        taken = rng.integers(n_taken[:, None], size=shape)
-        return np.take_along_axis(drawn, taken, axis=1) % n_offered
-    choices = np.array(list(itertools.product(*map(range, n_offered))))
-    return choices[rng.permutation(len(choices))[:MOST_CHOICES]]
 
 
 def _loops(wing: Wing, parameters: RouteParameters, westward: bool) -> list[Float]:
@@ -397,13 +395,8 @@ def _draw_starts(
     return tuple(routes)
 
 
-def ground_overlap(path_a_m: Float, path_b_m: Float) -> float:
-    """Return intersection over union of the ground along two paths, shape (N, 2) and (M, 2)."""
-    return float(_pairwise_overlap([path_a_m, path_b_m])[0, 1])
-
-
-def _pairwise_overlap(paths: Sequence[Float]) -> Float:
-    """Return `ground_overlap` of all pairs of paths, shape (P, P)."""
+def ground_overlaps(paths: Sequence[Float]) -> Float:
+    """Return intersection over union of the ground along pairs of paths (N, 2), shape (P, P)."""
     # imported here, because most commands draw no routes
     from scipy.sparse import csr_array
 

@@ -7,12 +7,13 @@ import subprocess
 import sys
 from typing import Any, Literal
 
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, not_installed
 
 BulletRenderer = Literal["tiny", "egl"]
 Renderer = Literal["tiny", "egl", "raycast"]
 NAMES = {"tiny": "TinyRenderer", "raycast": "our ray caster"}
 PLUGIN, PLUGIN_SYMBOL = "eglRenderer", "_eglRendererPlugin"
+NEWEST_WHEEL = (3, 11)  # last version of Python with wheels of PyBullet
 PROBE_S = 60  # the first image takes a second, on a slow disk a few seconds
 NEEDED = (
     "render.renderer: egl does not work here ({reason}); it needs PyBullet's plug-in and the "
@@ -22,12 +23,22 @@ NEEDED = (
 _PROBE = "from sim.renderer import probe; probe()"
 
 
+def require_pybullet() -> None:
+    """Raise InputError if PyBullet is not installed; nothing is imported."""
+    if importlib.util.find_spec("pybullet") is None:
+        how = not_installed("pybullet", "sim")
+        if sys.version_info[:2] > NEWEST_WHEEL:
+            how += " (pip compiles it for this Python, see `mapfusion docs installation`)"
+        raise InputError(f"a simulated world needs PyBullet: {how}")
+
+
 @functools.cache
 def egl_driver() -> str:
     """Return name and version of the EGL driver; raises InputError without a working one.
 
     The test runs in a process of its own, because the plug-in ends its process without a driver.
     """
+    require_pybullet()
     if importlib.util.find_spec(PLUGIN) is None:
         raise InputError(NEEDED.format(reason="the plug-in is not installed"))
     root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))

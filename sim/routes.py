@@ -63,7 +63,34 @@ def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
         if names.count(name) > 1:
             raise InputError(f"robot {name}: two robots have this name")
     for route in routes:
-        _check_free_space(plan, route)
+        # room at the waypoints and between them
+        points = np.concatenate([route.T_world_start[None, :2], route.waypoints_m])
+        labels = ["start", *(f"waypoint {i}" for i in range(1, len(points)))]
+        on_floor, clearance = plan.contains(points), plan.clearance_m(points)
+        for label, point, inside, room in zip(labels, points, on_floor, clearance, strict=True):
+            where = f"robot {route.robot}: {label} {format_point(point)}"
+            if not inside:
+                raise InputError(f"{where} lies outside the world")
+            if room < 0:
+                raise InputError(f"{where} lies inside a wall")
+            if room < OUTER_RADIUS_M:
+                raise InputError(
+                    f"{where} is {room:.2f} m from a wall, turning needs {OUTER_RADIUS_M:.2f} m"
+                )
+        ends = list(range(1, len(points))) + ([1] if route.loop else [])
+        starts = list(range(len(ends)))
+        for start, end in zip(starts, ends, strict=True):
+            room = plan.leg_clearance_m(points[start], points[end])
+            where = (
+                f"robot {route.robot}: the way from {labels[start]} {format_point(points[start])} "
+                f"to {labels[end]} {format_point(points[end])}"
+            )
+            if room < 0:
+                raise InputError(f"{where} leads through a wall")
+            if room < WIDTH_M / 2:
+                raise InputError(
+                    f"{where} passes a wall at {room:.2f} m, the robot needs {WIDTH_M / 2:.2f} m"
+                )
     for i, first in enumerate(routes):
         for second in routes[i + 1 :]:
             gap = np.hypot(*(first.T_world_start - second.T_world_start)[:2])
@@ -72,37 +99,6 @@ def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
                     f"robots {first.robot} and {second.robot}: they start {gap:.2f} m apart, "
                     f"at {format_point(first.T_world_start)}; {2 * OUTER_RADIUS_M:.2f} m are needed"
                 )
-
-
-def _check_free_space(plan: FloorPlan, route: Route) -> None:
-    """Raise InputError if a robot has not enough room at its waypoints or between them."""
-    points = np.concatenate([route.T_world_start[None, :2], route.waypoints_m])
-    labels = ["start", *(f"waypoint {i}" for i in range(1, len(points)))]
-    on_floor, clearance = plan.contains(points), plan.clearance_m(points)
-    for label, point, inside, room in zip(labels, points, on_floor, clearance, strict=True):
-        where = f"robot {route.robot}: {label} {format_point(point)}"
-        if not inside:
-            raise InputError(f"{where} lies outside the world")
-        if room < 0:
-            raise InputError(f"{where} lies inside a wall")
-        if room < OUTER_RADIUS_M:
-            raise InputError(
-                f"{where} is {room:.2f} m from a wall, turning needs {OUTER_RADIUS_M:.2f} m"
-            )
-    ends = list(range(1, len(points))) + ([1] if route.loop else [])
-    starts = list(range(len(ends)))
-    for start, end in zip(starts, ends, strict=True):
-        room = plan.leg_clearance_m(points[start], points[end])
-        where = (
-            f"robot {route.robot}: the way from {labels[start]} {format_point(points[start])} "
-            f"to {labels[end]} {format_point(points[end])}"
-        )
-        if room < 0:
-            raise InputError(f"{where} leads through a wall")
-        if room < WIDTH_M / 2:
-            raise InputError(
-                f"{where} passes a wall at {room:.2f} m, the robot needs {WIDTH_M / 2:.2f} m"
-            )
 
 
 # Least distance between two tried positions of a hold; a smaller step has no effect.

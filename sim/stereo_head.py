@@ -11,8 +11,8 @@ from typing import Annotated
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import ndtri
 
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, kernel
@@ -51,7 +51,7 @@ HALF = np.float32(0.5)  # keeps the sum in single precision
 @functools.cache
 def normal_values() -> np.ndarray:
     """Return equally likely values of a standard normal variable, ascending, shape (VALUES,)."""
-    quantiles = ndtri((np.arange(VALUES) + 0.5) / VALUES)
+    quantiles = scipy.special.ndtri((np.arange(VALUES) + 0.5) / VALUES)
     return (quantiles / quantiles.std()).astype(np.float32)
 
 

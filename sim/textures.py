@@ -151,35 +151,28 @@ def _paint_shapes(
     ):
         scale = scale_m * style.texels_per_m
         n = rng.poisson(coverage * texture.coverage * width * height / scale**2)
-        _paint_polygons(picture, scale, n, contrast, rng)
+        # n convex polygons of about this size at random positions
+        center = rng.uniform((0, 0), (width, height), (n, 2))
+        corners = rng.integers(3, _MOST_CORNERS + 1, n)
+        radius = 0.5 * scale * rng.uniform(0.6, 1.3, n)
+        stretch = rng.uniform(0.5, 1.0, n)
+        turn = rng.uniform(0, 2 * np.pi, (n, 2))
+        jitter = rng.uniform(-0.3, 0.3, (n, _MOST_CORNERS))
+        colour = _colours(n, contrast, rng).tolist()
+        # all polygons have `_MOST_CORNERS` corners; only the first `corners` of each are painted
+        share = (np.arange(_MOST_CORNERS) + jitter) / corners[:, None]
+        angle = turn[:, :1] + 2 * np.pi * share
+        x, y = np.cos(angle), stretch[:, None] * np.sin(angle)
+        cos, sin = np.cos(turn[:, 1:]), np.sin(turn[:, 1:])
+        turned = np.stack([cos * x - sin * y, sin * x + cos * y], -1)
+        points = center[:, None] + radius[:, None, None] * turned
+        fixed_point = np.round(points * 2**_SUBTEXEL_BITS).astype(np.int32)
+        for polygon, k, rgb in zip(fixed_point, corners.tolist(), colour, strict=True):
+            cv2.fillConvexPoly(picture, polygon[:k], rgb, cv2.LINE_8, _SUBTEXEL_BITS)
     if texture.contrast < 1:
         above = picture.astype(np.float32) - plain
         picture = np.rint(plain + texture.contrast * above).astype(np.uint8)
     return cv2.GaussianBlur(picture, (0, 0), style.low_pass_m * style.texels_per_m)
-
-
-def _paint_polygons(
-    picture: np.ndarray, scale: float, n: int, contrast: float, rng: np.random.Generator
-) -> None:
-    """Paint n convex polygons with a size of about `scale` texels at random positions."""
-    height, width = picture.shape[:2]
-    center = rng.uniform((0, 0), (width, height), (n, 2))
-    corners = rng.integers(3, _MOST_CORNERS + 1, n)
-    radius = 0.5 * scale * rng.uniform(0.6, 1.3, n)
-    stretch = rng.uniform(0.5, 1.0, n)
-    turn = rng.uniform(0, 2 * np.pi, (n, 2))
-    jitter = rng.uniform(-0.3, 0.3, (n, _MOST_CORNERS))
-    colour = _colours(n, contrast, rng).tolist()
-    # all polygons have `_MOST_CORNERS` corners here; only the first `corners` of each are painted
-    share = (np.arange(_MOST_CORNERS) + jitter) / corners[:, None]
-    angle = turn[:, :1] + 2 * np.pi * share
-    x, y = np.cos(angle), stretch[:, None] * np.sin(angle)
-    cos, sin = np.cos(turn[:, 1:]), np.sin(turn[:, 1:])
-    turned = np.stack([cos * x - sin * y, sin * x + cos * y], -1)
-    points = center[:, None] + radius[:, None, None] * turned
-    fixed_point = np.round(points * 2**_SUBTEXEL_BITS).astype(np.int32)
-    for polygon, k, rgb in zip(fixed_point, corners.tolist(), colour, strict=True):
-        cv2.fillConvexPoly(picture, polygon[:k], rgb, cv2.LINE_8, _SUBTEXEL_BITS)
 
 
 def _colours(n: int, contrast: float, rng: np.random.Generator) -> np.ndarray:

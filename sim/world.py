@@ -18,7 +18,7 @@ from mapfusion.errors import DamagedFileError
 from mapfusion.files import name_in_text, require_file, write_whole
 from mapfusion.geometry.numerics import Float
 from sim.floorplan import FloorPlan
-from sim.renderer import BulletRenderer, egl_driver, load_egl
+from sim.renderer import BulletRenderer, egl_driver, load_egl, require_pybullet
 from sim.textures import DEFAULT_TEXTURE, Texture, paint, paint_posters
 
 GRAVITY_M_S2 = 9.81
@@ -65,7 +65,7 @@ class World:
     """PyBullet client without a screen, for a `with` block.
 
     Args:
-        renderer: renderer of the client; raises InputError if it does not work.
+        renderer: renderer of the client; raises InputError without PyBullet or if it does not work.
 
     Attributes:
         renderer: renderer of the client.
@@ -74,6 +74,7 @@ class World:
     """
 
     def __init__(self, renderer: BulletRenderer = "tiny") -> None:
+        require_pybullet()
         if renderer == "egl":
             egl_driver()  # raises InputError without a driver
         self.renderer = renderer

@@ -12,6 +12,13 @@ from typing import Annotated
 
 import typer
 
+from experiments.cli.completion import (
+    complete_aligner,
+    complete_format,
+    complete_scenario,
+    complete_scenario_or_tag,
+    complete_setting,
+)
 from experiments.reports.formatting import plain
 from mapfusion.errors import InputError
 
@@ -28,14 +35,28 @@ ALL_CORES = (
 # Options with a mutable default have it here, not in the signature of a command.
 ScenarioNames = Annotated[
     list[str],
-    typer.Argument(metavar="SCENARIO...", help="Scenario files, or names or tags of the suite."),
+    typer.Argument(
+        metavar="SCENARIO...",
+        help="Scenario files, or names or tags of the suite.",
+        autocompletion=complete_scenario_or_tag,
+    ),
 ]
 OneScenario = Annotated[
-    str, typer.Argument(metavar="SCENARIO", help="Scenario file, or a name of the suite.")
+    str,
+    typer.Argument(
+        metavar="SCENARIO",
+        help="Scenario file, or a name of the suite.",
+        autocompletion=complete_scenario,
+    ),
 ]
 SettingsOf = Annotated[
     str | None,
-    typer.Option("--scenario", metavar="SCENARIO", help="File or name whose settings to use."),
+    typer.Option(
+        "--scenario",
+        metavar="SCENARIO",
+        help="File or name whose settings to use.",
+        autocompletion=complete_scenario,
+    ),
 ]
 ResultFolder = Annotated[Path, typer.Argument(metavar="RESULT", help="A run's result folder.")]
 Overrides = Annotated[
@@ -46,6 +67,18 @@ Overrides = Annotated[
         default_factory=list,
         show_default=False,
         help="Replaces a value of the scenario, e.g. slam.filter.n_particles=50.",
+        autocompletion=complete_setting,
+    ),
+]
+Aligners = Annotated[
+    list[str],
+    typer.Option(
+        "--aligner",
+        metavar="NAME",
+        default_factory=list,
+        show_default=False,
+        help="Only this aligner: a name, or a class of yours as FILE.py:CLASS; may be repeated.",
+        autocompletion=complete_aligner,
     ),
 ]
 ImportOverrides = Annotated[
@@ -65,11 +98,15 @@ Format = Annotated[
         metavar="FORMAT",
         help="tum, kitti (paths), g2o (graph), ply (maps), rerun of results; "
         "log, euroc, kitti, rosbag, rosbag2 of runs.",
+        autocompletion=complete_format,
     ),
 ]
 Seed = Annotated[int | None, typer.Option(help="Replaces the scenario's seed (0).", min=0)]
 Seeds = Annotated[str, typer.Option(help="A seed, a range 0..4 or a list 0,2,5.")]
 Jobs = Annotated[int, typer.Option(help="Processes.", min=1, show_default="all cores")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Check the input and print the plan; run nothing.")
+]
 Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
 Results = Annotated[Path, typer.Option(help="Folder that results go to.", show_default="results")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.cli import options
+from experiments.cli.completion import complete_scenario
 from mapfusion.errors import InputError
 
 app = typer.Typer()
@@ -19,46 +20,67 @@ def run(
     scenarios: options.ScenarioNames,
     *,
     seed: options.Seed = None,
+    aligners: options.Aligners,
     overrides: options.Overrides,
     jobs: options.Jobs = options.ALL_CORES,
     fresh: options.Fresh = False,
+    no_figures: Annotated[
+        bool, typer.Option("--no-figures", help="Draw no figures, which saves time.")
+    ] = False,
+    dry_run: options.DryRun = False,
     results: options.Results = options.RESULTS,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="Folder; RESULTS/NAME-SEED by default."),
     ] = None,
 ) -> None:
-    """Simulate, map, align, merge, evaluate and draw: `mapfusion run scenarios/quick.yaml`.
+    """Simulate, map, align, merge, evaluate and draw: `mapfusion run quick`.
 
-    Finished stages are reused, so an interrupted run continues. Exit code 1 if no robot's map can
-    be used.
+    Finished stages are reused, so an interrupted run continues. The last two lines name the method
+    to use, and the command that opens the report. Exit code 1 if no robot's map can be used.
     """
     from experiments.cli.options import require_result_folder
     from experiments.evaluation.metrics import load_checked
-    from experiments.scenario.suite import scenarios_of
+    from experiments.scenario.suite import scenarios_of, with_aligners
 
     require_result_folder(output)
-    checked = [load_checked(path, overrides, seed) for path in scenarios_of(scenarios)]
+    checked = [
+        load_checked(path, with_aligners(path, overrides, aligners), seed)
+        for path in scenarios_of(scenarios)
+    ]
     if output is not None and len(checked) > 1:
         several = f"is one folder for {len(checked)} runs; give --results"
         raise InputError(f"--output {output}: {several}")
+    if dry_run:
+        from experiments.evaluation.run_plan import plan_run
+        from experiments.reports.terminal.run_screen import print_plan
+
+        for loaded in checked:
+            print_plan(plan_run(loaded, results, jobs, fresh), results, jobs)
+        return
     # The imports for drawing are slow: wrong scenarios are refused before.
     from experiments.evaluation.criteria import nothing_merged
     from experiments.evaluation.evaluated_run import finding_lines, has_usable_map
     from experiments.evaluation.result import add_times, run_scenario
     from experiments.pipeline.workers import workers
-    from experiments.reports.figures.drawing import Drawing
+    from experiments.reports.figures.drawing import Drawing, remove_figures
     from experiments.reports.terminal import layout, run_screen
 
     unusable = False
     start = {"start": {"run": time.process_time()}}  # shared by all scenarios
     for loaded in checked:
+        times, skipped = dict(start), None
         with layout.progress() as show, workers(jobs) as pool:
-            drawing = Drawing(pool)
-            folder = run_scenario(loaded, results, jobs, show, fresh, output, drawing.written)
-            drawn = drawing.finish(folder, partial(show, _DRAWING))
-        add_times(folder, start | {"figures": drawn.elapsed_s})
-        run_screen.print_result(folder, drawn.skipped)
+            if no_figures:
+                folder = run_scenario(loaded, results, jobs, show, fresh, output)
+                remove_figures(folder)  # those of an earlier run do not belong to these tables
+            else:
+                drawing = Drawing(pool)
+                folder = run_scenario(loaded, results, jobs, show, fresh, output, drawing.written)
+                drawn = drawing.finish(folder, partial(show, _DRAWING))
+                times, skipped = times | {"figures": drawn.elapsed_s}, drawn.skipped
+        add_times(folder, times)
+        run_screen.print_result(folder, skipped)
         for line in finding_lines(folder):
             options.print_to_stderr(f"warning: {line}")
         if nothing := nothing_merged(folder):
@@ -68,6 +90,7 @@ def run(
                 f"{folder}: no robot's map can be used: all are empty or contradicted"
             )
             unusable = True
+        layout.print_lines(run_screen.closing_lines(folder))
     if unusable:
         raise typer.Exit(options.EXIT_FAILED)
 
@@ -82,6 +105,9 @@ def report(
     ] = None,
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw RESULT/figures again first, from its tables.")
+    ] = False,
+    open_it: Annotated[
+        bool, typer.Option("--open", help="Open the file in the browser, too.")
     ] = False,
     jobs: options.Jobs = options.ALL_CORES,
 ) -> None:
@@ -100,6 +126,11 @@ def report(
         layout.print_paths(result / "figures", drawn.files, drawn.skipped)
     path = write_report(result, output)
     layout.print_lines([f"{path} ({path.stat().st_size / 1e6:.1f} MB)"])
+    if open_it:
+        import webbrowser
+
+        if not webbrowser.open(path.resolve().as_uri()):
+            options.print_to_stderr(f"warning: no browser was found; open {path} in one")
 
 
 @app.command(rich_help_panel=options.LOOK)
@@ -113,7 +144,7 @@ def export(
 ) -> None:
     """Write a result in other programs' formats: `mapfusion export results/quick-0 --format tum`.
 
-    For files, frames and keys see experiments/docs/export.md.
+    `mapfusion docs export` describes files, frames and keys.
     """
     from experiments.cli.options import require_folder
     from experiments.reports.result_export import export_result
@@ -131,6 +162,21 @@ def inspect_command(
     from experiments.reports.inspect import inspect
 
     inspect(path)
+
+
+@app.command(rich_help_panel=options.LOOK)
+def docs(
+    page: Annotated[
+        str | None, typer.Argument(metavar="[PAGE]", help="Name of a page; lists all without.")
+    ] = None,
+) -> None:
+    """Show a page of the manual: `mapfusion docs formats`."""
+    from experiments.reports.terminal import layout
+
+    if page is None:
+        layout.print_pages()
+    else:
+        layout.print_page(page)
 
 
 @app.command(rich_help_panel=options.RUN)
@@ -192,7 +238,12 @@ def list_scenarios(
     ] = None,
     *,
     copy: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Write scenarios/NAME.yaml instead, to edit.")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Write scenarios/NAME.yaml and its schema instead, to edit.",
+            autocompletion=complete_scenario,
+        ),
     ] = None,
     aligners: Annotated[
         bool, typer.Option("--aligners", help="List the methods they can name instead.")
@@ -202,10 +253,13 @@ def list_scenarios(
     ] = False,
 ) -> None:
     """List the suite, with the tags that `run` and `check` take: `mapfusion scenarios`."""
-    from experiments.scenario.suite import copy_to_edit, entries
+    from experiments.scenario.suite import entries
 
     if copy is not None:
-        typer.echo(copy_to_edit(copy))
+        from experiments.scenario.editable_copy import copy_to_edit
+
+        for path in copy_to_edit(copy):
+            typer.echo(path)
         return
     if schema:
         from experiments.scenario.loading import schema_text

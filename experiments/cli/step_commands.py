@@ -23,8 +23,8 @@ def record(
 ) -> None:
     """Simulate, and write the log and truth of each robot: `mapfusion record S -o logs`.
 
-    `--format` writes images, odometry and truth for other programs, see
-    experiments/docs/recordings.md.
+    `--format` writes images, odometry and truth for other programs, see `mapfusion docs
+    recordings`.
     """
     from experiments.cli.options import require_folder
     from experiments.evaluation import single_steps as single
@@ -87,19 +87,24 @@ def align(
     map_b: Annotated[Path, typer.Argument(metavar="MAP_B")],
     *,
     output: options.DocumentFile = None,
+    aligners: options.Aligners,
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`."""
+    """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`.
+
+    T_a_b is the pose of map b in the frame of map a.
+    """
     from experiments.cli.options import DOCUMENT, require_file
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
     from experiments.reports.terminal.run_screen import print_estimates, print_verdict
-    from experiments.scenario.suite import settings_of
+    from experiments.scenario.suite import settings_of, with_aligners
 
     require_file("--output", output, DOCUMENT, [map_a, map_b, scenario])
+    overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
     rows = []
     for row in single.align(map_a, map_b, settings):
@@ -117,6 +122,7 @@ def merge(
     maps: Annotated[list[Path], typer.Argument(metavar="MAP MAP...", help="Two maps or more.")],
     *,
     output: options.Output,
+    aligners: options.Aligners,
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
@@ -130,9 +136,10 @@ def merge(
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
     from experiments.reports.terminal.run_screen import print_fused, print_unmerged
-    from experiments.scenario.suite import settings_of
+    from experiments.scenario.suite import settings_of, with_aligners
 
     require_map_file(output, [*maps, scenario], n_maps=max(len(maps) // 2, 1))
+    overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
     merged = single.merge(maps, settings)
     paths = single.save_fused(output, merged)

@@ -6,6 +6,8 @@ from typing import Annotated
 import typer
 
 from experiments.cli import options
+from experiments.cli.completion import complete_setting
+from mapfusion.errors import InputError
 
 app = typer.Typer()
 studies = typer.Typer(
@@ -48,7 +50,7 @@ def refusal(
     from experiments.scenario.seeds import parse_seeds
     from experiments.studies import refusal_rates, refusal_trial
     from experiments.studies.refusal_cases import worlds_of
-    from experiments.studies.refusal_rates import judged_answers, reliability
+    from experiments.studies.refusal_rates import answers_with_probability, reliability
     from experiments.studies.refusal_trial import PairsDrawn
 
     require_folder(output, worlds)
@@ -59,7 +61,7 @@ def refusal(
     study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
     kinds = refusal_rates.by_kind(refusals)
     study_screen.print_kinds(kinds)
-    answers = judged_answers(refusals)
+    answers = answers_with_probability(refusals)
     held = reliability(answers, np.random.default_rng(0)) if len(answers) else None
     if held is not None:
         study_screen.print_reliability(held)
@@ -77,6 +79,7 @@ def sweep(
         typer.Option(
             "--set",
             metavar="KEY=VALUE,...",
+            autocompletion=complete_setting,
             help="Values to try, e.g. slam.filter.n_particles=50,200; several give all "
             "combinations. Commas inside brackets do not separate values.",
         ),
@@ -89,7 +92,7 @@ def sweep(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder; RESULTS/sweeps/NAME by default.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only count the work.")] = False,
+    dry_run: options.DryRun = False,
     timings: Annotated[
         bool, typer.Option("--timings", help="At the end, time the aligners one after the other.")
     ] = False,
@@ -140,8 +143,17 @@ def compare(
         Path, typer.Argument(metavar="FIRST", help="Result or sweep of the first version.")
     ],
     second: Annotated[
-        Path, typer.Argument(metavar="SECOND", help="Result or sweep of the second version.")
-    ],
+        Path | None,
+        typer.Argument(metavar="[SECOND]", help="Result or sweep of the second version."),
+    ] = None,
+    values: Annotated[
+        str | None,
+        typer.Option(
+            "--values",
+            metavar="KEY=A,B",
+            help="Compare these values of a setting within the sweep FIRST, in place of SECOND.",
+        ),
+    ] = None,
     show_all: Annotated[bool, typer.Option("--all", help="Show unchanged values, too.")] = False,
     output: options.OutputFolder = None,
     apart_from: Annotated[
@@ -156,16 +168,27 @@ def compare(
 ) -> None:
     """Compare the results of two versions: `mapfusion compare old/quick-0 new/quick-0`.
 
-    Runs are matched by scenario, seed and settings. Values are called better or worse only if the
-    difference exceeds the noise.
+    Or two values of a setting within one sweep: `mapfusion compare results/sweeps/quick
+    --values slam.filter.n_particles=50,200`. Runs are matched by scenario, seed and settings.
+    Values are called better or worse only if the difference exceeds the noise.
     """
     from experiments.cli.options import require_folder
     from experiments.reports.export import write_tables
     from experiments.reports.terminal.statistics_screen import print_comparison
     from experiments.studies import comparison
+    from experiments.studies.sweep import parse_axes
 
     require_folder(output, [first, second])
-    found = comparison.compare(first, second, apart_from or ())
+    if (second is None) == (values is None):
+        raise InputError("compare: give a second result or sweep, or --values KEY=A,B")
+    if second is not None:
+        found = comparison.compare(first, second, apart_from or ())
+    else:
+        axes = parse_axes([values or ""], "--values")
+        ((setting, pair),) = axes.items()
+        if len(pair) != 2:
+            raise InputError(f"--values {values}: expected two values, {setting}=A,B")
+        found = comparison.compare_values(first, setting, *pair)
     if output is not None:
         write_tables(output, {"comparison": found.table})
     print_comparison(found, show_all, output)
@@ -176,10 +199,7 @@ def compare(
 @studies.command()
 def benchmark(
     *,
-    methods: Annotated[
-        list[str] | None,
-        typer.Option("--method", metavar="NAME", help="Only this method; may be repeated."),
-    ] = None,
+    aligners: options.Aligners,
     trials: Annotated[int, typer.Option(help="Trials of each method in a cell.", min=1)] = 100,
     pairs: Annotated[
         list[int] | None, typer.Option(help="Numbers of pairs; may be repeated.", min=3)
@@ -208,7 +228,7 @@ def benchmark(
     from experiments.studies import benchmark
 
     require_folder(output, [scenario])
-    entries = benchmark.entries_of(methods or (), scenario)
+    entries = benchmark.entries_of(aligners, scenario)
     counts, shares = (
         tuple(pairs or benchmark.PAIR_COUNTS),
         tuple(outliers or benchmark.OUTLIER_SHARES),

@@ -28,10 +28,10 @@ from experiments.pipeline.stages.align import (
 from experiments.pipeline.stages.slam import folders_of_both
 from experiments.pipeline.tables import MOTION
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.oracle import Oracle
+from mapfusion.align.refinement import Oracle
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 
 
 def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> Float:
@@ -50,16 +50,16 @@ def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> Float
     return nees
 
 
-def error_rows(map_pair: MapPair, judge: Judge, radius_m: float) -> pd.DataFrame:
+def error_rows(map_pair: MapPair, verifier: Verifier, radius_m: float) -> pd.DataFrame:
     """Return the rows of the table `errors` of one pair of maps; the first is the oracle's.
 
     The oracle is the aligner that is given the true correspondences.
     """
     is_true, pairs = map_pair.is_true(radius_m), Pairs(*map_pair.maps, map_pair.offered)
-    oracle = Oracle(judge.refinement).align(pairs, is_true)
-    evidence = evidence_of(map_pair.rivals, map_pair.maps, judge.evidence)
+    oracle = Oracle(verifier.refinement).align(pairs, is_true)
+    evidence = evidence_of(map_pair.rivals, map_pair.maps, verifier.evidence)
     row = map_pair.keys | {"aligner": ORACLE, "repetition": 0}
-    row |= estimate_row(len(pairs), oracle, oracle, judge.on(pairs, evidence).judge(oracle))
+    row |= estimate_row(len(pairs), oracle, oracle, verifier.on(pairs, evidence).verify(oracle))
     rows = [row, *map_pair.estimates]
     alignments = [alignment_of(each, len(pairs)) for each in rows]
     T_true = se2.between(map_pair.a.path.T_world_map, map_pair.b.path.T_world_map)
@@ -115,7 +115,7 @@ ALIGNED = ("estimates", "correspondences", "rivals")
 class EvaluationSettings:
     """Settings of the evaluation of alignments."""
 
-    judge: Judge
+    verifier: Verifier
     merge: MergeSettings
     true_pair_radius_m: float
 
@@ -125,7 +125,7 @@ def run_evaluation(settings: EvaluationSettings, job: Job) -> None:
     robots = [load_robot(folders) for folders in folders_of_both(job)]
     aligned = [tables.read(job.inputs["align"] / f"{name}.parquet", name) for name in ALIGNED]
     map_pairs, radius_m = join_map_pairs(robots, *aligned), settings.true_pair_radius_m
-    errors = pd.concat([error_rows(pair, settings.judge, radius_m) for pair in map_pairs])
+    errors = pd.concat([error_rows(pair, settings.verifier, radius_m) for pair in map_pairs])
     tables.write(job.output / "errors.parquet", "errors", errors)
     fusion = fusion_rows(map_pairs, settings.merge, radius_m)
     tables.write(job.output / "fusion.parquet", "fusion", fusion)

@@ -56,8 +56,8 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fusion.fusers import make_fuser
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Aligner
 from mapfusion.robot_log import RobotLog, read_log, read_true_poses
+from mapfusion.verification.registration import Aligner
 
 TABLES_PART = "tables"  # part of a run outside its stages, in the table `timings`
 _EVALUATION_TABLES = {"errors", "fusion"}  # the stage `align` writes the other tables of pairs
@@ -156,7 +156,7 @@ class EvaluatedRun:
         pipeline = build_pipeline(scenario)
         merge = MergeSettings(scenario.merge.aligner, scenario.merge.parameters)
         radius_m = scenario.evaluate.true_pair_radius_m
-        settings = EvaluationSettings(scenario.align.judge, merge, radius_m)
+        settings = EvaluationSettings(scenario.align.verifier, merge, radius_m)
         no_truth = scenario.why_no_truth()
         kind, evaluations = EVALUATION_STAGE, []
         for pair in () if no_truth else pipeline.pairs:

@@ -17,7 +17,7 @@ matrices of its size.
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from experiments.evaluation.truth import degrees_of_freedom, squared_mahalanobis
 from mapfusion.align.rigid_motion import fit_rigid

@@ -44,7 +44,7 @@ from experiments.pipeline.stages.smooth import (
 )
 from mapfusion.files import POSE_FIELDS, named_columns
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import FusedMap, Fusion
+from mapfusion.fusion.fusers import FusedMap, Fusion
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap

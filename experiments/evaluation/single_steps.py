@@ -31,13 +31,11 @@ from mapfusion.datasets.log_consistency import Finding, check_log, gate_finding,
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
-from mapfusion.fusion.fused_map import AlignedPair, Fusion, name_order
-from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.fusers import AlignedPair, Fusion, make_fuser, name_order
 from mapfusion.fusion.merge import merge as merge_maps
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
-from mapfusion.registration import Registration
 from mapfusion.robot_log import (
     TRUTH_FILES,
     read_log,
@@ -49,6 +47,7 @@ from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
 from mapfusion.smoother.odometry_calibration import Calibration, calibrate
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.tables import NO_LABEL
+from mapfusion.verification.registration import Registration
 from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
 
@@ -201,7 +200,7 @@ def save_fused(path: Path, merged: MergeResult) -> list[Path]:
 
 def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-    return Registration(aligner, settings.refinement, settings.judge)
+    return Registration(aligner, settings.refinement, settings.verifier)
 
 
 def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, Any]]:
@@ -212,7 +211,7 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
     """
     map_a, map_b = read_map(path_a), read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
-    evidence = settings.align.judge.on(Pairs(map_a, map_b, pairs)).evidence
+    evidence = settings.align.verifier.on(Pairs(map_a, map_b, pairs)).evidence
     for entry in settings.align.aligners:
         registration = _registration(entry, settings.align)
         given = map_a, map_b, pairs, evidence
@@ -257,8 +256,8 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         done = ready.register(rng)
         false_alarms = done.verdict.log10_false_alarms
         pairs.append(AlignedPair(a, b, done.applied, offered, false_alarms))
-        if done.applied.status is Status.AMBIGUOUS and ready.judge is not None:
-            rivals = ready.judge.rivals_of(done.refined)
+        if done.applied.status is Status.AMBIGUOUS and ready.verifier is not None:
+            rivals = ready.verifier.rivals_of(done.refined)
             pairs += [AlignedPair(a, b, rival, offered, false_alarms) for rival in rivals]
     chosen = settings.merge
     fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))

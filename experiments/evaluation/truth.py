@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import KDTree
+import scipy
 
 from experiments.pipeline.stages.align import alignment_of, correspondences_of, latest_at
 from experiments.pipeline.stages.slam import ROBOTS_KEPT, RobotFolders, stored_maps
@@ -16,7 +16,7 @@ from experiments.pipeline.tables import records
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.errors import InputError
-from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.fusion.fusers import AlignedPair
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
@@ -94,8 +94,8 @@ def common_landmarks(points_a: Float, points_b: Float, radius_m: float) -> int:
     known_a, known_b = (own[np.isfinite(own).all(axis=1)] for own in (points_a, points_b))
     if not len(known_a) or not len(known_b):
         return 0
-    distance, nearest_b = KDTree(known_b).query(known_a)
-    _, nearest_a = KDTree(known_a).query(known_b)
+    distance, nearest_b = scipy.spatial.KDTree(known_b).query(known_a)
+    _, nearest_a = scipy.spatial.KDTree(known_a).query(known_b)
     mutual = np.asarray(nearest_a)[nearest_b] == np.arange(len(known_a))
     return int(np.sum(mutual & (distance <= radius_m)))
 

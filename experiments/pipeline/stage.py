@@ -12,6 +12,7 @@ share the folder. Numba writes whole files, so processes need no lock: at worst 
 compile the same kernel at the same time.
 """
 
+import contextlib
 import functools
 import hashlib
 import importlib.metadata
@@ -32,16 +33,25 @@ PACKAGES = ("mapfusion", "sim", "experiments")
 _FINDS_BY_NAME = frozenset({"mapfusion/align/aligners.py"})
 _DATA = ".urdf"  # suffix of files that a module reads from its own folder
 _KEPT = (".py", _DATA)
-_NUMERICAL_LIBRARIES = ("numba", "numpy", "opencv-python-headless", "pyarrow", "pybullet", "scipy")
+_NUMERICAL_LIBRARIES = ("numba", "numpy", "opencv-python-headless", "pyarrow", "scipy")
+_SIMULATOR = "pybullet"  # optional; used by modules of `sim` only
 # Import statement as written by the formatter; Python's parser takes ten times as long.
 _IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) )?import (\([^)]*\)|.+)$", re.MULTILINE)
 _NO_NAME = re.compile(r"#.*|[()]")
 
 
 @functools.cache
-def library_versions() -> dict[str, str]:
-    """Return installed versions of the libraries that the results depend on."""
-    return {name: importlib.metadata.version(name) for name in _NUMERICAL_LIBRARIES}
+def library_versions(*, simulator: bool = True) -> dict[str, str]:
+    """Return installed versions of the libraries that the results depend on.
+
+    Args:
+        simulator: include PyBullet, if it is installed.
+    """
+    versions = {name: importlib.metadata.version(name) for name in _NUMERICAL_LIBRARIES}
+    if simulator:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[_SIMULATOR] = importlib.metadata.version(_SIMULATOR)
+    return versions
 
 
 @functools.cache
@@ -239,12 +249,14 @@ class Stage:
         """Key that identifies the results among those of the same stage."""
         from pydantic_core import to_jsonable_python
 
+        # results without the simulator stay valid when it is installed later
+        simulator = any(path.startswith("sim/") for path in self.sources)
         content = {
             "stage": self.name,
             "settings": to_jsonable_python(self.settings),
             "before": {name: stage.key for name, stage in self.before.items()},
             "source": source_hash(self.sources),
-            "libraries": library_versions(),
+            "libraries": library_versions(simulator=simulator),
         }
         text = json.dumps(content, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:_KEY_LENGTH]

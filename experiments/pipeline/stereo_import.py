@@ -19,7 +19,7 @@ from mapfusion.datasets.stereo_import import (
     write_imported,
 )
 from mapfusion.datasets.stereo_recording import StereoRecording
-from mapfusion.datasets.tum import read_odometry, read_tum
+from mapfusion.datasets.text_files import read_odometry, read_tum
 from mapfusion.errors import InputError
 from mapfusion.geometry.camera import CalibrationError
 from mapfusion.vision.front_end import FrontEndParameters

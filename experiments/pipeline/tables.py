@@ -12,6 +12,7 @@ import pyarrow as pa
 from mapfusion.files import covariances_from, read_table, schema, write_table
 from mapfusion.geometry.numerics import Float
 
+# Commands that only read tables are quicker without pandas.
 if TYPE_CHECKING:
     import pandas as pd
 

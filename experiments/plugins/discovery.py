@@ -1,4 +1,4 @@
-"""Discovery of alignment methods by name: built in, peers (`[peers]`) and installed plug-ins.
+"""Discovery of alignment methods by name: built in, peers (`[peers]`), plug-ins and own files.
 
 Discovery reads the metadata of packages. It imports no plug-in, since an import may run any code.
 """
@@ -8,21 +8,25 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import json
+import re
+import sys
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from operator import attrgetter
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from experiments.plugins.isolated_process import IsolatedAligner, ProcessFailedError, process_for
 from mapfusion.align.aligners import ALIGNERS, PEERS, construct
-from mapfusion.errors import did_you_mean
-from mapfusion.registration import Aligner, as_aligner
+from mapfusion.errors import did_you_mean, not_installed
+from mapfusion.verification.registration import Aligner, as_aligner
 
 ENTRY_POINTS = "mapfusion.aligners"  # group of the entry points that declare aligners
 _CODE_SUFFIXES = (".py", ".so", ".pyd")
+_OWN_FILE = re.compile(r"(.+\.py):(\w+)")  # a class in a Python file, as name of a method
 _PEER_PACKAGES = {  # distribution and import package
     "opencv": ("opencv-python-headless", "cv2"),
     "kiss_matcher": ("kiss-matcher", "kiss_matcher"),
@@ -44,9 +48,9 @@ class KnownMethod:
     Attributes:
         name: name in scenarios.
         kind: origin of the method.
-        target: `module:class`; the class is constructed with the parameters.
-        distribution: name of the distribution to install; empty for built-in methods.
-        package: import package of the distribution; empty for built-in methods.
+        target: `module:class` or `file.py:class`; the class is constructed with the parameters.
+        distribution: name of the distribution to install; empty for built-in methods and files.
+        package: import package of the distribution, or the file; empty for built-in methods.
     """
 
     name: str
@@ -64,14 +68,16 @@ class KnownMethod:
             return ""
 
     @property
+    def own_module(self) -> str:
+        """Module of this project with the source of the method; all of them for a plug-in."""
+        return "mapfusion.align" if self.kind is Kind.PLUG_IN else self.target.partition(":")[0]
+
+    @property
     def absence(self) -> str:
         """Reason why a peer cannot run, with a remedy; empty if the method can run."""
         if self.kind is not Kind.PEER or _find_spec(self.package) is not None:
             return ""
-        return (
-            f"the package {self.distribution} is not installed; "
-            "pip install 'mapfusion[peers]' installs it"
-        )
+        return not_installed(self.distribution, "peers")
 
     def origin(self) -> dict[str, str]:
         """Return the code that results depend on, beside our own, for the keys of stages."""
@@ -133,15 +139,38 @@ def name_clashes() -> dict[str, str]:
 
 
 def find_method(name: str) -> KnownMethod:
-    """Return the method of a name; raise ValueError if none or several plug-ins declare it."""
+    """Return the method of a name, or of a class in a file, `FILE.py:CLASS`.
+
+    Raises:
+        ValueError: no method has the name, several plug-ins declare it, or there is no such file.
+    """
+    if own_file := _OWN_FILE.fullmatch(name):
+        file = Path(own_file[1])
+        if not file.is_file():
+            raise ValueError(f"{file}: no such file (expected FILE.py:CLASS, an aligner of yours)")
+        target = f"{file.absolute()}:{own_file[2]}"
+        return KnownMethod(name, Kind.PLUG_IN, target, package=str(file.absolute()))
     # Our own methods need no search of installed packages.
     known = _OWN_METHODS if name in _OWN_METHODS else known_methods()
     if name not in known:
         unknown = (
             f"unknown aligner {name!r}, known are {', '.join(known)}{did_you_mean(name, known)}"
         )
+        if name.endswith(".py"):
+            unknown = f"{name}: name the class too, as in {name}:MyAligner"
         raise ValueError(name_clashes().get(name, unknown))
     return known[name]
+
+
+def absolute_method(name: str, folder: Path | None = None) -> str:
+    """Return the name of a method with an absolute path if it names a file.
+
+    Args:
+        name: name of a method.
+        folder: folder that a relative path belongs to; None: the working folder.
+    """
+    own_file = _OWN_FILE.fullmatch(name)
+    return f"{(folder or Path()).absolute() / own_file[1]}:{own_file[2]}" if own_file else name
 
 
 def make_method(name: str, /, **parameters: Any) -> Any:
@@ -150,8 +179,34 @@ def make_method(name: str, /, **parameters: Any) -> Any:
     Raises:
         ValueError: the name or a parameter is unknown, or a parameter is out of range.
     """
-    module, _, names = find_method(name).target.partition(":")
-    return construct(name, attrgetter(names)(import_module(module)), parameters)
+    method = find_method(name)
+    module, _, names = method.target.rpartition(":")
+    if not module.endswith(".py"):
+        return construct(name, attrgetter(names)(import_module(module)), parameters)
+    made = _module_of_file(Path(module))
+    if not hasattr(made, names):
+        own = [key for key, value in vars(made).items() if _is_class_of(made, value)]
+        there = ", ".join(own) or "none"
+        raise ValueError(
+            f"{module}: has no class {names}; there: {there}{did_you_mean(names, own)}"
+        )
+    return construct(names, getattr(made, names), parameters)
+
+
+def _is_class_of(module: ModuleType, value: Any) -> bool:
+    return isinstance(value, type) and value.__module__ == module.__name__
+
+
+def _module_of_file(file: Path) -> ModuleType:
+    """Import a Python file under a name of its own."""
+    name = f"mapfusion_own_{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
 
 
 def callable_aligner(method: str, parameters: dict[str, Any], time_limit_s: float) -> Aligner:
@@ -204,13 +259,16 @@ def _find_spec(package: str) -> ModuleSpec | None:
 
 @functools.cache
 def fingerprint(package: str) -> str:
-    """Return a hash of the code files of a top-level package or module; empty if it is absent."""
-    spec = _find_spec(package)
-    if spec is None:
+    """Return a hash of the code files of a top-level package, module or file; empty if absent."""
+    is_file = package.endswith(".py")
+    spec = None if is_file else _find_spec(package)
+    if spec is None and not is_file:
         return ""
-    roots = [Path(folder) for folder in spec.submodule_search_locations or ()]
+    roots = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
     files = [(root, path) for root in roots for path in sorted(root.rglob("*"))]
-    if spec.origin and not roots:
+    if is_file:
+        files = [(Path(package).parent, Path(package))]
+    elif spec and spec.origin and not roots:
         files = [(Path(spec.origin).parent, Path(spec.origin))]
     digest = hashlib.sha256()
     for root, path in files:

@@ -32,12 +32,19 @@ from typing import Any
 
 import numpy as np
 
-from mapfusion.align.alignment import Alignment, Pairs, Status, without_answer
+from mapfusion.align.alignment import (
+    Alignment,
+    Fit,
+    Needs,
+    Pairs,
+    Status,
+    Undetermined,
+    without_answer,
+)
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.method import Fit, Needs, Undetermined
 from mapfusion.errors import one_line
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Aligner, MethodAligner
+from mapfusion.verification.registration import Aligner, MethodAligner
 
 _STATUSES = (Status.ACCEPTED, Status.REFUSED, Status.DEGENERATE)
 _MAX_ASYMMETRY = 1e-9  # relative to the largest entry: rounding of a symmetric product

@@ -22,7 +22,7 @@ from experiments.plugins.isolated_process import (
     checked_alignment,
 )
 from mapfusion.errors import moved_module_note, one_line
-from mapfusion.registration import Aligner
+from mapfusion.verification.registration import Aligner
 
 # The process ends itself this long after the time limit, if a plug-in holds the interpreter's lock
 # and the process that would end it has been killed.

@@ -10,7 +10,6 @@ import pyarrow as pa
 from experiments.evaluation import tables
 from experiments.evaluation.tables import require_as_written
 from experiments.reports.terminal.layout import Column, print_lines, print_table
-from experiments.scenario.loading import load_scenario
 from mapfusion import attitude, landmark_map, robot_log
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, read_parquet, read_table, text_attributes
@@ -97,6 +96,8 @@ def contents_of(path: Path) -> Contents:
 
 def _resolved(path: Path) -> dict[str, Any]:
     """Return all settings of a scenario; raises InputError."""
+    from experiments.scenario.loading import load_scenario  # imports all methods
+
     return load_scenario(path).resolved()
 
 
@@ -116,8 +117,8 @@ def _folder_contents(path: Path) -> Contents:
         log = robot_log.read_log(path)
         facts: dict[str, Any] = {"robot": log.robot, "planar": log.planar}
     else:
-        told = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
-        facts = {name: value for each in told for name, value in each.facts.items()}
+        descriptions = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
+        facts = {name: value for each in descriptions for name, value in each.facts.items()}
     if kind == _RESULT:
         require_as_written(path)
     # Files and rows by table, or by folder and table in a result

@@ -220,7 +220,7 @@ def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFram
         "last iteration. Each team is the first robots of the scenario. CPU times and memory are "
         f"those of one machine ({platform.machine()}), measured one piece of work after the other; "
         "compare them with each other. Errors are root mean squares, of landmarks without the "
-        "gross ones. `experiments/docs/independence.md` defines all of it.\n"
+        "gross ones. `mapfusion docs independence` defines all of it.\n"
     ]
     labels = {strategy.name: strategy.label for strategy in STRATEGIES}
     for n_robots, rows in summary.groupby("n_robots"):

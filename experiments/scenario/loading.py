@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import to_jsonable_python
 
-from experiments.plugins.discovery import name_clashes
+from experiments.plugins.discovery import absolute_method, name_clashes
 from experiments.scenario.settings import (
     Align,
     AnyScenario,
@@ -95,7 +95,9 @@ def load_scenario(
             key and the allowed values.
     """
     _require_whole_paths(overrides)
-    data = apply_overrides(read_mapping(path) if content is None else content, overrides)
+    folder = OWN if path.parent == SHIPPED else path.parent
+    written = read_mapping(path) if content is None else content
+    data = apply_overrides(_with_absolute_methods(written, folder), overrides)
     if seed is not None:
         data["seed"] = seed
 
@@ -114,7 +116,7 @@ def load_scenario(
     _warn_of_name_clashes(scenario.align)
     if not isinstance(scenario, Recording):
         return scenario
-    folder, logs = OWN if path.parent == SHIPPED else path.parent, []
+    logs = []
     for log in scenario.logs:
         try:
             resolved = (folder / log).resolve()
@@ -124,6 +126,26 @@ def load_scenario(
             raise InputError(f"{path}: logs: {log}: no folder has this path ({reason})") from error
         logs.append(str(resolved))
     return scenario.model_copy(update={"logs": logs})
+
+
+def _with_absolute_methods(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the content of a file in `folder` with absolute paths of aligners in Python files."""
+    align = data.get("align")
+    if not isinstance(align, dict):
+        return data
+    lists = {
+        name: align[name] for name in ("aligners", "also") if isinstance(align.get(name), list)
+    }
+    resolved = {
+        name: [
+            each | {"method": absolute_method(each["method"], folder)}
+            if isinstance(each, dict) and isinstance(each.get("method"), str)
+            else each
+            for each in entries
+        ]
+        for name, entries in lists.items()
+    }
+    return data | {"align": align | resolved}
 
 
 # Each wrong key of a file needs the lines.
@@ -232,6 +254,13 @@ def _known(kind: type[S]) -> TypeAdapter[S]:
 def _known_keys(kind: type) -> list[tuple[str, ...]]:
     schema = _schema(kind)
     return list(_keys(schema, schema))
+
+
+def setting_keys() -> list[str]:
+    """Return the dotted keys of all settings that have a value of their own, sorted."""
+    known = {*_known_keys(Simulation), *_known_keys(GeneratedScenario)}
+    sections = {path[:-1] for path in known}
+    return sorted(".".join(path) for path in known - sections if "*" not in path)
 
 
 @functools.cache

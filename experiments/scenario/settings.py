@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from experiments.plugins.discovery import require_usable
+from experiments.plugins.discovery import absolute_method, require_usable
 from experiments.scenario.world_settings import (
     MAX_COUNT,
     MAX_NAMED,
@@ -34,15 +34,14 @@ from experiments.scenario.world_settings import (
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refinement import Refinement
 from mapfusion.errors import OutOfRangeError, did_you_mean
-from mapfusion.fusion.fused_map import MergeParameters
-from mapfusion.fusion.fusers import USUAL
+from mapfusion.fusion.fusers import USUAL, MergeParameters
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.parameters import Range
 from mapfusion.robot_log import TRUTH_TABLES
 from mapfusion.tables import table_path
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 from mapfusion.vision.front_end import FrontEndParameters
 from sim.odometry import OdometryNoise
 from sim.stereo_head import RadiometricNoise
@@ -121,14 +120,15 @@ class AlignerEntry(Section):
 
     Attributes:
         name: name of the aligner in tables and figures.
-        method: alignment method, built in or from an installed package.
+        method: alignment method, built in, from an installed package, or a class in a Python file
+            (FILE.py:CLASS, relative to the scenario file).
         parameters: parameters of the method.
         time_limit_s: time limit for one call of an aligner from another package. The default is
             long enough for slow methods on a busy machine.
     """
 
     name: Annotated[Name, AfterValidator(free)]
-    method: Annotated[str, Field(max_length=100)]
+    method: Annotated[str, Field(max_length=1000), AfterValidator(absolute_method)]
     parameters: dict[str, Any] = Field(default_factory=dict)
     time_limit_s: Annotated[float, Range(0.01, 86_400, "s")] = 60.0
 
@@ -177,9 +177,9 @@ class Align(Section):
     repetitions: Annotated[int, Range(1, 1000, "repetitions")] = 20
 
     @property
-    def judge(self) -> Judge:
-        """Return the judge of alignments with these settings."""
-        return Judge(self.acceptance, self.evidence, self.refinement)
+    def verifier(self) -> Verifier:
+        """Verifier of alignments with these settings."""
+        return Verifier(self.acceptance, self.evidence, self.refinement)
 
     @model_validator(mode="after")
     def _unique(self) -> Self:

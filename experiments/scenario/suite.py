@@ -5,17 +5,19 @@ A scenario in ./scenarios replaces the shipped scenario of the same name.
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.scenario.yaml_files import OWN, SHIPPED, read_mapping
 from mapfusion.errors import InputError, did_you_mean
-from mapfusion.files import write_whole
 
 if TYPE_CHECKING:
-    from experiments.scenario.settings import Scenario
+    from experiments.scenario.settings import AlignerEntry, Scenario
 
+_TAGS = re.compile(r"^tags: \[([^]\n]+)\]", re.MULTILINE)
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
 
 
@@ -61,6 +63,64 @@ def settings_of(
     return load_scenario(one_scenario(word), overrides, seed)
 
 
+def with_aligners(
+    word: str | Path | None, overrides: Sequence[str], names: Sequence[str]
+) -> list[str]:
+    """Return the overrides with others that replace the aligners of a scenario.
+
+    The first of the new aligners is used for the merge if the scenario's one is not among them.
+    Bounds of metrics of other aligners are dropped.
+
+    Args:
+        word: scenario, as in `settings_of`.
+        overrides: overrides of the scenario.
+        names: aligners of the scenario, other methods, or classes in files; none keeps them all.
+
+    Raises:
+        InputError: a name is unknown, or the scenario is wrong.
+    """
+    if not names:
+        return list(overrides)
+    from experiments.scenario.settings import why_unknown
+
+    scenario = settings_of(word, overrides)
+    entries = chosen_aligners(names, scenario.align.aligners)
+    chosen = [entry.name for entry in entries]
+    own = {"align.aligners": [entry.model_dump(mode="json") for entry in entries]}
+    if scenario.merge.aligner not in chosen:
+        own |= {"merge.aligner": chosen[0]}
+    own |= {
+        "expect": {
+            metric: bound.model_dump(mode="json")
+            for metric, bound in scenario.expect.items()
+            if not why_unknown(metric, chosen, scenario.fuse.fusers)
+        }
+    }
+    return [*overrides, "align.also=[]", *(f"{key}={json.dumps(own[key])}" for key in own)]
+
+
+def chosen_aligners(
+    names: Sequence[str], entries: Sequence[AlignerEntry] = ()
+) -> tuple[AlignerEntry, ...]:
+    """Return aligners by name: those of `entries`, else methods with their default parameters.
+
+    A class in a file, FILE.py:CLASS, is named CLASS. Raises InputError if a name is unknown.
+    """
+    from experiments.plugins.discovery import require_usable
+    from experiments.scenario.settings import AlignerEntry
+
+    known, chosen = {entry.name: entry for entry in entries}, []
+    for name in dict.fromkeys(names):
+        if name not in known:
+            try:
+                require_usable(name, {})
+                known[name] = AlignerEntry(name=name.rpartition(":")[2], method=name)
+            except ValueError as error:
+                raise InputError(f"--aligner {name}: {' '.join(str(error).split())}") from error
+        chosen.append(known[name])
+    return tuple(chosen)
+
+
 def _named(wanted: str, folder: Path | None) -> list[Path]:
     files = _files(folder)
     if any(path.stem == wanted for path in files):
@@ -87,21 +147,27 @@ def _mentions(path: Path, word: str) -> bool:
         return True  # the reader reports the error
 
 
-def copy_to_edit(name: str) -> Path:
-    """Copy a shipped scenario to ./scenarios and return the path of the copy.
-
-    Raises:
-        InputError: the name is unknown, or the file exists.
-    """
+def shipped_scenario(name: str) -> Path:
+    """Return the file of a shipped scenario; raise InputError if the name is unknown."""
     shipped = {path.stem: path for path in _files(SHIPPED)}
     if name not in shipped:
         raise InputError(f"--copy {name}: no scenario of the suite; known: {', '.join(shipped)}")
-    source = shipped[name]
-    copy = OWN / source.name
-    if copy.exists():
-        raise InputError(f"{copy}: exists; edit it, or rename it to get the shipped one again")
-    write_whole(copy, lambda temporary: temporary.write_bytes(source.read_bytes()))
-    return copy
+    return shipped[name]
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the suite's files without their suffix, sorted."""
+    return [path.stem for path in _files(None)]
+
+
+def tags_as_written() -> list[str]:
+    """Return the tags of the suite that are written as `tags: [a, b]`, sorted.
+
+    Files are searched and not read as YAML, which takes too long for a completion in the shell.
+    """
+    texts = (path.read_text(encoding="utf-8", errors="replace") for path in _files(None))
+    lists = (_TAGS.findall(text) for text in texts)
+    return sorted({tag.strip() for found in lists for each in found for tag in each.split(",")})
 
 
 def _files(folder: Path | None) -> list[Path]:

@@ -25,17 +25,16 @@ from experiments.pipeline.workers import single_threaded, workers
 from experiments.plugins.discovery import callable_aligner, find_method, known_methods
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AlignerEntry
-from experiments.scenario.suite import settings_of
+from experiments.scenario.suite import chosen_aligners, settings_of
 from experiments.studies.intervals import wilson
 from mapfusion.align.alignment import NOT_RUN, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid
-from mapfusion.errors import InputError
 from mapfusion.files import schema
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 
 # Constants, so that tables of different versions can be compared.
 SIZE_M = 20.0  # side of the square that contains the landmarks
@@ -155,7 +154,7 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     n_pairs, share = settings.n_pairs, settings.outlier_share
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
     registration = Registration(
-        aligner, judge=None
+        aligner, verifier=None
     )  # no verdict: methods are ranked by their estimates
     cell = {"method": settings.name, "n_pairs": n_pairs, "outlier_share": share}
     rows: list[dict[str, Any]] = []
@@ -235,26 +234,17 @@ class BenchmarkDesign:
 def entries_of(
     methods: Sequence[str], scenario: str | Path | None = None
 ) -> tuple[AlignerEntry, ...]:
-    """Return methods with default parameters by name, or a scenario's aligners.
+    """Return aligners by name, as `chosen_aligners` does.
 
-    With both arguments, return the scenario's aligners of these names; with none, all methods.
+    Without names, return all aligners of the scenario, or without a scenario all known methods.
 
     Raises:
         InputError: a name or the scenario is unknown or unusable.
     """
-    names = list(dict.fromkeys(methods))
-    if scenario is not None:
-        entries = {entry.name: entry for entry in settings_of(scenario).align.aligners}
-        for name in names:
-            if name not in entries:
-                raise InputError(f"{scenario}: align.aligners: none is named {name}")
-        return tuple(entries[name] for name in names or entries)
-    try:
-        for name in names:
-            find_method(name)
-    except ValueError as error:
-        raise InputError(f"--method: {error}") from error
-    return tuple(AlignerEntry(name=name, method=name) for name in names or known_methods())
+    if scenario is None:
+        return chosen_aligners(list(methods) or list(known_methods()))
+    entries = settings_of(scenario).align.aligners
+    return chosen_aligners(methods, entries) if methods else tuple(entries)
 
 
 def run_benchmark(design: BenchmarkDesign, store: Store, on_progress: OnProgress) -> pd.DataFrame:
@@ -272,7 +262,7 @@ def run_benchmark(design: BenchmarkDesign, store: Store, on_progress: OnProgress
             seed=design.seed,
             budget_s=design.budget_s,
         )
-        loads, label = (method.target.partition(":")[0],), "measure the aligners"
+        label, loads = "measure the aligners", (method.own_module,)
         stages.append(Stage("benchmark", label, settings, run_cell, (TRIALS_FILE,), loads=loads))
     with workers(1) as this_process:
         run_tasks(list(tasks_of(stages, store).values()), this_process, on_progress)

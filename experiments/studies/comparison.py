@@ -1,11 +1,15 @@
-"""Comparison of two versions on the same runs: changes that exceed noise.
+"""Comparison of two versions, or of two values of a setting, on the same runs.
+
+Changes are called better or worse if they exceed the noise.
 
 Only rows that both versions have are compared: the same scenario, seed and settings (except those
 that are excluded by name), robot pair, iteration and aligner.
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -37,7 +41,7 @@ from experiments.studies import intervals
 from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.studies.run_tables import RunPath, Runs, find_runs, match_names
 from experiments.studies.statistics import ROBOT_PAIR
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, did_you_mean
 
 EACH_METHOD = "each method"  # fusers too
 _ROBOT = ("run_id", "robot")
@@ -157,7 +161,7 @@ class VersionComparison(NamedTuple):
 
     Attributes:
         table: one row per metric; a and b are medians over all rows, or means of shares; change is
-            a factor b / a, or a difference.
+            a factor b / a, or a difference; n_better of n_units changed for the better.
         unit: unit of n_units, "run" or "maps of one run".
         n_runs: number of matched runs.
         notes: warnings for the reader, one line each.
@@ -186,9 +190,71 @@ def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> Versi
         InputError: both have no run or no table in common; no sweep varied a setting of
             `apart_from`; or runs of one version differ only in these settings.
     """
-    a, b = find_runs(path_a), find_runs(path_b)
-    notes = _apart_from(a, b, apart_from)
-    runs_a, runs_b = (_names(*side, apart_from) for side in ((path_a, a), (path_b, b)))
+    return _compared((path_a, find_runs(path_a)), (path_b, find_runs(path_b)), apart_from)
+
+
+def compare_values(path: Path, setting: str, first: str, second: str) -> VersionComparison:
+    """Compare the runs of a sweep with two values of a setting.
+
+    Args:
+        path: folder of the sweep.
+        setting: dotted key of the setting.
+        first: first value, as in the sweep's tables.
+        second: second value.
+
+    Raises:
+        InputError: the folder is not a sweep, or it did not vary the setting or has no finished
+            run with one of the values.
+    """
+    runs = find_runs(path)
+    if not runs.sweeps:
+        raise InputError(f"{path}: is one run; the values of a setting are compared in a sweep")
+    known = values_by_setting(runs)
+    if setting not in known:
+        there = ", ".join(known) or "none"
+        close = did_you_mean(setting, known)
+        raise InputError(f"{path}: the sweep did not vary {setting}; it varied: {there}{close}")
+    for value in (first, second):
+        if value not in known[setting]:
+            there = ", ".join(known[setting])
+            raise InputError(f"{path}: no finished run has {setting}={value}; there are: {there}")
+    side_a, side_b = ((path, replace(runs, only=((setting, v),))) for v in (first, second))
+    return _compared(side_a, side_b, [setting])
+
+
+def values_by_setting(runs: Runs) -> dict[str, list[str]]:
+    """Return the values of each setting that a sweep varied, numbers in increasing order."""
+    described = runs.described
+    settings = setting_columns(described)
+    values = {name: sorted(described[name].unique(), key=natural_key) for name in settings}
+    return {name: found for name, found in values.items() if len(found) > 1}
+
+
+def natural_key(text: object) -> tuple[float, str]:
+    """Return a sorting key that puts 50 before 200."""
+    try:
+        return float(str(text)), ""
+    except ValueError:
+        return math.inf, str(text)
+
+
+def _compared(
+    side_a: tuple[Path, Runs], side_b: tuple[Path, Runs], apart_from: Sequence[str]
+) -> VersionComparison:
+    """Compare two groups of runs, each with the path that messages name."""
+    (path_a, a), (path_b, b) = side_a, side_b
+    notes = _excluded_settings(a, b, apart_from)
+    name_sets = []
+    for path, runs in (side_a, side_b):
+        names = match_names(runs.described, apart_from)
+        several = names[names.duplicated()]
+        if apart_from and len(several):
+            raise InputError(
+                f"{path}: {several.iloc[0]} is there more than once, with other values of "
+                f"{' and '.join(apart_from)}; each side may have one"
+            )
+        name_sets.append(set(names))
+    runs_a, runs_b = name_sets
     common = runs_a & runs_b
     if not common:
         raise InputError(
@@ -207,7 +273,9 @@ def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> Versi
         row = {"metric": quantity.metric, "method": method} | quantity._asdict()
         row |= {"a": of_a, "b": of_b}
         row |= dict(zip(("change", "low", "high"), limits, strict=True))
+        sign = 1 if quantity.higher_is_better else -1
         row |= {"n_units": len(changes), "n_rows": len(values), "p": found.p}
+        row |= {"n_better": int((sign * changes > 0).sum())}
         rows.append(row | {"identical": not values["change"].any()})
     if not rows:
         raise InputError(f"{path_a} and {path_b}: their common runs have no rows in common")
@@ -240,20 +308,7 @@ def compare(path_a: Path, path_b: Path, apart_from: Sequence[str] = ()) -> Versi
     return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
 
 
-def _names(path: Path, runs: Runs, apart_from: Sequence[str]) -> set[str]:
-    """Return the names that the runs of one version are matched by."""
-    names = match_names(runs.described, apart_from)
-    several = names[names.duplicated()]
-    if apart_from and len(several):
-        settings = " and ".join(apart_from)
-        raise InputError(
-            f"{path}: {several.iloc[0]} is there more than once, with other values of {settings}; "
-            "each side may have one"
-        )
-    return set(names)
-
-
-def _apart_from(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
+def _excluded_settings(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
     """Return notes on the settings that runs are not matched by."""
     notes = []
     varied = [runs.described[setting_columns(runs.described)] for runs in (a, b)]
@@ -308,7 +363,10 @@ def _differing_settings(a: Runs, b: Runs) -> list[str]:
 def _all_values(
     a: Runs, b: Runs, apart_from: Sequence[str]
 ) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
-    """Yield quantities of common tables, the method, and columns run_id, a, b and change."""
+    """Yield quantities of common tables, the method, and columns run_id, a, b and change.
+
+    Rows without a finite change are left out; success rates cover them.
+    """
     for table in READ:
         if not (a.has(table) and b.has(table)):
             continue
@@ -335,21 +393,22 @@ def _all_values(
             own = rows[rows["aligner"] == method] if method else rows
             of = method if method in ("", ORACLE) else EACH_METHOD
             for quantity in QUANTITIES:
-                if (quantity.table, quantity.of) == (table, of):
-                    values = _changes(quantity, own)
-                    if len(values):
-                        yield quantity, method, values
-
-
-def _changes(quantity: Quantity, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return values and changes of rows with a finite change; success rates cover the others."""
-    rows = rows.query(quantity.where) if quantity.where else rows
-    a, b = (rows[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
-    if quantity.scale == "ln":  # distance from consistency, in either direction
-        change = np.abs(intervals.log_ratio(b, np.ones(1))) - np.abs(
-            intervals.log_ratio(a, np.ones(1))
-        )
-    else:
-        change = b - a if quantity.scale == "share" else intervals.log_ratio(b, a)
-    frame = pd.DataFrame({"run_id": rows["run_id"], "a": a, "b": b, "change": change})
-    return frame[np.isfinite(a) & np.isfinite(change)]
+                if (quantity.table, quantity.of) != (table, of):
+                    continue
+                chosen = own.query(quantity.where) if quantity.where else own
+                x, y = (
+                    chosen[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab"
+                )
+                if quantity.scale == "share":
+                    change = y - x
+                elif quantity.scale == "ratio":
+                    change = intervals.log_ratio(y, x)
+                else:  # change of the distance from consistency, in either direction
+                    from_1_a, from_1_b = (
+                        np.abs(intervals.log_ratio(v, np.ones(1))) for v in (x, y)
+                    )
+                    change = from_1_b - from_1_a
+                known = np.isfinite(x) & np.isfinite(change)
+                if known.any():
+                    values = {"run_id": chosen["run_id"], "a": x, "b": y, "change": change}
+                    yield quantity, method, pd.DataFrame(values)[known]

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import ndtri
 
 from experiments.evaluation.criteria import MAP_KEYS
 from mapfusion.geometry.numerics import Float
@@ -157,7 +157,7 @@ def wilson(successes: ArrayLike, trials: ArrayLike) -> tuple[Float, Float]:
     k, n = np.broadcast_arrays(np.asarray(successes, float), np.asarray(trials, float))
     if np.any(k < 0) or np.any(k > n + 1e-9 * (1 + n)):  # sums of fractions round
         raise ValueError("successes: must lie between 0 and trials")
-    z2 = ndtri((1 + CONFIDENCE) / 2) ** 2
+    z2 = scipy.special.ndtri((1 + CONFIDENCE) / 2) ** 2
     known = n > 0
     rate = np.minimum(np.divide(k, n, out=np.full(n.shape, 0.5), where=known), 1.0)
     centre = (n * rate + z2 / 2) / (n + z2)
@@ -232,9 +232,7 @@ def mean_change(changes: Float) -> BetterTest:
         return BetterTest(mean, mean, mean, p)
     with warnings.catch_warnings():  # changes that differ by rounding only
         warnings.simplefilter("ignore", RuntimeWarning)
-        from scipy.stats import ttest_1samp  # a slow import
-
-        tested: Any = ttest_1samp(changes, 0.0)
+        tested: Any = scipy.stats.ttest_1samp(changes, 0.0)
     low, high = tested.confidence_interval(CONFIDENCE)
     return BetterTest(mean, float(low), float(high), float(tested.pvalue))
 

@@ -9,10 +9,10 @@ import gc
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -32,12 +32,12 @@ from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import POSE_FIELDS, float_fields, named_columns, schema
-from mapfusion.fusion.fused_map import FusedMap
+from mapfusion.fusion.fusers import FusedMap
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, write_map
-from mapfusion.registration import Registration
 from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance, write_log
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.registration import Registration
+from mapfusion.verification.verdict import Verifier
 
 FILTER, SMOOTHING, ALIGNMENT, FUSION = "filter", "smoothing", "alignment", "fusion"
 # Messages of a robot, as files in our own formats. A filter's map: landmarks with their own
@@ -141,7 +141,23 @@ def measure_robot(settings: RobotCostSettings, job: Job) -> None:
     for k in iterations:
         costs.append(cost_row(k, SMOOTHING, _smooth_at(settings.smooth, job, log, k)))
     paths = [path_rows(each.iteration, log.robot, each.path) for each in filtered]
-    sent = [row for each in filtered for row in _sent(each, log, job.inputs["smooth"])]
+    sent, smoothed = [], job.inputs["smooth"]
+    for each in filtered:  # the sizes of the files that would be sent
+        k = each.iteration
+        with tempfile.TemporaryDirectory() as place:
+            own_map, own_log = Path(place) / "map", Path(place) / "log"
+            write_map(own_map / "map.parquet", each.landmarks)
+            write_log(own_log, smooth.log_until(log, k))
+            # A robot whose log is not smoothed at this iteration sends the filter's map instead.
+            has_map = k in smooth.read_smoothed_path(smoothed)
+            messages = {
+                FILTER_MAP: own_map.iterdir(),
+                SMOOTHED_MAP: smooth.map_files(smoothed, k) if has_map else own_map.iterdir(),
+                LOG: own_log.iterdir(),
+            }
+            for what, files in messages.items():
+                n_bytes = sum(file.stat().st_size for file in files)
+                sent.append({"iteration": k, "what": what, "n_bytes": n_bytes})
     write_rows(job.output / COSTS_FILE, WORK_COSTS, pd.DataFrame(costs))
     write_rows(job.output / SENT_FILE, SENT, pd.DataFrame(sent))
     write_rows(job.output / PATHS_FILE, PATHS, pd.concat(paths))
@@ -182,27 +198,6 @@ def _smooth_at(settings: SmoothSettings, job: Job, log: RobotLog, iteration: int
     return meter.read()
 
 
-def _sent(filtered: _Filtered, log: RobotLog, smoothed: Path) -> Iterator[dict[str, Any]]:
-    """Yield rows of `SENT` at an iteration: the sizes of the files that would be sent.
-
-    A robot whose log is not smoothed at this iteration sends the filter's map instead.
-    """
-    k = filtered.iteration
-    with tempfile.TemporaryDirectory() as place:
-        own_map, own_log = Path(place) / "map", Path(place) / "log"
-        write_map(own_map / "map.parquet", filtered.landmarks)
-        write_log(own_log, smooth.log_until(log, k))
-        has_map = k in smooth.read_smoothed_path(smoothed)
-        files = {
-            FILTER_MAP: own_map.iterdir(),
-            SMOOTHED_MAP: smooth.map_files(smoothed, k) if has_map else own_map.iterdir(),
-            LOG: own_log.iterdir(),
-        }
-        for what, own in files.items():
-            n_bytes = sum(file.stat().st_size for file in own)
-            yield {"iteration": k, "what": what, "n_bytes": n_bytes}
-
-
 def path_rows(iteration: int, robot: str, path: Float) -> pd.DataFrame:
     """Return rows of `PATHS` of poses (T, 3) from the first frame on."""
     columns = named_columns(POSE_FIELDS, path) | {"frame": np.arange(len(path))}
@@ -240,7 +235,7 @@ def _align(settings: PairCostSettings, map_a: LandmarkMap, map_b: LandmarkMap) -
     own = settings.aligner
     aligner = callable_aligner(own.method, own.parameters, own.time_limit_s)
     registration = Registration(
-        aligner, own.refinement, Judge(own.acceptance, own.evidence, own.refinement)
+        aligner, own.refinement, Verifier(own.acceptance, own.evidence, own.refinement)
     )
     rng, meter = generator(own.seed, "align", map_a.name, map_b.name), Meter()
     pairs = match(map_a, map_b, settings.match)

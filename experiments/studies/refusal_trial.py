@@ -18,7 +18,6 @@ from experiments.pipeline.stages.align import latest_at
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.tasks import OnProgress
 from experiments.pipeline.workers import workers
-from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import Simulation
 from experiments.studies import refusal_cases
@@ -28,7 +27,6 @@ from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.files import schema
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.registration import Registration
 from mapfusion.verification.false_alarms import (
     Acceptance,
     IndependentPairs,
@@ -150,7 +148,7 @@ class Crossing(NamedTuple):
 
 
 class PairsDrawn(NamedTuple):
-    """Numbers of pairs of maps to judge.
+    """Numbers of pairs of maps to evaluate.
 
     Attributes:
         n_apart: pairs from worlds of different seeds, for each kind of world, and as many from
@@ -301,14 +299,14 @@ def _answers(
     names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
     bound = np.log10(settings.acceptance.false_alarms)
     pairs = Pairs(case.map_a, case.map_b, case.pairs)
-    judged = settings.judge.on(pairs)  # evidence is computed once, for answers that beat chance
+    verifier = settings.verifier.on(
+        pairs
+    )  # evidence is computed once, for answers that beat chance
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
-        aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        registration = Registration(aligner, settings.refinement, judge=None)
-        refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
-        verdict = judged.judge(refined)
+        refined = case.refined_estimate(entry, settings.refinement, rng)
+        verdict = verifier.verify(refined)
         error = refined.T_a_b - case.T_true
         found = {
             "aligner": entry.name,

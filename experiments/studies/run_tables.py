@@ -44,10 +44,17 @@ class RunPath(NamedTuple):
 
 @dataclass(frozen=True)
 class Runs:
-    """Runs of result folders and sweep folders."""
+    """Runs of result folders and sweep folders.
+
+    Attributes:
+        results: result folders.
+        sweeps: folders of sweeps.
+        only: settings and values that the runs of sweeps must have.
+    """
 
     results: tuple[RunPath, ...]
     sweeps: tuple[Path, ...]
+    only: tuple[tuple[str, str], ...] = ()
 
     def files(self, table: str) -> list[RunPath]:
         """Return the files of one table in a fixed order."""
@@ -56,7 +63,7 @@ class Runs:
         for sweep in self.sweeps:
             run_rows = self._run_rows[self._run_rows["sweep"] == str(sweep)]
             finished = None  # an earlier version did not write `runs`
-            if len(run_rows):
+            if len(run_rows) or self.only:
                 finished = frozenset(run_rows.loc[run_rows["status"] == "finished", "run_id"])
             if finished is None or finished:
                 found += [RunPath(path, {}, finished) for path in _whole_files(sweep / table)]
@@ -130,7 +137,10 @@ class Runs:
             for rows in _read(RunPath(path, {}), "runs", _STATUS, ())
         ]
         none = pd.DataFrame(columns=["sweep", *RUN_KEYS, *_STATUS])
-        return pd.concat(parts, ignore_index=True) if parts else none
+        rows = pd.concat(parts, ignore_index=True) if parts else none
+        for setting, value in self.only:
+            rows = rows[rows[setting] == value] if setting in rows else rows.iloc[:0]
+        return rows
 
     @property
     def failed(self) -> pd.DataFrame:

@@ -27,6 +27,7 @@ from experiments.pipeline.stages.pipeline import require_memory
 from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded
+from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import scenarios_of
 from experiments.scenario.yaml_files import parse_value, read_mapping
 from experiments.studies.sweep_tables import (
@@ -39,6 +40,7 @@ from experiments.studies.sweep_tables import (
 )
 from mapfusion.errors import InputError
 from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whole
+from sim.renderer import require_pybullet
 
 _EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
 _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
@@ -47,28 +49,28 @@ _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
 Axes = Mapping[str, tuple[str, ...]]
 
 
-def parse_axes(entries: Sequence[str]) -> Axes:
-    """Parse `--set KEY=VALUE,VALUE,...`; raises InputError that shows the correct form."""
+def parse_axes(entries: Sequence[str], option: str = "--set") -> Axes:
+    """Parse `OPTION KEY=VALUE,VALUE,...`; raises InputError that shows the correct form."""
     axes: dict[str, tuple[str, ...]] = {}
     for entry in entries:
         key, _, listed = entry.partition("=")
         if not key or not listed.strip():
-            raise InputError(f"--set {entry}: {_EXPECTED}")
+            raise InputError(f"{option} {entry}: {_EXPECTED}")
         if key in _FIXED:
-            raise InputError(f"--set {entry}: {key} cannot be set here; use {_FIXED[key]}")
+            raise InputError(f"{option} {entry}: {key} cannot be set here; use {_FIXED[key]}")
         if key in axes:
-            raise InputError(f"--set {key}: given twice; write its values as {key}=A,B")
-        values = parse_value(f"[{listed}]", f"--set {entry}: {_EXPECTED}")
+            raise InputError(f"{option} {key}: given twice; write its values as {key}=A,B")
+        values = parse_value(f"[{listed}]", f"{option} {entry}: {_EXPECTED}")
         # Text stays as it is unless YAML would read another type; everything else becomes JSON.
         axes[key] = tuple(
             value
-            if isinstance(value, str) and parse_value(value, "--set") == value
+            if isinstance(value, str) and parse_value(value, option) == value
             else json.dumps(value, default=str)
             for value in values
         )
         for value in axes[key]:
             if axes[key].count(value) > 1:
-                raise InputError(f"--set {entry}: {value} is given twice")
+                raise InputError(f"{option} {entry}: {value} is given twice")
     return axes
 
 
@@ -79,7 +81,8 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     is reported before anything is computed.
 
     Raises:
-        InputError: a scenario, key or value is wrong, or two scenarios have the same name.
+        InputError: a scenario, key or value is wrong, two scenarios have the same name, or PyBullet
+            is not installed.
     """
     choices = ([(key, value) for value in values] for key, values in axes.items())
     combinations = list(itertools.product(*choices))
@@ -87,8 +90,10 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
     names: dict[str, Path] = {}
     for path in paths:
         content = read_mapping(path)
-        first = (SweepRun(path, "", seeds[0], each, content) for each in combinations)
-        (name,) = {run.load().name for run in first}
+        loaded = [SweepRun(path, "", seeds[0], each, content).load() for each in combinations]
+        if any(isinstance(scenario, Simulation) for scenario in loaded):
+            require_pybullet()
+        (name,) = {scenario.name for scenario in loaded}
         if names.setdefault(name, path) != path:
             raise InputError(f"{path}: is named {name}, as {names[name]} is; names must differ")
         runs += [
@@ -170,32 +175,33 @@ def plan_run(
     Raises:
         InputError: the run is impossible.
     """
-    judged = EvaluatedRun.of(run.load(), store)
+    evaluated = EvaluatedRun.of(run.load(), store)
     if jobs is not None:
-        require_memory(judged.pipeline, jobs)
-    pipeline, stages = judged.pipeline, [f"{each.name}/{each.key}" for each in judged.stages()]
+        require_memory(evaluated.pipeline, jobs)
+    pipeline = evaluated.pipeline
+    stages = [f"{each.name}/{each.key}" for each in evaluated.stages()]
     read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam, robot.smooth)]
-    read += [*(pair.estimates for pair in pipeline.pairs), *judged.evaluations]
+    read += [*(pair.estimates for pair in pipeline.pairs), *evaluated.evaluations]
     read += pipeline.fusers.values()
     needs = tuple(name for stage in read for name in task_names(stage))
-    name, arguments = f"run/{run.run_id}", (run, judged, stages, tables.dataset)
+    name, arguments = f"run/{run.run_id}", (run, evaluated, stages, tables.dataset)
     last = Task(name, "write the tables", rows_of, arguments, (), needs)
-    tasks = judged.tasks | {name: last}
+    tasks = evaluated.tasks | {name: last}
     left = [] if tables.holds(run, stages) else unfinished(tasks, [name])
     return PlannedRun(run, stages, tasks, left)
 
 
 def rows_of(
-    run: SweepRun, judged: EvaluatedRun, stages: Sequence[str], dataset: SweepDataset
+    run: SweepRun, evaluated: EvaluatedRun, stages: Sequence[str], dataset: SweepDataset
 ) -> dict[str, pa.Table]:
     """Return a run's rows of all tables (work of the last task)."""
-    made = all_tables(judged, judged.team, _TABLES)
+    made = all_tables(evaluated, evaluated.team, _TABLES)
     times = [
         {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
-        for folder in judged.folders()
+        for folder in evaluated.folders()
         for name, seconds in folder.figures().items()
     ]
-    return dataset.finished(run, renderer(judged.scenario), stages, {**made, RUN_TIMES: times})
+    return dataset.finished(run, renderer(evaluated.scenario), stages, {**made, RUN_TIMES: times})
 
 
 @dataclass
@@ -494,6 +500,13 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     Measurements are serial; nothing else may run on the machine. The store keeps the times of each
     run; the table is written file by file.
     """
+
+    def measured(run: SweepRun) -> pd.DataFrame:
+        evaluated = EvaluatedRun.of(run.load(), sweep.store)
+        evaluated.execute(1, lambda *_: None)  # makes damaged stages again; all others exist
+        measure_aligners(evaluated)
+        return evaluated.pair_table(ALIGNER_TIMINGS)
+
     single_threaded()
     label, done = "time the aligners", 0
     runs = [run for run in sweep.runs if run.run_id not in failed]
@@ -506,15 +519,8 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
                 on_progress(label, done, len(runs))
                 done += 1
                 if run.run_id not in timed:
-                    measured = retry_damaged(sweep.store, partial(_measured, sweep, run))
-                    rows[run.run_id] = sweep.dataset.rows(ALIGNER_TIMINGS, run, measured)
+                    timings = retry_damaged(sweep.store, partial(measured, run))
+                    rows[run.run_id] = sweep.dataset.rows(ALIGNER_TIMINGS, run, timings)
             if rows:
                 tables.replace(ALIGNER_TIMINGS, number, rows)
     on_progress(label, len(runs), len(runs))
-
-
-def _measured(sweep: Sweep, run: SweepRun) -> pd.DataFrame:
-    judged = EvaluatedRun.of(run.load(), sweep.store)
-    judged.execute(1, lambda *_: None)  # makes damaged stages again; all others exist
-    measure_aligners(judged)
-    return judged.pair_table(ALIGNER_TIMINGS)

@@ -4,15 +4,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
+from mapfusion.align.alignment import Method
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.gnc import Gnc
 from mapfusion.align.icp import Icp, ImpIcp
-from mapfusion.align.method import Method
-from mapfusion.align.peers.kiss_matcher import KissMatcher
-from mapfusion.align.peers.opencv import OpenCv
-from mapfusion.align.ransac import Ransac
-from mapfusion.align.ransac_mahalanobis import RansacMahalanobis
+from mapfusion.align.peers import KissMatcher, OpenCv
+from mapfusion.align.ransac import Ransac, RansacMahalanobis
 from mapfusion.align.svd import Svd
 from mapfusion.errors import did_you_mean
 

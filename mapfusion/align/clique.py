@@ -11,7 +11,7 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
+from mapfusion.align.alignment import Fit, Pairs, Undetermined
 from mapfusion.align.consensus import Consensus, consistency_graphs, packed_rows
 from mapfusion.align.mahalanobis_gate import (
     PairSpread,
@@ -19,7 +19,6 @@ from mapfusion.align.mahalanobis_gate import (
     refit_at_best_drift,
     refit_to_support,
 )
-from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import WORD, chi_square_bound, count_common, kernel, trailing_zeros
 from mapfusion.parameters import Probability, Range

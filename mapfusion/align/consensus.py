@@ -6,20 +6,19 @@ is therefore equal in both maps up to noise (Mangelson et al. 2018, PCM; Lusk et
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
+from mapfusion.align.alignment import Fit, Pairs, Undetermined, why_angle_is_open
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.drift import DRIFT_FLOOR_M
 from mapfusion.align.mahalanobis_gate import (
+    DRIFT_FLOOR_M,
     PairSpread,
     PlanarPairs,
     mean_variances,
     refit_at_best_drift,
 )
-from mapfusion.align.method import Fit, Undetermined, why_angle_is_open
 from mapfusion.geometry.numerics import (
     WORD,
     Float,
@@ -39,21 +38,6 @@ _SHARE = 1 / 16
 _LEAST_EXTENT_M = 1e-6  # smallest extent of a map, which avoids a division by zero
 
 
-class _Coarse(NamedTuple):
-    """N correspondences in single precision, in units of the larger map's extent, arrays (N,).
-
-    Attributes:
-        ax, ay, bx, by: positions relative to the first pair.
-        most: contribution to the largest squared difference of two distances.
-    """
-
-    ax: np.ndarray
-    ay: np.ndarray
-    bx: np.ndarray
-    by: np.ndarray
-    most: np.ndarray
-
-
 @kernel
 def _worst(xx: float, xy: float, yy: float) -> float:
     """Return the larger eigenvalue of a covariance."""
@@ -61,29 +45,30 @@ def _worst(xx: float, xy: float, yy: float) -> float:
 
 
 @kernel
-def _coarse(rows: Float, variance_m2: float, bound: float) -> _Coarse:
-    """Return the pairs in single precision, with bounds that include rounding errors."""
+def _coarse(
+    rows: Float, variance_m2: float, bound: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pairs in single precision, with bounds that include rounding errors.
+
+    Returns:
+        Positions ax, ay, bx, by relative to the first pair, in units of the larger map's extent,
+        and the contribution of each pair to the largest squared difference of two distances, each
+        of shape (N,).
+    """
     n, extent = len(rows), _LEAST_EXTENT_M
     for i in range(n):
         for k in range(4):
             extent = max(extent, abs(rows[i, k] - rows[0, k]))
-    coarse = _Coarse(
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-        np.empty(n, np.float32),
-    )
+    ax, ay = np.empty(n, np.float32), np.empty(n, np.float32)
+    bx, by, most = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     for i in range(n):
-        coarse.ax[i] = (rows[i, 0] - rows[0, 0]) / extent
-        coarse.ay[i] = (rows[i, 1] - rows[0, 1]) / extent
-        coarse.bx[i] = (rows[i, 2] - rows[0, 2]) / extent
-        coarse.by[i] = (rows[i, 3] - rows[0, 3]) / extent
+        ax[i], ay[i] = (rows[i, 0] - rows[0, 0]) / extent, (rows[i, 1] - rows[0, 1]) / extent
+        bx[i], by[i] = (rows[i, 2] - rows[0, 2]) / extent, (rows[i, 3] - rows[0, 3]) / extent
         worst = _worst(rows[i, 4], rows[i, 5], rows[i, 6])
         worst += _worst(rows[i, 7], rows[i, 8], rows[i, 9])
-        most = bound * (worst + variance_m2) / (extent * extent)
-        coarse.most[i] = (1 + _SHARE) * most + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
-    return coarse
+        own = bound * (worst + variance_m2) / (extent * extent)
+        most[i] = (1 + _SHARE) * own + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
+    return ax, ay, bx, by, most
 
 
 @kernel
@@ -233,7 +218,7 @@ class Consensus:
         The result is undetermined for T_a_b of NaN. Results are kept with the pairs, because
         repetitions of a method find the same motions.
         """
-        fits: dict[tuple, Fit | Undetermined] = pairs.kept.setdefault(Consensus, {})
+        fits: dict[tuple, Fit | Undetermined] = pairs.cache.setdefault(Consensus, {})
         key = self, T_a_b.tobytes()
         if key not in fits:
             inlier, level = np.zeros(len(pairs), dtype=bool), -1
@@ -264,6 +249,6 @@ class Consensus:
 
 def pair_spread(pairs: Pairs) -> PairSpread:
     """Return the `PairSpread` of the pairs, which is kept with them."""
-    if PairSpread not in pairs.kept:
-        pairs.kept[PairSpread] = PairSpread.of(pairs.in_plan())
-    return pairs.kept[PairSpread]
+    if PairSpread not in pairs.cache:
+        pairs.cache[PairSpread] = PairSpread.of(pairs.in_plan())
+    return pairs.cache[PairSpread]

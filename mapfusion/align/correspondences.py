@@ -114,18 +114,16 @@ class _Side(NamedTuple):
         return np.flatnonzero((self.z_m + reach >= low_m) & (self.z_m - reach <= high_m))
 
 
-class _Coarse(NamedTuple):
-    """Landmarks (n,) in single precision."""
-
-    square: np.ndarray  # squared norms of the descriptors
-    best: np.ndarray  # squared distance to the nearest so far
-    z: np.ndarray  # heights in m
-    most: np.ndarray  # contribution to the largest squared difference of heights
-
-
 @kernel
-def _coarse(side: _Side, rows: np.ndarray, height_bound: float) -> _Coarse:
-    """Return some landmarks (n,) in single precision, with bounds that include rounding."""
+def _coarse(
+    side: _Side, rows: np.ndarray, height_bound: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return some landmarks (n,) in single precision, with bounds that include rounding.
+
+    Returns:
+        Squared norms of the descriptors, squared distances to the nearest so far, heights in m,
+        and contributions to the largest squared difference of heights.
+    """
     n = len(rows)
     square, best = np.empty(n, np.float32), np.empty(n, np.float32)
     z, most = np.empty(n, np.float32), np.empty(n, np.float32)
@@ -139,7 +137,7 @@ def _coarse(side: _Side, rows: np.ndarray, height_bound: float) -> _Coarse:
         if height_bound < math.inf:
             most[k] = (1 + _SHARE) * height_bound * side.variance_m2[i]
             most[k] += (1 + 1 / _SHARE) * 2 * lost * lost
-    return _Coarse(square, best, z, most)
+    return square, best, z, most
 
 
 @kernel
@@ -180,7 +178,7 @@ def _take_nearer(
     since few are nearer than the nearest of many; the others are compared in full precision.
     """
     m = len(columns)
-    coarse_a = _coarse(a, rows, height_bound)
+    square_a, _, z_a, most_a = _coarse(a, rows, height_bound)
     square, best, z, most = _coarse(b, columns, height_bound)
     eights = np.zeros((m + WORD - 1) // WORD * 8, np.uint64)
     near = eights.view(np.uint8)
@@ -189,7 +187,7 @@ def _take_nearer(
         first, end = 0, WORD
         while first < m:
             end = min(end, m)
-            own = coarse_a.square[k], np.float32(a.distance2[i]), coarse_a.z[k], coarse_a.most[k]
+            own = square_a[k], np.float32(a.distance2[i]), z_a[k], most_a[k]
             part = slice(first, end)
             _mark_nearer(
                 product[k, part], square[part], best[part], z[part], most[part], own, near[part]

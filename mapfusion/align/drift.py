@@ -10,12 +10,11 @@ import math
 import numpy as np
 
 from mapfusion.align.alignment import Pairs
+from mapfusion.align.mahalanobis_gate import DRIFT_FLOOR_M
 from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import rotation
 
-# Lower bound of s_drift, which keeps the weights of noise-free data finite.
-DRIFT_FLOOR_M = 1e-6
 _TOLERANCE = 1e-9  # relative step of s_drift^2 that ends the search
 _MAX_STEPS = 100  # a dozen are the rule
 # g^2 / 2v above which the gate's term is below rounding: x exp(-x) < 2^-53

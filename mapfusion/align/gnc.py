@@ -6,10 +6,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
+from mapfusion.align.alignment import Fit, Pairs, Undetermined
 from mapfusion.align.consensus import Consensus
 from mapfusion.align.mahalanobis_gate import PlanarPairs, mean_variances
-from mapfusion.align.method import Fit, Undetermined
 from mapfusion.align.rigid_motion import fit_weighted
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import residual

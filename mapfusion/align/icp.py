@@ -7,9 +7,8 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
+from mapfusion.align.alignment import Fit, Needs, Pairs
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.method import Fit, Needs
 from mapfusion.align.nearest_neighbours import (
     GROUP,
     BoxTree,
@@ -68,9 +67,9 @@ class ClosestPoints:
     @classmethod
     def of(cls, pairs: Pairs) -> "ClosestPoints":
         """Return the value kept with the pairs, made at the first call."""
-        if cls not in pairs.kept:
-            pairs.kept[cls] = cls(pairs)
-        return pairs.kept[cls]
+        if cls not in pairs.cache:
+            pairs.cache[cls] = cls(pairs)
+        return pairs.cache[cls]
 
     def cost_m2(self, T_a_b: Float, most_m2: float = math.inf) -> float:
         """Return the sum of squared distances from map b's landmarks to their nearest in map a.

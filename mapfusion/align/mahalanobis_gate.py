@@ -17,6 +17,9 @@ from mapfusion.align.rigid_motion import fit_weighted, residual_covariances
 from mapfusion.geometry.numerics import Float, kernel, source_of
 from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points
 
+# Lower bound of s_drift, which keeps the weights of noise-free data finite.
+DRIFT_FLOOR_M = 1e-6
+
 _ROUNDS = 20  # rounds of fit and support; two to five usually suffice
 # e^T C^-1 e above which the density of true pairs (e^-100 of its peak) is negligible
 _BEYOND = 200.0

@@ -154,39 +154,6 @@ def new_search_state() -> SearchState:
 
 
 @kernel
-def find_nearest_of_group(
-    T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: SearchState
-) -> None:
-    """Find the nearest tree points of a group under T_a_b.
-
-    Args:
-        T_a_b: motion, shape (3,).
-        first: index of the first point of the group.
-        groups: all groups.
-        tree: tree of points.
-        nearest: initial tree point of each point of all groups, shape (M GROUP,); -1 for none.
-        room: work space; its `nearest` and `square` hold the result.
-    """
-    x, y, z, found, square, _, _, _, _ = room
-    _, _, own_x, own_y, own_z = groups
-    _, px, py, pz, _, _, _, _ = tree
-    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
-    # unsigned indices allow vector instructions
-    begin = np.uint64(first)
-    for q in range(GROUP):
-        i = begin + np.uint64(q)
-        x[q], y[q] = moved_point(T_a_b, cos, sin, own_x[i], own_y[i])
-        z[q] = own_z[i]
-    for q in range(GROUP):
-        k = nearest[first + q]
-        found[q], square[q] = k, math.inf
-        if k >= 0:
-            dx, dy, dz = px[k] - x[q], py[k] - y[q], pz[k] - z[q]
-            square[q] = dx * dx + dy * dy + dz * dz
-    _descend(tree, room)
-
-
-@kernel
 def _largest(values: Float) -> float:
     largest = values[0]
     for q in range(1, GROUP):
@@ -201,10 +168,36 @@ def _between(low: float, high: float, box_low: float, box_high: float) -> float:
 
 
 @kernel
-def _descend(tree: BoxTree, room: SearchState) -> None:
-    """Search the tree for a group, nearest boxes first."""
-    _, px, py, pz, _, box, starts, ends = tree
+def find_nearest_of_group(
+    T_a_b: Float, first: int, groups: Groups, tree: BoxTree, nearest: np.ndarray, room: SearchState
+) -> None:
+    """Find the nearest tree points of a group under T_a_b.
+
+    Args:
+        T_a_b: motion, shape (3,).
+        first: index of the first point of the group.
+        groups: all groups.
+        tree: tree of points.
+        nearest: initial tree point of each point of all groups, shape (M GROUP,); -1 for none.
+        room: work space; its `nearest` and `square` hold the result.
+    """
     x, y, z, found, square, nodes, aways, near, far = room
+    _, _, own_x, own_y, own_z = groups
+    _, px, py, pz, _, box, starts, ends = tree
+    cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
+    # unsigned indices allow vector instructions
+    begin = np.uint64(first)
+    for q in range(GROUP):
+        i = begin + np.uint64(q)
+        x[q], y[q] = moved_point(T_a_b, cos, sin, own_x[i], own_y[i])
+        z[q] = own_z[i]
+    for q in range(GROUP):
+        k = nearest[first + q]
+        found[q], square[q] = k, math.inf
+        if k >= 0:
+            dx, dy, dz = px[k] - x[q], py[k] - y[q], pz[k] - z[q]
+            square[q] = dx * dx + dy * dy + dz * dz
+    # Search the tree, nearest boxes first.
     low_x, high_x, low_y, high_y, low_z, high_z = x[0], x[0], y[0], y[0], z[0], z[0]
     for q in range(1, GROUP):
         low_x, high_x = min(low_x, x[q]), max(high_x, x[q])

@@ -1,13 +1,24 @@
-"""Least-squares refinement of an estimate: local, without new sampling."""
+"""Least-squares refinement of an estimate: local, without new sampling.
+
+The oracle refines the motion of the true correspondences: the best result that the maps allow.
+"""
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
 
-from mapfusion.align.alignment import MIN_PAIRS, Alignment, Pairs, Status, undetermined
+from mapfusion.align.alignment import (
+    MIN_PAIRS,
+    Alignment,
+    Pairs,
+    Status,
+    undetermined,
+    why_angle_is_open,
+    why_too_few,
+)
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.drift import calibration_covariance, drift_step
 from mapfusion.align.mahalanobis_gate import (
@@ -16,7 +27,7 @@ from mapfusion.align.mahalanobis_gate import (
     is_outlier_to_others,
     why_rests_on_one_pair,
 )
-from mapfusion.align.method import why_angle_is_open
+from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import Float, invert, kernel
 from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points, wrap
 from mapfusion.parameters import Range, require_in_range, require_shape
@@ -250,3 +261,32 @@ def maximise_likelihood(
         determined = invert(normal, covariance)
     most = highest_leverage_pair(T_a_b, pairs, variance, truth, covariance)
     return determined, moved, T_a_b, covariance, variance, truth, most
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Aligner that receives the true pairs, for evaluation only.
+
+    Attributes:
+        refinement: least squares, as for the estimate of every aligner.
+    """
+
+    refinement: Refinement = field(default_factory=Refinement)
+
+    def align(self, pairs: Pairs, is_true: np.ndarray) -> Alignment:
+        """Estimate T_a_b from the correspondences marked in `is_true` (N,) bool.
+
+        Raises:
+            ValueError: `is_true` has another length.
+        """
+        started_s = time.perf_counter()
+        require_shape("is_true", is_true, (len(pairs),))
+        rows = np.flatnonzero(is_true)
+        reason = why_too_few(pairs.map_a, pairs.map_b, len(rows), MIN_PAIRS)
+        if reason:
+            return undetermined(f"true ones: {reason}", len(pairs), started_s)
+        start = fit_rigid(pairs.p_a, pairs.p_b, rows)
+        found = self.refinement.refine(pairs[rows], np.array(start))
+        inlier = np.zeros(len(pairs), dtype=bool)
+        inlier[rows] = found.inlier
+        return replace(found, inlier=inlier, elapsed_s=time.perf_counter() - started_s)

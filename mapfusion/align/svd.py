@@ -6,8 +6,7 @@ from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from mapfusion.align.alignment import MIN_PAIRS, Pairs
-from mapfusion.align.method import Fit, Needs
+from mapfusion.align.alignment import MIN_PAIRS, Fit, Needs, Pairs
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import rotation
 

@@ -260,8 +260,56 @@ class Rectification:
     @classmethod
     def of(cls, calibration: StereoCalibration) -> "Rectification":
         """Return the rectification of a pair; raise InputError if there is no common view."""
-        cropping = _crop(calibration)
-        return _resample(calibration) if cropping is None else cropping
+        left, right, T = calibration.left, calibration.right, calibration.T_left_right
+        f = float(left.focal_px[0])
+        tilt_px = f * np.abs(T[:3, :3] - np.eye(3)).max() + f * np.abs(T[1:3, 3]).max() / T[0, 3]
+        shift = right.center_px[0] - left.center_px[0]
+        differences = [each - f for each in (*left.focal_px, *right.focal_px)]
+        differences += [right.center_px[1] - left.center_px[1], shift - round(shift), tilt_px]
+        distorted = any(any(lens.coefficients) for lens in (left, right))
+        if not distorted and np.abs(differences).max() <= _SAME_PX:
+            (width, column, du), (height, row, dv) = (
+                _centred_span(left, right, axis) for axis in (0, 1)
+            )
+            # The optical axis of the crop is (-du / f, -dv / f, 1): a rotation of the camera.
+            turn, _ = cv2.Rodrigues(np.array([dv / f, -du / f, 0.0]))
+            return Rectification(
+                _camera(width, height, f, float(T[0, 3])),
+                R_ROBOT_OPTICAL @ turn @ R_ROBOT_OPTICAL.T,
+                ((column, row), (column + round(shift), row)),
+                None,
+                (left.size_px, right.size_px),
+            )
+
+        # Resample in the largest rectangle that both images fill.
+        T_right_left = np.linalg.inv(calibration.T_left_right)
+        # Only the rotations are used; they do not depend on the lenses.
+        found = cv2.stereoRectify(
+            np.eye(3), np.zeros(4), np.eye(3), np.zeros(4), (1, 1), T_right_left[:3, :3],
+            np.ascontiguousarray(T_right_left[:3, 3]),
+        )  # fmt: skip
+        R_left, R_right = (np.asarray(R, dtype=np.float64) for R in found[:2])
+        f = float(np.mean([*left.focal_px, *right.focal_px]))
+        reach = np.min([_reach(left, R_left), _reach(right, R_right)], axis=0)
+        width, height = (int(np.floor(2 * f * each)) + 1 for each in reach)
+        width, height = min(width, MAX_IMAGE_SIDE_PX), min(height, MAX_IMAGE_SIDE_PX)
+        camera = _camera(width, height, f, float(np.linalg.norm(T_right_left[:3, 3])))
+        K = np.eye(3) * [f, f, 1.0]
+        K[:2, 2] = camera.center_px
+        maps = []
+        for lens, R in ((left, R_left), (right, R_right)):
+            fisheye = lens.distortion == "equidistant"
+            make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+            size = (width, height)
+            columns, rows = make(lens.matrix, lens.parameters, R, K, size, cv2.CV_32FC1)
+            maps.append((columns, rows))
+        return Rectification(
+            camera,
+            R_ROBOT_OPTICAL @ R_left.T @ R_ROBOT_OPTICAL.T,
+            None,
+            (maps[0], maps[1]),
+            (left.size_px, right.size_px),
+        )
 
     def apply(self, raw: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Rectify a pair of raw images (H, W) uint8.
@@ -287,29 +335,6 @@ class Rectification:
         return left, right
 
 
-def _crop(calibration: StereoCalibration) -> Rectification | None:
-    """Return the rectification by cropping; None if the pair is not rectified."""
-    left, right, T = calibration.left, calibration.right, calibration.T_left_right
-    f = float(left.focal_px[0])
-    tilt_px = f * np.abs(T[:3, :3] - np.eye(3)).max() + f * np.abs(T[1:3, 3]).max() / T[0, 3]
-    shift = right.center_px[0] - left.center_px[0]
-    differences = [each - f for each in (*left.focal_px, *right.focal_px)]
-    differences += [right.center_px[1] - left.center_px[1], shift - round(shift), tilt_px]
-    distorted = any(any(lens.coefficients) for lens in (left, right))
-    if distorted or np.abs(differences).max() > _SAME_PX:
-        return None
-    (width, column, du), (height, row, dv) = (_centred_span(left, right, axis) for axis in (0, 1))
-    # The optical axis of the crop is (-du / f, -dv / f, 1): a rotation of the camera.
-    turn, _ = cv2.Rodrigues(np.array([dv / f, -du / f, 0.0]))
-    return Rectification(
-        _camera(width, height, f, float(T[0, 3])),
-        R_ROBOT_OPTICAL @ turn @ R_ROBOT_OPTICAL.T,
-        ((column, row), (column + round(shift), row)),
-        None,
-        (left.size_px, right.size_px),
-    )
-
-
 def _centred_span(left: Lens, right: Lens, axis: int) -> tuple[int, int, float]:
     """Return the largest span of columns (rows) around the centre that both images cover.
 
@@ -325,39 +350,6 @@ def _centred_span(left: Lens, right: Lens, axis: int) -> tuple[int, int, float]:
     begin = round(center - (side - 1) / 2)
     begin = min(max(begin, first), last - side + 1)
     return side, begin, center - begin - (side - 1) / 2
-
-
-def _resample(calibration: StereoCalibration) -> Rectification:
-    """Return the rectification by resampling in the largest rectangle that both images fill."""
-    left, right = calibration.left, calibration.right
-    T_right_left = np.linalg.inv(calibration.T_left_right)
-    # Only the rotations are used; they do not depend on the lenses.
-    found = cv2.stereoRectify(
-        np.eye(3), np.zeros(4), np.eye(3), np.zeros(4), (1, 1), T_right_left[:3, :3],
-        np.ascontiguousarray(T_right_left[:3, 3]),
-    )  # fmt: skip
-    R_left, R_right = (np.asarray(R, dtype=np.float64) for R in found[:2])
-    f = float(np.mean([*left.focal_px, *right.focal_px]))
-    reach = np.min([_reach(left, R_left), _reach(right, R_right)], axis=0)
-    width, height = (int(np.floor(2 * f * each)) + 1 for each in reach)
-    width, height = min(width, MAX_IMAGE_SIDE_PX), min(height, MAX_IMAGE_SIDE_PX)
-    camera = _camera(width, height, f, float(np.linalg.norm(T_right_left[:3, 3])))
-    K = np.eye(3) * [f, f, 1.0]
-    K[:2, 2] = camera.center_px
-    maps = []
-    for lens, R in ((left, R_left), (right, R_right)):
-        fisheye = lens.distortion == "equidistant"
-        make = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
-        size = (width, height)
-        columns, rows = make(lens.matrix, lens.parameters, R, K, size, cv2.CV_32FC1)
-        maps.append((columns, rows))
-    return Rectification(
-        camera,
-        R_ROBOT_OPTICAL @ R_left.T @ R_ROBOT_OPTICAL.T,
-        None,
-        (maps[0], maps[1]),
-        (left.size_px, right.size_px),
-    )
 
 
 def _reach(lens: Lens, R: Float) -> Float:

@@ -19,7 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.datasets.camera_calibration import StereoCalibration, parse_lens, parse_transform
-from mapfusion.datasets.export import OnFrame, StereoDrive, write_picture, write_text
+from mapfusion.datasets.export import (
+    OnFrame,
+    StereoDrive,
+    write_dead_reckoning,
+    write_picture,
+    write_text,
+)
 from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.levelling import MountSettings, robot_in_body
 from mapfusion.datasets.stereo_recording import (
@@ -31,13 +37,14 @@ from mapfusion.datasets.stereo_recording import (
 )
 from mapfusion.datasets.text_files import (
     POSES,
+    TimedPoses,
     parse_time_ns,
+    read_odometry_beside,
     read_rows,
     read_time_series,
     require_columns,
     require_increasing,
 )
-from mapfusion.datasets.tum import ODOMETRY_FILE, TimedPoses, read_odometry, tum_text
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
 
@@ -108,7 +115,6 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
             raise InputError(f"{states}: holds a quaternion of length 0")
         T_world_body = se3.from_quaternions(values[:, :3], values[:, [4, 5, 6, 3]])
         truth = TimedPoses(truth_ns, T_world_body).moved(T_body_robot)
-    odometry = root / ODOMETRY_FILE
     return StereoRecording(
         (root.resolve().parent if root.name == "mav0" else root.resolve()).name,
         time_ns,
@@ -116,7 +122,7 @@ def read_euroc(folder: Path, settings: EurocSettings, read_yaml: ReadYaml) -> St
         calibration,
         settings.mount.applied(T_robot_left),
         truth,
-        read_odometry(odometry) if odometry.exists() else None,
+        read_odometry_beside(root),
         (*lost_left, *lost_right, *dropped),
         inertial,
         calibrated_by,
@@ -175,7 +181,5 @@ def write_euroc(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pat
     values = np.column_stack([T[:, :3, 3], np.roll(se3.quaternions(T), 1, axis=1)]).tolist()
     rows = [",".join(map(str, [s, *v])) for s, v in zip(stamps, values, strict=True)]
     write_text(root / STATES / "data.csv", [_WRITTEN_STATE_COLUMNS, *rows])
-    about = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
-    text = tum_text(drive.time_s, drive.reckoned_bodies, about)
-    write_text(root / ODOMETRY_FILE, text.splitlines())
+    write_dead_reckoning(root, drive)
     return [folder / drive.robot]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
-from mapfusion.datasets.text_files import NS
+from mapfusion.datasets.text_files import NS, ODOMETRY_FILE, tum_text
 from mapfusion.files import write_whole
 from mapfusion.geometry import se2, se3
 from mapfusion.geometry.camera import StereoCamera
@@ -92,6 +92,13 @@ class StereoDrive:
         half_m = self.camera.baseline_m / 2
         place = self.camera.p_robot_eye(-half_m if camera else half_m)
         return se3.pose(self.camera.camera_axes @ R_ROBOT_OPTICAL, place)
+
+
+def write_dead_reckoning(folder: Path, drive: StereoDrive) -> None:
+    """Write the dead-reckoned trajectory of a drive to `odometry.tum` in a folder."""
+    about = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
+    text = tum_text(drive.time_s, drive.reckoned_bodies, about)
+    write_text(folder / ODOMETRY_FILE, text.splitlines())
 
 
 def write_text(path: Path, lines: list[str]) -> None:

@@ -99,8 +99,8 @@ IMPORTERS = {
 EXPORTERS = {
     "euroc": "mapfusion.datasets.euroc:write_euroc",
     "kitti": "mapfusion.datasets.kitti:write_kitti",
-    "rosbag": "mapfusion.datasets.rosbag_writer:write_rosbag",
-    "rosbag2": "mapfusion.datasets.rosbag_writer:write_rosbag2",
+    "rosbag": "mapfusion.datasets.rosbag:write_rosbag",
+    "rosbag2": "mapfusion.datasets.rosbag:write_rosbag2",
 }
 
 

@@ -36,15 +36,17 @@ from mapfusion.datasets.stereo_recording import (
 )
 from mapfusion.datasets.text_files import (
     NS,
+    TRUTH_FILE,
     parse_time_ns,
+    read_odometry_beside,
     read_rows,
+    read_time_series,
+    read_tum,
     require_columns,
     require_increasing,
 )
-from mapfusion.datasets.tum import ODOMETRY_FILE, TRUTH_FILE, read_odometry, read_tum
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
-from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import Range, require_in_range
 
 _KINDS = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
@@ -89,7 +91,23 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (a recording of images)")
     calibration_file = folder / settings.calibration
-    calibration, T_robot_left = _read_calibration(calibration_file, read_yaml)
+    document = read_yaml(calibration_file)
+    cam0, cam1 = (parse_section(calibration_file, document, name) for name in ("cam0", "cam1"))
+    T_right_left = parse_transform(f"{calibration_file}: cam1", "T_cn_cnm1", cam1)
+    try:
+        lenses = (
+            parse_lens(f"{calibration_file}: cam0", cam0),
+            parse_lens(f"{calibration_file}: cam1", cam1),
+        )
+        calibration = StereoCalibration(*lenses, se3.inverse(T_right_left))
+    except InputError as error:
+        known = str(error).startswith(str(calibration_file))
+        raise InputError(f"{'' if known else f'{calibration_file}: cam1: '}{error}") from error
+    T_robot_left = level_mount(float(calibration.T_left_right[0, 3]), 0.0, _HEIGHT_M)
+    if "T_BS" in cam0:
+        T_body_left = parse_transform(f"{calibration_file}: cam0", "T_BS", cam0)
+        T_robot_left = robot_in_body(T_body_left)[1]
+
     pair_list = folder / settings.list
     if pair_list.is_file():
         left, right = _read_pair_list(pair_list)
@@ -100,7 +118,7 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
         )
     max_offset_ns = round(settings.most_apart_s * NS)
     time_ns, pictures, dropped = pair_shots(folder, left, right, max_offset_ns)
-    odometry, truth = folder / ODOMETRY_FILE, folder / TRUTH_FILE
+    truth = folder / TRUTH_FILE
     return StereoRecording(
         folder.resolve().name,
         time_ns,
@@ -108,28 +126,10 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
         calibration,
         settings.mount.applied(T_robot_left),
         truth=read_tum(truth) if truth.exists() else None,
-        odometry=read_odometry(odometry) if odometry.exists() else None,
+        odometry=read_odometry_beside(folder),
         dropped=dropped,
         calibrated_by=str(calibration_file),
     )
-
-
-def _read_calibration(path: Path, read_yaml: ReadYaml) -> tuple[StereoCalibration, Float]:
-    """Return the calibration of the pair and T_robot_left (4, 4)."""
-    document = read_yaml(path)
-    left, right = (parse_section(path, document, name) for name in ("cam0", "cam1"))
-    T_right_left = parse_transform(f"{path}: cam1", "T_cn_cnm1", right)
-    try:
-        lenses = parse_lens(f"{path}: cam0", left), parse_lens(f"{path}: cam1", right)
-        calibration = StereoCalibration(*lenses, se3.inverse(T_right_left))
-    except InputError as error:
-        where = "" if str(error).startswith(str(path)) else f"{path}: cam1: "
-        raise InputError(f"{where}{error}") from error
-    if "T_BS" not in left:
-        baseline_m = float(calibration.T_left_right[0, 3])
-        return calibration, level_mount(baseline_m, 0.0, _HEIGHT_M)
-    T_body_left = parse_transform(f"{path}: cam0", "T_BS", left)
-    return calibration, robot_in_body(T_body_left)[1]
 
 
 def _read_folder(folder: Path, times: Path) -> list[Shot]:
@@ -141,13 +141,11 @@ def _read_folder(folder: Path, times: Path) -> list[Shot]:
         kinds = ", ".join(sorted(_KINDS))
         raise InputError(f"{folder}: holds no picture of one camera ({kinds})")
     if times.is_file():
-        rows = list(read_rows(times, "times of pictures"))
-        if len(rows) != len(paths):
-            raise InputError(
-                f"{times}: has {len(rows)} times for {len(paths)} pictures of {folder}"
-            )
-        time_ns = [parse_time_ns(times, line, words[0], NS) for line, words in rows]
-        require_increasing(times, [line for line, _ in rows], np.array(time_ns, dtype=np.int64))
+        taken_ns, _ = read_time_series(times, "times of pictures", "time", NS, more=True)
+        if len(taken_ns) != len(paths):
+            found = f"has {len(taken_ns)} times for {len(paths)} pictures of {folder}"
+            raise InputError(f"{times}: {found}")
+        time_ns = taken_ns.tolist()
     else:
         time_ns = list[int]()
         for path in paths:

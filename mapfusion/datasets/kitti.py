@@ -38,7 +38,13 @@ from mapfusion.datasets.camera_calibration import (
     StereoCalibration,
     require_rigid,
 )
-from mapfusion.datasets.export import OnFrame, StereoDrive, write_picture, write_text
+from mapfusion.datasets.export import (
+    OnFrame,
+    StereoDrive,
+    write_dead_reckoning,
+    write_picture,
+    write_text,
+)
 from mapfusion.datasets.levelling import MountSettings, level_mount
 from mapfusion.datasets.stereo_recording import (
     PictureFile,
@@ -50,13 +56,14 @@ from mapfusion.datasets.stereo_recording import (
 from mapfusion.datasets.text_files import (
     NS,
     POSES,
+    TimedPoses,
     parse_numbers,
-    parse_time_ns,
+    read_odometry_beside,
     read_rows,
+    read_time_series,
     require_columns,
     require_increasing,
 )
-from mapfusion.datasets.tum import ODOMETRY_FILE, TimedPoses, read_odometry, tum_text
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float
@@ -124,14 +131,7 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
             line.
     """
     time_file = folder / "times.txt"
-    lines, times = list[int](), list[int]()
-    for line, words in read_rows(time_file, "times of a KITTI sequence"):
-        require_columns(time_file, line, words, "time")
-        lines.append(line)
-        times.append(parse_time_ns(time_file, line, words[0], NS))
-    taken_ns = np.array(times, dtype=np.int64)
-    require_increasing(time_file, lines, taken_ns)
-
+    taken_ns, _ = read_time_series(time_file, "times of a KITTI sequence", "time", NS)
     first = 0 if settings.cameras == "grey" else 2
     folders = [folder / f"image_{camera}" for camera in (first, first + 1)]
     left, right = (numbered_shots(f, _DIGITS, f.name, taken_ns, time_file) for f in folders)
@@ -148,7 +148,6 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
     sequence = folder.resolve()
     beside = sequence.parent.parent / "poses" / f"{sequence.name}.txt"
     truth = next((path for path in (sequence / "poses.txt", beside) if path.exists()), None)
-    odometry = folder / ODOMETRY_FILE
     return StereoRecording(
         sequence.name,
         time_ns,
@@ -156,7 +155,7 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
         calibration,
         T_robot_left,
         None if truth is None else _read_truth(truth, taken_ns, T_robot_left),
-        read_odometry(odometry) if odometry.exists() else None,
+        read_odometry_beside(folder),
         dropped,
         calibrated_by=str(calibration_file),
     )
@@ -276,7 +275,6 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
         T_imu_left = se3.inverse(T_rect_imu) @ se3.pose(np.eye(3), offset)
         T_imu_ahead = T_imu_left @ se3.inverse(se3.pose(R_ROBOT_OPTICAL, np.zeros(3)))
         truth = _read_oxts(drive / "oxts").moved(T_imu_ahead @ se3.inverse(T_robot_left))
-    odometry = folder / ODOMETRY_FILE
     return StereoRecording(
         drive.name,
         time_ns,
@@ -284,7 +282,7 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
         pair,
         T_robot_left,
         truth,
-        read_odometry(odometry) if odometry.exists() else None,
+        read_odometry_beside(folder),
         dropped,
         calibrated_by=str(calibration_file),
     )
@@ -356,9 +354,7 @@ def write_kitti(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pat
     T_world_left = drive.true_bodies @ T_robot_left
     poses = se3.between(T_world_left[0], T_world_left)
     write_text(sequence / "poses.txt", [_matrix_text(T[:3]) for T in poses])
-    about = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
-    text = tum_text(drive.time_s, drive.reckoned_bodies, about)
-    write_text(sequence / ODOMETRY_FILE, text.splitlines())
+    write_dead_reckoning(sequence, drive)
     return [sequence]
 
 

@@ -245,7 +245,16 @@ def likely_cause(
     )
     for candidates in stages:
         for text, R_robot_stated, corrected in candidates:
-            cause = _correct_axes_and_unit(text, observed, R_robot_stated, corrected, sigma)
+            # Correct the axes, then the unit. Rotation vectors are axial vectors: mirrored axes
+            # change their sign.
+            shift, turn = motions_of_poses(corrected, observed.start, observed.end)
+            moved = shift @ R_robot_stated.T
+            turned = np.linalg.det(R_robot_stated) * turn @ R_robot_stated.T
+            ratio = _compare_vectors(observed, moved, turned, sigma).shift.ratio
+            if not ratio > 0 or abs(np.log(ratio)) < np.log1p(_UNIT_TOLERANCE):
+                ratio = 1.0
+            found = _compare_vectors(observed, moved / ratio, turned, sigma)
+            cause = _Cause(text, found, ratio)
             if best is None or cause.comparison.worst > best.comparison.worst + _TIE:
                 best = cause
         if best is not None and best.comparison.worst >= _EXPLAINED:
@@ -269,19 +278,6 @@ def likely_cause(
             text = f"distances are {scales[0]:.3g} and turns {scales[1]:.3g} times those"
             return f"{text} that are observed: are units, focal length and baseline right?"
     return "no common mistake explains it: is it another run's, or the calibration another's?"
-
-
-def _correct_axes_and_unit(
-    text: str, observed: Motions, axes: Float, poses: Float, sigma: Float
-) -> _Cause:
-    """Return the cause with axes R_robot_stated (3, 3) and the unit corrected."""
-    shift, turn = motions_of_poses(poses, observed.start, observed.end)
-    # Rotation vectors are axial vectors: mirrored axes change their sign.
-    moved, turned = shift @ axes.T, np.linalg.det(axes) * turn @ axes.T
-    ratio = _compare_vectors(observed, moved, turned, sigma).shift.ratio
-    if not ratio > 0 or abs(np.log(ratio)) < np.log1p(_UNIT_TOLERANCE):
-        ratio = 1.0
-    return _Cause(text, _compare_vectors(observed, moved / ratio, turned, sigma), ratio)
 
 
 def _frames_late(observed: Motions, poses: Float) -> list[int]:

@@ -16,11 +16,11 @@ the others are landmarks.
 
 import re
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 
 import numpy as np
 
+from mapfusion.datasets.text_files import parse_numbers, read_rows, require_columns
 from mapfusion.errors import InputError
 from mapfusion.geometry.camera import CalibrationError
 from mapfusion.geometry.numerics import Float
@@ -35,7 +35,6 @@ from mapfusion.robot_log import (
 )
 
 _LAST_ROBOT_SUBJECT = 5
-_MAX_VALUE = 1e12  # of any number: times since 1970 are 1e9 s
 _CAMERA = "MRCLAM"  # all robots share one camera model, calibration and print of barcodes
 _MAY_BE_ZERO = ("range_sigma_ratio", "range_scale_sigma")
 _MAX_FRAMES = 1_000_000  # eleven days at one frame a second
@@ -105,14 +104,14 @@ def import_mrclam(
     landmark_file = folder / "Landmark_Groundtruth.dat"
     landmarks: dict[int, Float] | None = None
     if landmark_file.exists():
-        rows, _ = _read_table(landmark_file, 5)
+        rows, _ = _read_table(landmark_file, "subject x y sigma_x sigma_y")
         landmarks = {int(row[0]): np.array([row[1], row[2], 0.0]) for row in rows}
     recordings = [
         (
             f"robot{n}",
-            _read_time_series(folder / f"Robot{n}_Odometry.dat", 3),
+            _read_time_series(folder / f"Robot{n}_Odometry.dat", "time speed turn_rate"),
             _read_measurements(folder / f"Robot{n}_Measurement.dat", subject_of_barcode, landmarks),
-            _read_time_series(path, 4)
+            _read_time_series(path, "time x y theta")
             if (path := folder / f"Robot{n}_Groundtruth.dat").exists()
             else None,
         )
@@ -242,7 +241,7 @@ def _interpolate_truth(clock_s: Float, truth: Float, longest_gap_s: float) -> Fl
 
 def _read_barcodes(path: Path) -> dict[int, int]:
     """Return the subject of each barcode."""
-    table, lines = _read_table(path, 2)
+    table, lines = _read_table(path, "subject barcode")
     subject_of: dict[int, int] = {}
     for (subject, barcode), line in zip(table, lines, strict=True):
         if subject % 1 or barcode % 1:
@@ -261,7 +260,7 @@ def _read_measurements(
     Robots and unknown (misread) barcodes are left out, and landmarks without a true position if
     `landmarks` is given.
     """
-    table, lines = _read_table(path, 4)
+    table, lines = _read_table(path, "time barcode range bearing")
     wrong = np.flatnonzero(table[:, 2] <= 0)
     if len(wrong):
         row = wrong[0]
@@ -276,39 +275,19 @@ def _read_measurements(
     return table[np.argsort(table[:, 0], kind="stable")]
 
 
-def _read_time_series(path: Path, n_columns: int) -> Float:
+def _read_time_series(path: Path, columns: str) -> Float:
     """Read a table and sort it by time; at least two rows are required."""
-    table, _ = _read_table(path, n_columns)
+    table, _ = _read_table(path, columns)
     if len(table) < 2:
         raise InputError(f"{path}: has {len(table)} rows, expected at least 2")
     return table[np.argsort(table[:, 0], kind="stable")]
 
 
-def _read_table(path: Path, n_columns: int) -> tuple[Float, list[int]]:
-    """Return the numbers of a text file, shape (N, n_columns), and the line number of each row."""
-    try:
-        text = path.read_text(encoding="ascii")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file (part of an MRCLAM recording)") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a readable text file") from error
+def _read_table(path: Path, columns: str) -> tuple[Float, list[int]]:
+    """Return the numbers of a text file, shape (N, n), and the line number of each row."""
     rows, lines = [], []
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) != n_columns:
-            raise InputError(
-                f"{path}, line {number}: has {len(words)} columns, expected {n_columns}"
-            )
-        try:
-            row = [float(word) for word in words]
-        except ValueError as error:
-            raise InputError(f"{path}, line {number}: not a number in {line.strip()!r}") from error
-        if not all(map(isfinite, row)):
-            raise InputError(f"{path}, line {number}: not a finite number in {line.strip()!r}")
-        if max(map(abs, row)) > _MAX_VALUE:
-            raise InputError(f"{path}, line {number}: larger than {_MAX_VALUE:g}: {line.strip()!r}")
-        rows.append(row)
-        lines.append(number)
-    return np.array(rows).reshape(-1, n_columns), lines
+    for line, words in read_rows(path, "part of an MRCLAM recording"):
+        require_columns(path, line, words, columns)
+        rows.append(parse_numbers(path, line, words))
+        lines.append(line)
+    return np.array(rows).reshape(len(rows), len(columns.split())), lines

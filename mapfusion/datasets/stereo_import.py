@@ -25,8 +25,7 @@ from mapfusion.datasets.log_consistency import Finding, disagreement, truth_find
 from mapfusion.datasets.motion_agreement import Stated, pose_mistakes
 from mapfusion.datasets.relative_motion import composed_spans, motions_between_frames
 from mapfusion.datasets.stereo_recording import StereoRecording, sample_indices
-from mapfusion.datasets.text_files import NS
-from mapfusion.datasets.tum import TimedPoses
+from mapfusion.datasets.text_files import NS, TimedPoses
 from mapfusion.errors import InputError, OutOfRangeError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se3
@@ -50,7 +49,7 @@ from mapfusion.vision.stereo_noise import (
     parameters_for_noise,
     rectification_offsets,
 )
-from mapfusion.vision.tracking import Features, Tracks
+from mapfusion.vision.tracking import Tracks
 from mapfusion.vision.visual_odometry import RigidMotion, robot_motions, visual_odometry
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -149,29 +148,9 @@ def front_end_for_recording(
     ]
     vision = scale_descriptor_window(vision, camera, np.concatenate([*depth_m, np.empty(0)]))
     front_end = FrontEnd(camera, vision)
-    return _tune_to_tracks(camera, vision, [front_end.extract(*pair) for pair in run])
+    frames = [front_end.extract(*pair) for pair in run]
 
-
-def scale_descriptor_window(
-    vision: FrontEndParameters, camera: StereoCamera, depth_m: Float
-) -> FrontEndParameters:
-    """Scale the descriptor window to observed depths (N,); no depths leave it unchanged.
-
-    The factor is a power of two, so that similar robots in similar places use the same window and
-    their descriptors can be compared.
-    """
-    if not len(depth_m):
-        return vision
-    usual_m = vision.usurf.side_m
-    fits = np.median(depth_m) / _DEFAULT_DEPTH_M * _DEFAULT_CAMERA.focal_px / camera.focal_px
-    side_m = usual_m * 2.0 ** float(np.round(np.log2(fits)))
-    return replace(vision, usurf=replace(vision.usurf, side_m=float(np.clip(side_m, *_SIDE_M))))
-
-
-def _tune_to_tracks(
-    camera: StereoCamera, vision: FrontEndParameters, frames: Sequence[Features]
-) -> FrontEndParameters:
-    """Set the pixel noise by reprojection errors and the number of corners by observations."""
+    # The pixel noise follows from reprojection errors, the number of corners from observations.
     observer = Observer.of(camera, vision)
     seen = [observer.observe(found).tracks for found in frames]
     errors = [
@@ -190,6 +169,22 @@ def _tune_to_tracks(
         corners = int(vision.harris.max_corners * _MAX_OBSERVATIONS / usual)
         vision = replace(vision, harris=replace(vision.harris, max_corners=corners))
     return vision
+
+
+def scale_descriptor_window(
+    vision: FrontEndParameters, camera: StereoCamera, depth_m: Float
+) -> FrontEndParameters:
+    """Scale the descriptor window to observed depths (N,); no depths leave it unchanged.
+
+    The factor is a power of two, so that similar robots in similar places use the same window and
+    their descriptors can be compared.
+    """
+    if not len(depth_m):
+        return vision
+    usual_m = vision.usurf.side_m
+    fits = np.median(depth_m) / _DEFAULT_DEPTH_M * _DEFAULT_CAMERA.focal_px / camera.focal_px
+    side_m = usual_m * 2.0 ** float(np.round(np.log2(fits)))
+    return replace(vision, usurf=replace(vision.usurf, side_m=float(np.clip(side_m, *_SIDE_M))))
 
 
 def reprojection_errors_px(camera: StereoCamera, before: Tracks, after: Tracks) -> Float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mapfusion.datasets.camera_calibration import StereoCalibration
 from mapfusion.datasets.imu import ImuData
-from mapfusion.datasets.tum import TimedPoses
+from mapfusion.datasets.text_files import TimedPoses
 from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
 

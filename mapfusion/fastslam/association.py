@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import Estimates, Slots, boxes_overlap
+from mapfusion.fastslam.landmarks import Estimates, boxes_overlap, slots_near
 from mapfusion.fastslam.measurement import DROPPED, NEW, MapObservations, innovation, quadratic_form
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.geometry.numerics import Float, kernel
@@ -33,16 +33,6 @@ class Pairs(NamedTuple):
     slot: np.ndarray  # (P,)
 
 
-def observation_boxes(seen: MapObservations, gate: float) -> Float:
-    """Return boxes (K, 4) that enclose each observation and its gate in all particles."""
-    # by coordinate (2, K, M), since NumPy is slow along an axis before a short one
-    point = np.ascontiguousarray(seen.point_m[:, :, :2].transpose(2, 0, 1))
-    spread = np.stack([seen.covariance_m2[:, :, 0], seen.covariance_m2[:, :, 3]])  # xx and yy
-    margin = np.sqrt(gate * spread.max(axis=2, initial=0.0))
-    boxes = np.concatenate([point.min(axis=2) - margin, point.max(axis=2) + margin])
-    return np.ascontiguousarray(boxes.T)
-
-
 def candidate_pairs(
     maps: ParticleMaps,
     seen: MapObservations,
@@ -58,12 +48,18 @@ def candidate_pairs(
     """
     if descriptor is None:
         descriptor = np.empty((len(seen.point_m), 0), dtype=np.float32)
-    boxes = observation_boxes(seen, gate)
+    # Boxes (K, 4) that enclose each observation and its gate in all particles. They are computed by
+    # coordinate (2, K, M), since NumPy is slow along an axis before a short one.
+    point = np.ascontiguousarray(seen.point_m[:, :, :2].transpose(2, 0, 1))
+    spread = np.stack([seen.covariance_m2[:, :, 0], seen.covariance_m2[:, :, 3]])  # xx and yy
+    margin = np.sqrt(gate * spread.max(axis=2, initial=0.0))
+    bounds = np.concatenate([point.min(axis=2) - margin, point.max(axis=2) + margin])
+    boxes = np.ascontiguousarray(bounds.T)
     around = np.concatenate([boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)])
     observation, slot, distance = _pairs_of_boxes(
         maps.slots.box_m,
         maps.slots.descriptor,
-        maps.near(around),
+        slots_near(maps.slots, around),
         boxes,
         np.ascontiguousarray(descriptor, dtype=np.float32),
         np.float32(descriptor_threshold),
@@ -239,13 +235,3 @@ def _assign_nearest(
             if chosen[k, m] < 0 and not taken[j, m]:
                 chosen[k, m] = pairs.slot[i]
                 taken[j, m] = True
-
-
-def observation_sources(slots: Slots, chosen: np.ndarray, first_source: int) -> np.ndarray:
-    """Return the source (K, M) int32 of the landmark of each observation, -1 for dropped ones.
-
-    `first_source` is the running number of the first observation.
-    """
-    own = first_source + np.arange(len(chosen))[:, None]
-    source = np.where(chosen == NEW, own, slots.source[chosen])
-    return np.where(chosen == DROPPED, -1, source).astype(np.int32)

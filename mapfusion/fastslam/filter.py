@@ -16,7 +16,6 @@ from mapfusion.fastslam.association import (
     associate,
     candidate_pairs,
     label_pairs,
-    observation_sources,
 )
 from mapfusion.fastslam.landmarks import ActiveTracks
 from mapfusion.fastslam.loop_closing import (
@@ -26,6 +25,8 @@ from mapfusion.fastslam.loop_closing import (
     odometry_noise_factor,
 )
 from mapfusion.fastslam.measurement import (
+    DROPPED,
+    NEW,
     MapObservations,
     log_density_at_gate,
     observations_in_map,
@@ -230,7 +231,10 @@ class FastSlam:
         self._log_weights, log_evidence = normalised(log_weights)
         self._best = int(np.argmax(self._log_weights))
         if self._history is not None:
-            source = observation_sources(maps.slots, chosen, self._n_observations)
+            # Source (K, M) of the landmark of each observation, -1 for dropped ones.
+            own = self._n_observations + np.arange(len(chosen))[:, None]
+            source = np.where(chosen == NEW, own, maps.slots.source[chosen])
+            source = np.where(chosen == DROPPED, -1, source).astype(np.int32)
             self._history.add(self._poses, source)
         self._n_observations += len(chosen)
         n_effective = effective_sample_size(self._log_weights)
@@ -244,8 +248,14 @@ class FastSlam:
             log_weights=self._log_weights,
             log_evidence=log_evidence,
         )
-        if few:
-            self._resample()
+        if few:  # replace particles of low weight by copies of heavy ones
+            ancestors = systematic_ancestors(self._log_weights, self._rng)
+            self._poses = self._poses[ancestors]
+            maps.resample(ancestors)
+            self._log_weights = np.full(settings.n_particles, -np.log(settings.n_particles))
+            if self._history is not None:
+                self._history.resample(ancestors)
+            self._best = int(np.searchsorted(ancestors, self._best))
         return result
 
     def best_map(self, min_count: int = 3) -> LandmarkMap:
@@ -371,17 +381,6 @@ class FastSlam:
             pairs = candidate_pairs(self._maps, seen, settings.gate)
         nearest = settings.association is Association.GATE
         return associate(self._maps, pairs, seen, may_create, settings.gate, self._planar, nearest)
-
-    def _resample(self) -> None:
-        """Replace particles of low weight by copies of heavy ones."""
-        n_particles = self.parameters.n_particles
-        ancestors = systematic_ancestors(self._log_weights, self._rng)
-        self._poses = self._poses[ancestors]
-        self._maps.resample(ancestors)
-        self._log_weights = np.full(n_particles, -np.log(n_particles))
-        if self._history is not None:
-            self._history.resample(ancestors)
-        self._best = int(np.searchsorted(ancestors, self._best))
 
     def _kept_history(self) -> PathHistory:
         if self._history is None:

@@ -114,7 +114,15 @@ def run_log(
             evidence = viewing_of_log(log, source, path, landmarks.source_observation)
             landmarks = replace(landmarks, viewing=evidence)
         if attitude is not None and not log.planar:
-            landmarks = _with_attitude(landmarks, log, source, path, attitude)
+            # The attitude's uncertainty adds to the variance of the heights.
+            rows = np.flatnonzero(np.isin(source, landmarks.source_observation))
+            order = np.argsort(landmarks.source_observation, kind="stable")
+            place = order[np.searchsorted(landmarks.source_observation[order], source[rows])]
+            own = log.iteration[rows].astype(np.int64)
+            lifted = attitude_height_errors(attitude, path, own, place, landmarks.position_m)
+            covariance = landmarks.covariance_m2.copy()
+            covariance[:, 2, 2] += np.sum(lifted**2, axis=0)
+            landmarks = replace(landmarks, covariance_m2=covariance)
         yield Frame(iteration, result, slam, landmarks, path, source)
 
 
@@ -137,29 +145,3 @@ def build_map(
         if frame.landmarks is not None:
             return frame.landmarks
     raise InputError(f"log {log.robot}: holds no frame")
-
-
-def _with_attitude(
-    landmarks: LandmarkMap,
-    log: RobotLog,
-    source: np.ndarray,
-    path: Float,
-    attitude: Attitude,
-) -> LandmarkMap:
-    """Add the attitude's uncertainty to the height variances of a map.
-
-    Args:
-        landmarks: the map.
-        log: measurements of the robot.
-        source: (n,) source of the landmark of each observation so far.
-        path: (T, 3) path of the robot.
-        attitude: attitude that levelled the observations.
-    """
-    rows = np.flatnonzero(np.isin(source, landmarks.source_observation))
-    order = np.argsort(landmarks.source_observation, kind="stable")
-    place = np.searchsorted(landmarks.source_observation[order], source[rows])
-    frame = log.iteration[rows].astype(np.int64)
-    lifted = attitude_height_errors(attitude, path, frame, order[place], landmarks.position_m)
-    covariance = landmarks.covariance_m2.copy()
-    covariance[:, 2, 2] += np.sum(lifted**2, axis=0)
-    return replace(landmarks, covariance_m2=covariance)

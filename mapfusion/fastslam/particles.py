@@ -19,7 +19,6 @@ from mapfusion.fastslam.landmarks import (
     Estimates,
     allocate,
     grow,
-    slots_near,
     transform_boxes,
     update_block_boxes,
     update_boxes,
@@ -62,10 +61,6 @@ class ParticleMaps:
     def n_rows(self) -> int:
         """Number of slots that have a row."""
         return len(self._used_rows)
-
-    def near(self, box_m: Float) -> np.ndarray:
-        """Return slots whose box overlaps `box_m` (4,); they may be out of date."""
-        return slots_near(self.slots, box_m)
 
     def bring_up_to_date(self, which: np.ndarray) -> np.ndarray:
         """Update the rows of slots (n,) to the present generation; free slots without a particle.
@@ -321,8 +316,25 @@ class PathHistory:
         self._poses.append(T_map_robot.copy())
         self._ancestors.append(np.arange(len(T_map_robot), dtype=np.int32))
         self._sources.append(source)
-        if len(self._poses) == self._next_pruning:
-            self._prune()
+        if len(self._poses) < self._next_pruning:
+            return
+        # Remove particles without descendants.
+        step = len(self._poses) - 1
+        while step >= 0:
+            kept, place = np.unique(self._ancestors[step], return_inverse=True)
+            all_kept = len(kept) == len(self._poses[step])
+            if all_kept and step < self._n_pruned:
+                break  # unchanged since the last pruning, and so are all earlier steps
+            if not all_kept:
+                self._ancestors[step] = place.astype(np.int32)
+                self._poses[step] = self._poses[step][kept]
+                self._sources[step] = self._sources[step][:, kept]
+                if step > 0:
+                    self._ancestors[step - 1] = self._ancestors[step - 1][kept]
+            step -= 1
+        n_examined = len(self._poses) - 1 - step
+        self._n_pruned = len(self._poses)
+        self._next_pruning = self._n_pruned + max(_PRUNING_INTERVAL, n_examined // 2)
 
     def resample(self, ancestors: np.ndarray) -> None:
         """Record that particle m became a child of ancestors[m] (M,) after the last step."""
@@ -360,22 +372,3 @@ class PathHistory:
             particle = int(ancestors[particle])
             line.append(particle)
         return line[::-1]
-
-    def _prune(self) -> None:
-        """Remove particles without descendants."""
-        step = len(self._poses) - 1
-        while step >= 0:
-            kept, place = np.unique(self._ancestors[step], return_inverse=True)
-            all_kept = len(kept) == len(self._poses[step])
-            if all_kept and step < self._n_pruned:
-                break  # unchanged since the last pruning, and so are all earlier steps
-            if not all_kept:
-                self._ancestors[step] = place.astype(np.int32)
-                self._poses[step] = self._poses[step][kept]
-                self._sources[step] = self._sources[step][:, kept]
-                if step > 0:
-                    self._ancestors[step - 1] = self._ancestors[step - 1][kept]
-            step -= 1
-        n_examined = len(self._poses) - 1 - step
-        self._n_pruned = len(self._poses)
-        self._next_pruning = self._n_pruned + max(_PRUNING_INTERVAL, n_examined // 2)

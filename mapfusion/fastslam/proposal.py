@@ -33,6 +33,7 @@ class Proposal(StrEnum):
     INFORMED = "informed"  # odometry and observations, with corrected weights
 
 
+@kernel(error_model="numpy")
 def with_odometry_noise(
     predicted: MapObservations, T_map_predicted: Float, odometry: Float, sigma: Float
 ) -> MapObservations:
@@ -44,16 +45,8 @@ def with_odometry_noise(
         odometry: (3,) increment that the prediction used.
         sigma: (3,) standard deviations of the increment.
     """
+    point, pose, turn = predicted.point_m, T_map_predicted, odometry[2]
     covariance = predicted.covariance_m2.copy()
-    _add_odometry_noise(predicted.point_m, covariance, T_map_predicted, odometry[2], sigma)
-    return MapObservations(predicted.point_m, covariance)
-
-
-@kernel(error_model="numpy")
-def _add_odometry_noise(
-    point: Float, covariance: Float, pose: Float, turn: float, sigma: Float
-) -> None:
-    """Add the odometry's covariance in the map frame to `covariance` (K, M, 6), in place."""
     a, b, w = sigma[0] ** 2, sigma[1] ** 2, sigma[2] ** 2
     by_odometry = np.empty((len(pose), 3))
     for m in range(len(pose)):
@@ -67,6 +60,7 @@ def _add_odometry_noise(
             covariance[k, m, 0] += by_odometry[m, 0] + w * dy * dy
             covariance[k, m, 1] += by_odometry[m, 1] - w * dx * dy
             covariance[k, m, 3] += by_odometry[m, 2] + w * dx * dx
+    return MapObservations(point, covariance)
 
 
 @kernel(error_model="numpy")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
+import scipy
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.rigid_motion import motion_jacobian
@@ -206,7 +206,7 @@ class AssociationTest:
             np.trace(x.covariance_m2[:, :2, :2], axis1=1, axis2=2) + x.drift_m2 for x in (a, b)
         )
         radius = np.sqrt(bound * (variance_a + variance_b.max()))
-        tree = KDTree(b.position_m[:, :2])
+        tree = scipy.spatial.KDTree(b.position_m[:, :2])
         found = tree.query_ball_point(a.position_m[:, :2], radius, return_sorted=True)
         lengths = [len(rows) for rows in found]
         i = np.repeat(np.arange(len(a)), lengths)

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
+from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
-from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.joint_smoothing import smooth_jointly
 from mapfusion.smoother.smooth import condensed_points
 
@@ -44,10 +43,14 @@ class Batch:
             return replace(joint, fallback=f"the log of {name}'s smoothed map is not known")
         if len({each.parameters.stray_m for each in logs}) > 1:
             return replace(joint, fallback="the logs have different values of stray_m")
-        points = [
-            _fused_points(component.maps[k], joint.parents[:, k], each.landmark)
-            for k, each in zip(members, logs, strict=True)
-        ]
+        points = []  # fused point of each observation of each log, shape (N_k,)
+        for k, each in zip(members, logs, strict=True):
+            parents, source = joint.parents[:, k], component.maps[k].source_observation
+            rows = np.flatnonzero(parents != ABSENT)
+            point = dict(zip(source[parents[rows]].tolist(), rows.tolist(), strict=True))
+            names, inverse = np.unique(each.landmark, return_inverse=True)
+            own = np.array([point.get(name, _NO_POINT) for name in names.tolist()], np.int64)
+            points.append(own[inverse])
         start = joint.T_first_map[members]
         try:
             smoothed = smooth_jointly(logs, points, start, self.max_memory_gb)
@@ -71,18 +74,3 @@ class Batch:
             motion_covariance=motion_covariance,
             paths=smoothed.paths,
         )
-
-
-def _fused_points(landmarks: LandmarkMap, parents: np.ndarray, landmark: np.ndarray) -> np.ndarray:
-    """Return the fused point of each observation of a log, shape (N,); negative for none.
-
-    Args:
-        landmarks: map of the log.
-        parents: row of this map in each fused point, shape (C,); ABSENT for none.
-        landmark: `source_observation` of each observation's landmark, shape (N,); negative for
-            none.
-    """
-    has = np.flatnonzero(parents != ABSENT)
-    point = {int(landmarks.source_observation[parents[row]]): int(row) for row in has}
-    names, inverse = np.unique(landmark, return_inverse=True)
-    return np.array([point.get(int(name), _NO_POINT) for name in names], dtype=np.int64)[inverse]

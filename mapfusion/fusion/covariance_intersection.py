@@ -7,7 +7,7 @@ the covariance.
 
 import numpy as np
 
-from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
+from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.kalman import fuse_sequentially
 from mapfusion.geometry.numerics import Float
 

@@ -1,15 +1,214 @@
-"""Fusers by name: built-in fusers and plug-ins.
+"""Interface of fusers: aligned maps, parameters and the fused map; fusers by name.
 
 A package provides a fuser by an entry point of the group `mapfusion.fusers`: its name and a class
 that implements `Fuser` and has a constructor without arguments.
 """
 
 import importlib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from importlib.metadata import entry_points
-from typing import Protocol
+from itertools import zip_longest
+from typing import Annotated, Any, Protocol
 
+import numpy as np
+
+from mapfusion.align.alignment import Alignment
+from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.errors import did_you_mean, moved_module_note
-from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
+from mapfusion.fusion.aligned_landmarks import ABSENT, AssociationTest
+from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters
+from mapfusion.geometry.numerics import Float
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.parameters import Probability, Range, require_in_range
+from mapfusion.smoother.joint_smoothing import AssociatedLog
+
+
+@dataclass(frozen=True)
+class AlignedPair:
+    """Alignment of two of the maps that are merged.
+
+    Attributes:
+        a: index of the reference map.
+        b: index of the other map.
+        alignment: refined alignment T_a_b; not used if it was rejected.
+        correspondences: correspondences that the alignment was computed from.
+        log10_false_alarms: logarithm of the expected number of false alarms. Of contradictory
+            alignments without other confirmation the one with the lowest number is used.
+    """
+
+    a: int
+    b: int
+    alignment: Alignment
+    correspondences: Correspondences
+    log10_false_alarms: float = 0.0
+
+    @property
+    def inliers(self) -> Correspondences:
+        """Correspondences that are inliers of the alignment."""
+        return self.correspondences[self.alignment.inlier]
+
+
+@dataclass(frozen=True)
+class FusedMap:
+    """N landmarks fused from some of M maps, in the frame of the first of these.
+
+    Attributes:
+        landmarks: the fused map.
+        parents: row of each landmark in each map, shape (N, M); ABSENT for none.
+        T_first_map: pose of each map in the fused frame, shape (M, 3); NaN for maps left out.
+        motion_covariance: covariances of these poses, shape (M, 3, 3); zero for the first, NaN for
+            maps left out.
+        drift_sigma_m: s_drift of each map that was added, shape (M,); NaN for maps left out.
+        duplicate_share: share of the landmarks that pass the gate and descriptor test with another
+            landmark.
+        left_out: name of each map that was not fused, with the reason.
+        fallback: reason for the use of a simpler fuser than the requested one; empty if none.
+        paths: path of each member in the fused frame, shape (T_k, 3); empty if the fuser does not
+            estimate paths.
+    """
+
+    landmarks: LandmarkMap
+    parents: np.ndarray
+    T_first_map: Float
+    motion_covariance: Float
+    drift_sigma_m: Float
+    duplicate_share: float
+    left_out: tuple[tuple[str, str], ...]
+    fallback: str = ""
+    paths: tuple[Float, ...] = ()
+
+    @property
+    def members(self) -> np.ndarray:
+        """Indices of the fused maps; the first map defines the frame."""
+        return np.flatnonzero(np.isfinite(self.T_first_map[:, 0]))
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """Result of a merge.
+
+    Attributes:
+        fused: a fused map for each set of connected maps, largest set first. Unconnected maps are
+            not included; if no maps are connected, only the first map is.
+        edge_status: status of the alignment of each pair.
+    """
+
+    fused: tuple[FusedMap, ...]
+    edge_status: tuple[EdgeStatus, ...]
+
+
+_DIGITS = re.compile("([0-9]+)")
+
+
+def name_order(name: str) -> tuple[list[Any], str]:
+    """Return a natural sorting key: R2 is before R10."""
+    parts = _DIGITS.split(name)  # alternating words and numbers
+    numbers = [(len(digits), digits) for digits in (part.lstrip("0") for part in parts[1::2])]
+    return [
+        key for both in zip_longest(parts[::2], numbers) for key in both if key is not None
+    ], name
+
+
+@dataclass(frozen=True)
+class MergeParameters:
+    """Parameters of a merge.
+
+    Attributes:
+        team: selection of consistent alignments between more than two maps.
+        max_descriptor_distance: largest descriptor distance of landmarks that are associated
+            without an alignment; not used if both have labels.
+        gate_probability: probability that landmarks of the same point pass the gate (chi-square, 2
+            degrees of freedom, drift included; joint fusion: fitted Student-t distribution).
+        height: test of the heights; not used for planar maps and joint covariances.
+        use_alignment_uncertainty: add J S_T J^T, the first-order covariance of the map's pose, to
+            the landmarks that the Kalman fusers transform. The paper does not add it. The error is
+            common to all landmarks of a map, so separate covariances overstate it; and the result
+            depends on the order of the maps.
+    """
+
+    team: TeamParameters = field(default_factory=TeamParameters)
+    max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.3
+    gate_probability: Probability = 0.99
+    height: HeightGate = field(default_factory=HeightGate)
+    use_alignment_uncertainty: bool = False
+
+    def __post_init__(self) -> None:
+        require_in_range(self)
+
+    def association_test(self, planar: bool) -> AssociationTest:
+        """Return the test for landmarks that are no inliers of an alignment."""
+        return AssociationTest(
+            self.max_descriptor_distance, self.gate_probability, self.height, planar
+        )
+
+
+@dataclass(frozen=True)
+class Component:
+    """Connected component: K of M maps with their poses in a common frame.
+
+    Attributes:
+        maps: all M maps.
+        members: indices of the maps that are fused, shape (K,); the first defines the frame.
+        pairs: alignments between members that are used.
+        T_first_map: pose of each member in the fused frame, shape (M, 3); NaN for the others.
+        motion_covariance: covariances of these poses, shape (M, 3, 3).
+        left_out: name of each other map, with the reason.
+        recordings: log that each map was smoothed from; empty or None if unknown.
+    """
+
+    maps: tuple[LandmarkMap, ...]
+    members: np.ndarray
+    pairs: tuple[AlignedPair, ...]
+    T_first_map: Float
+    motion_covariance: Float
+    left_out: tuple[tuple[str, str], ...]
+    recordings: tuple[AssociatedLog | None, ...] = ()
+
+    @property
+    def by_name(self) -> list[int]:
+        """Members in the order of their names, which does not depend on the frame."""
+        return sorted(self.members.tolist(), key=lambda k: name_order(self.maps[k].name))
+
+    @property
+    def planar(self) -> bool:
+        """True if heights carry no information."""
+        return any(self.maps[k].planar for k in self.members)
+
+    @property
+    def drift_sigma_m(self) -> Float:
+        """Standard deviation s_drift of each map, shape (M,); NaN for maps left out.
+
+        Half of an alignment's s_drift^2 is attributed to each of its maps. A map has the mean over
+        its alignments.
+        """
+        drift = np.full(len(self.maps), np.nan)
+        for k in self.members:
+            own = [p.alignment.drift_sigma_m for p in self.pairs if k in (p.a, p.b)]
+            drift[k] = np.sqrt(np.mean(np.square(own)) / 2) if own else 0.0
+        return drift
+
+    def on(self, maps: Sequence[LandmarkMap]) -> "Component":
+        """Return the component with other maps of the same observations.
+
+        Inliers without a landmark in both new maps are removed.
+        """
+        row_of = []  # row in the new map of each landmark of the old map
+        for old, new in zip(self.maps, maps, strict=True):
+            rows = {int(source): row for row, source in enumerate(new.source_observation)}
+            sources = old.source_observation
+            row_of.append(np.array([rows.get(int(s), ABSENT) for s in sources], dtype=np.int64))
+        pairs = []
+        for pair in self.pairs:
+            known = pair.inliers
+            index_a = row_of[pair.a][known.index_a]
+            index_b = row_of[pair.b][known.index_b]
+            kept = (index_a != ABSENT) & (index_b != ABSENT)
+            inliers = Correspondences(index_a[kept], index_b[kept], known.distance[kept])
+            alignment = replace(pair.alignment, inlier=np.ones(len(inliers), dtype=bool))
+            pairs.append(replace(pair, alignment=alignment, correspondences=inliers))
+        return replace(self, maps=tuple(maps), pairs=tuple(pairs))
 
 
 class Fuser(Protocol):

@@ -10,9 +10,7 @@ from functools import cached_property
 from itertools import chain, combinations
 
 import numpy as np
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import KDTree
+import scipy
 
 from mapfusion.align.alignment import MIN_PAIRS
 from mapfusion.fusion.aligned_landmarks import (
@@ -21,7 +19,7 @@ from mapfusion.fusion.aligned_landmarks import (
     CandidatePairs,
     cluster_landmarks,
 )
-from mapfusion.fusion.fused_map import Component, FusedMap, MergeParameters
+from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint_estimate import (
     JointEstimate,
     JointMap,
@@ -201,7 +199,9 @@ class JointFuser:
 def _is_connected(points: np.ndarray) -> bool:
     """Return True if pairs of maps with enough common points (C, K) connect all maps."""
     has = (points != ABSENT).astype(np.int64)
-    n_components, _ = connected_components(csr_matrix(has.T @ has >= MIN_PAIRS), directed=False)
+    n_components, _ = scipy.sparse.csgraph.connected_components(
+        scipy.sparse.csr_matrix(has.T @ has >= MIN_PAIRS), directed=False
+    )
     return n_components == 1
 
 
@@ -300,7 +300,7 @@ def _neighbours(a: _PlacedMap, b: _PlacedMap, bound: float) -> tuple[np.ndarray,
     for each in np.unique(octave):
         rows = np.flatnonzero(octave == each)
         radius_m = np.sqrt(bound * (bound_a + 2.0**each))
-        tree = KDTree(b.position_m[rows])
+        tree = scipy.spatial.KDTree(b.position_m[rows])
         found = tree.query_ball_point(a.position_m, radius_m, return_sorted=True)
         rows_a.append(np.repeat(np.arange(len(bound_a)), [len(own) for own in found]))
         rows_b.append(rows[np.fromiter(chain.from_iterable(found), np.int64)])

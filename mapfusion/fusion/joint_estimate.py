@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from mapfusion.align.rigid_motion import motion_jacobian
 from mapfusion.fusion.aligned_landmarks import ABSENT

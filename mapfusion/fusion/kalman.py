@@ -14,7 +14,7 @@ from mapfusion.fusion.aligned_landmarks import (
     FusePairs,
     one_to_one,
 )
-from mapfusion.fusion.fused_map import AlignedPair, Component, FusedMap, MergeParameters
+from mapfusion.fusion.fusers import AlignedPair, Component, FusedMap, MergeParameters
 from mapfusion.geometry.numerics import Float
 
 

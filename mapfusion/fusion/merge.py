@@ -7,8 +7,15 @@ import numpy as np
 
 from mapfusion.align.alignment import Status
 from mapfusion.align.drift import whole_map_covariance
-from mapfusion.fusion.fused_map import AlignedPair, Component, Fusion, MergeParameters, name_order
-from mapfusion.fusion.fusers import Fuser, make_fuser
+from mapfusion.fusion.fusers import (
+    AlignedPair,
+    Component,
+    Fuser,
+    Fusion,
+    MergeParameters,
+    make_fuser,
+    name_order,
+)
 from mapfusion.fusion.pose_graph import AlignmentEdges
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters, team_graph
 from mapfusion.landmark_map import LandmarkMap

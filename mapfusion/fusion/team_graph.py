@@ -100,19 +100,6 @@ class _Paths:
         return _Paths(self.steps[rows], self.last[rows], self.visited[rows], self.motions[rows])
 
 
-@dataclass(frozen=True)
-class _Loops:
-    """Closed loops of equal length.
-
-    Attributes:
-        steps: rows of the edges in their order, shape (n, L).
-        distance: squared Mahalanobis distances, shape (n,).
-    """
-
-    steps: np.ndarray
-    distance: Float
-
-
 class LoopSearch:
     """Search for closed loops of edges, in both directions of each edge."""
 
@@ -140,7 +127,7 @@ class LoopSearch:
         for seed in np.flatnonzero(allowed):
             placement = optimize_poses(self.edges, np.array([seed]))
             for loops in self._closed_loops(placement, allowed):
-                for loop, distance in zip(loops.steps, loops.distance, strict=True):
+                for loop, distance in zip(*loops, strict=True):
                     distance_of.setdefault(tuple(np.union1d(seed, loop).tolist()), distance)
         found: list[ConsistentSet] = []
         for loop in sorted(distance_of, key=lambda loop: (len(loop), distance_of[loop])):
@@ -165,13 +152,21 @@ class LoopSearch:
             if loops is None:
                 return ConsistentSet(rows, placement)
             # the loop whose first step is part of most loops, and of these the best closed
-            n_confirming = np.bincount(loops.steps[:, 0])[loops.steps[:, 0]]
-            best = np.lexsort([loops.distance, -n_confirming])[0]
-            rows = np.union1d(rows, loops.steps[best])
+            steps, distance = loops
+            n_confirming = np.bincount(steps[:, 0])[steps[:, 0]]
+            best = np.lexsort([distance, -n_confirming])[0]
+            rows = np.union1d(rows, steps[best])
             rows = np.union1d(rows, self.consistent_rows(optimize_poses(self.edges, rows), allowed))
 
-    def _closed_loops(self, placement: Placement, allowed: np.ndarray) -> Iterator[_Loops]:
-        """Yield significant closed loops by length, until there are too many paths."""
+    def _closed_loops(
+        self, placement: Placement, allowed: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, Float]]:
+        """Yield significant closed loops by length, until there are too many paths.
+
+        Yields:
+            Rows of the edges of n loops in their order, shape (n, L), and the squared Mahalanobis
+            distances of the loops from the identity, shape (n,).
+        """
         n = len(self.edges)
         usable = np.concatenate([allowed, allowed])
         leaves = placement.contains(self._from) & ~placement.contains(self._to)
@@ -181,7 +176,14 @@ class LoopSearch:
         visited[np.arange(len(steps)), self._to[steps]] = True
         paths = _Paths(steps[:, None], self._to[steps], visited, self._motions[steps])
         while 0 < len(paths.last) <= _MAX_PATHS:
-            paths = self._extend(paths, usable)
+            # extend each path by every edge to a robot that it has not visited
+            possible = (paths.last[:, None] == self._from) & usable & ~paths.visited[:, self._to]
+            path, step = np.nonzero(possible)
+            visited = paths.visited[path]
+            visited[np.arange(len(path)), self._to[step]] = True
+            steps = np.column_stack([paths.steps[path], step])
+            motions = paths.motions[path].compose_independent(self._motions[step])
+            paths = _Paths(steps, self._to[step], visited, motions)
             returned = placement.contains(paths.last)
             closed, paths = paths[returned], paths[~returned]
             first = closed.steps[:, 0]
@@ -192,17 +194,7 @@ class LoopSearch:
             by_chance = n_tests * self.test.chance(S, self._max_distance_m)
             true = (distance <= self.test.gate) & (by_chance <= self.test.false_alarms)
             if true.any():
-                yield _Loops(closed.steps[true] % n, distance[true])
-
-    def _extend(self, paths: _Paths, usable: np.ndarray) -> _Paths:
-        """Extend each path by every edge to a robot that it has not visited."""
-        possible = (paths.last[:, None] == self._from) & usable & ~paths.visited[:, self._to]
-        path, step = np.nonzero(possible)
-        visited = paths.visited[path]
-        visited[np.arange(len(path)), self._to[step]] = True
-        steps = np.column_stack([paths.steps[path], step])
-        motions = paths.motions[path].compose_independent(self._motions[step])
-        return _Paths(steps, self._to[step], visited, motions)
+                yield closed.steps[true] % n, distance[true]
 
 
 def resolve_alternatives(

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-import scipy.linalg
+import scipy
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import require_finite, require_shape
@@ -27,8 +27,6 @@ _DEPENDENT = 1e-6
 # Largest number of rows for which computing Y Y' costs no more than its products with columns by
 # way of Y' in all iterations.
 _FEW = 2 * _ITERATIONS * (RANK + _OVERSAMPLING)
-
-(_cholesky,) = scipy.linalg.get_lapack_funcs(("potrf",), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -227,7 +225,7 @@ def _orthonormal(columns: Float) -> Float:
     length = np.linalg.norm(columns, axis=0)
     basis = columns / np.where(length > 0, length, 1.0)
     for _ in range(2):
-        factor, failed = _cholesky(basis.T @ basis, lower=1)
+        factor, failed = scipy.linalg.lapack.dpotrf(basis.T @ basis, lower=1)
         if failed or not np.diagonal(factor).min() > _DEPENDENT:
             return np.linalg.qr(columns)[0]
         basis = scipy.linalg.solve_triangular(factor, basis.T, lower=True, check_finite=False).T

@@ -10,26 +10,75 @@ and its rounding depends on the processor.
 
 import math
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any, cast
 
 import numpy as np
-from numba import njit, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 Float = NDArray[np.float64]
 
 
+class Compiled:
+    """Function that Numba compiles at its first call, or at that of a kernel which calls it.
+
+    The import of Numba takes longer than a command that needs no kernel.
+
+    Attributes:
+        py_func: the Python function.
+    """
+
+    def __init__(self, function: Callable[..., Any], compiler: Callable[..., Any]) -> None:
+        self.py_func, self._compiler = function, compiler
+
+    @cached_property
+    def compiled(self) -> Any:
+        """Numba's function for calls from Python, kept on disk."""
+        _let_kernels_call_each_other()
+        return self._compiler(self.py_func, cache=True)
+
+    @cached_property
+    def inner(self) -> Any:
+        """Numba's function for calls from kernels, which are kept on disk together with it.
+
+        It does not convert arguments of Python, which saves a third of its compilation.
+        """
+        return self._compiler(self.py_func, no_cpython_wrapper=True)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the function from Python."""
+        return self.compiled(*arguments)
+
+
+@cache
+def _let_kernels_call_each_other() -> None:
+    """Give a `Compiled` object the Numba type of its `inner` function."""
+    from numba.core.registry import cpu_target
+    from numba.extending import typeof_impl
+
+    context = cast(Any, cpu_target).typing_context
+
+    def typeof(function: Compiled, _: Any) -> Any:
+        inner = function.inner
+        context.refresh()  # a processor instruction is known from here on
+        return context.resolve_value_type(inner)
+
+    typeof_impl.register(Compiled)(typeof)
+
+
 def kernel(function: Any = None, **options: Any) -> Any:
-    """Compile a function with Numba, once for each version of its source, and keep it on disk.
+    """Compile a function with Numba, once for each version of its source.
 
     Nothing calls kernels from C, so they have no wrapper for that.
     """
-    if function is None:
-        return partial(kernel, **options)
-    return cast(Any, njit)(function, cache=True, no_cfunc_wrapper=True, **options)
+
+    def compiler(python: Any, **further: Any) -> Any:
+        from numba import njit
+
+        return cast(Any, njit)(python, no_cfunc_wrapper=True, **options, **further)
+
+    return partial(kernel, **options) if function is None else Compiled(function, compiler)
 
 
 def source_of(compiled: Callable[..., Any]) -> Callable[..., Any]:
@@ -140,9 +189,19 @@ def times_vectors(A: Float, x: Float) -> Float:
 
 def times_blocks(A: Float, B: Float) -> Float:
     """Return the products (N, 3, 3) of blocks (N, 3, 3)."""
-    made = A[:, :, 0, None] * B[:, 0, None] + A[:, :, 1, None] * B[:, 1, None]
-    made += A[:, :, 2, None] * B[:, 2, None]
+    made = np.empty(A.shape)
+    _fill_products(A, B, made)
     return made
+
+
+@kernel
+def _fill_products(A: Float, B: Float, made: Float) -> None:
+    """Fill the products (N, 3, 3) of blocks (N, 3, 3)."""
+    for i in range(len(made)):
+        for r in range(3):
+            x, y, z = A[i, r, 0], A[i, r, 1], A[i, r, 2]
+            for q in range(3):
+                made[i, r, q] = x * B[i, 0, q] + y * B[i, 1, q] + z * B[i, 2, q]
 
 
 def sums_by(group: np.ndarray, values: Float, n: int) -> Float:
@@ -206,14 +265,22 @@ WORD = 64
 # to 56).
 _GATHER = np.uint64(0x0102040810204080)
 
-# Processor instructions without a Numba function, for use inside kernels only. The type hides the
-# first argument, which Numba passes.
-_instruction = cast(Callable[..., Callable[[Any], int]], intrinsic)
+
+def _instruction(generator: Callable[[Any, Any], Any]) -> Compiled:
+    """Make a processor instruction without a Numba function, for use inside kernels only."""
+
+    def compiler(python: Any, **_: Any) -> Any:
+        from numba.extending import intrinsic
+
+        return intrinsic(python)
+
+    return Compiled(generator, compiler)
 
 
 @_instruction
 def trailing_zeros(typing_context: Any, word: Any) -> Any:
     """Return the number of the lowest bit set in a word that is not 0."""
+    from numba import types
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         del signature
@@ -226,6 +293,7 @@ def trailing_zeros(typing_context: Any, word: Any) -> Any:
 @_instruction
 def popcount(typing_context: Any, word: Any) -> Any:
     """Return the number of bits set in a word."""
+    from numba import types
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         del context, signature

@@ -15,9 +15,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, reverse_cuthill_mckee
+import scipy
 
 from mapfusion.geometry.numerics import Float
 
@@ -42,7 +40,7 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
     groups = np.concatenate([group, n_groups + chain, n_groups + chain])
     members = np.concatenate([member, chain, chain + 1])
     shape = (n_members, n_groups + len(chain))
-    has = csr_matrix((np.ones(len(groups)), (members, groups)), shape=shape)
+    has = scipy.sparse.csr_matrix((np.ones(len(groups)), (members, groups)), shape=shape)
     related = (has @ has.T).tocsr()
     related.data[:] = 1.0
     starts, column = related.indptr[:-1], related.indices.astype(np.int64)
@@ -52,8 +50,11 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
         return int(np.sum((place - np.minimum.reduceat(place[column], starts)) ** 2))
 
     begins = np.unique(np.linspace(0, n_members - 1, _SEARCHES).round().astype(np.int64))
-    found = [breadth_first_order(related, each, return_predecessors=False)[::-1] for each in begins]
-    found.append(reverse_cuthill_mckee(related, symmetric_mode=True))
+    found = [
+        scipy.sparse.csgraph.breadth_first_order(related, each, return_predecessors=False)[::-1]
+        for each in begins
+    ]
+    found.append(scipy.sparse.csgraph.reverse_cuthill_mckee(related, symmetric_mode=True))
     swept = min(map(_places, found), key=cost)
     orders = [by_number, swept]
     for _ in range(_SWEEPS):
@@ -88,8 +89,6 @@ def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> n
 
 # Size of a block: large enough for fast matrix products, small enough to follow the envelope.
 _BLOCK = 48
-# LAPACK functions without SciPy's checks, because blocks are many and small.
-_cholesky, _inverted = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -303,11 +302,12 @@ def factor_in_envelope(entries: Float, envelope: Envelope) -> Factor:
                 product = before @ others[:, done - first_too : columns.start - first_too].T
                 left -= product
             if i == j:
-                left[:], failed = _cholesky(left, lower=1)
+                # LAPACK without SciPy's checks: blocks are many and small
+                left[:], failed = scipy.linalg.lapack.dpotrf(left, lower=1)
                 if failed:
                     raise np.linalg.LinAlgError("the matrix is not positive definite")
                 # products with the inverse are faster than triangular solutions
-                inverses.append(_inverted(left, lower=1)[0])
+                inverses.append(scipy.linalg.lapack.dtrtri(left, lower=1)[0])
             else:
                 left[:] = left @ inverses[j].T
     return Factor(envelope, entries, tuple(inverses))

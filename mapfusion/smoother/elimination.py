@@ -14,8 +14,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
-from scipy.sparse import csr_array
+import scipy
 
 from mapfusion.geometry.joint_covariance import RANK, KnownErrors, SharedErrors
 from mapfusion.geometry.numerics import Float, kernel
@@ -151,7 +150,7 @@ class PathErrors:
         return total + np.swapaxes(total, 1, 2)
 
     @cached_property
-    def _landmark_pose(self) -> csr_array:
+    def _landmark_pose(self) -> "scipy.sparse.csr_array":
         """A C' with one block for each observation, shape (3L, R)."""
         place, each = self.obs.unknown_place, np.arange(3)
         known = place >= 0
@@ -159,16 +158,16 @@ class PathErrors:
         columns = 3 * place[known, None] + each
         rows, columns = np.broadcast_arrays(rows[:, None, :], columns[:, :, None])
         shape = 3 * self.obs.n_landmarks, len(self)
-        return csr_array(
+        return scipy.sparse.csr_array(
             (self.pose_landmark[known].ravel(), (rows.ravel(), columns.ravel())), shape
         )
 
     @cached_property
-    def _landmark_pose_single(self) -> csr_array:
+    def _landmark_pose_single(self) -> "scipy.sparse.csr_array":
         """A C' in single precision."""
         known = self._landmark_pose
         entries = known.data.astype(np.float32), known.indices, known.indptr
-        return csr_array(entries, known.shape)
+        return scipy.sparse.csr_array(entries, known.shape)
 
 
 @kernel

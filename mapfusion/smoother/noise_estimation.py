@@ -39,8 +39,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
-from scipy.optimize import root_scalar
+import scipy
 
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float, kernel
@@ -392,7 +391,9 @@ class PosteriorShares(NamedTuple):
 
         if excess(likely) == 0 or likely == 1:
             return likely
-        found = root_scalar(excess, bracket=(likely, 1.0), method="brentq", rtol=_SCALE_TOLERANCE)
+        found = scipy.optimize.root_scalar(
+            excess, bracket=(likely, 1.0), method="brentq", rtol=_SCALE_TOLERANCE
+        )
         return float(found.root)
 
 

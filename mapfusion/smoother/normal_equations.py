@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.geometry.numerics import Float, sums_by, times_vectors
+from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import between, rotation, wrap
 from mapfusion.smoother.problem import OrderedObservations
 
@@ -173,18 +173,10 @@ def normal_equations(
         np.empty((len(obs), 3, 3)),
         _no_observations(at, weights, offset_prior, shares),
     )
-    share, frame = shares.observation, obs.frame
-    W, e, point = _in_map_frame(obs, at, weights.observation)
-    _put_points(obs, W, e, share, made.points)
-    # (a, b) is the lever arm, the last column of de/dx
-    a, b = point[:, 1] - at.path[frame, 1], at.path[frame, 0] - point[:, 0]
-    coupling = made.coupling
-    coupling[:, :2] = -share * W[:, :2]
-    coupling[:, 2] = share * (a[:, None] * W[:, 0] + b[:, None] * W[:, 1])
-    made.pose_gradient[:] = sums_by(frame, times_vectors(coupling, e) / share, n_poses)
-    made.pose_block[:, :, :2] = -sums_by(frame, coupling[:, :, :2], n_poses)
-    turned = coupling[:, :, 0] * a[:, None] + coupling[:, :, 1] * b[:, None]
-    made.pose_block[:, :, 2] = sums_by(frame, turned, n_poses)
+    poses = made.pose_block, made.pose_gradient, made.coupling
+    _add_observations(
+        _observed_points(obs, at), weights.observation, shares.observation, made.points, *poses
+    )
     # odometry
     d = disturbances(at.path, odometry)
     before, after = disturbance_jacobians(at.path)
@@ -201,8 +193,8 @@ def point_equations(
 ) -> PointEquations:
     """Return the equations of the points for a fixed path; arguments as in `normal_equations`."""
     made = _no_observations(at, weights, offset_prior, FULL_INFORMATION)
-    W, e, _ = _in_map_frame(obs, at, weights.observation)
-    _put_points(obs, W, e, 1.0, made)
+    nothing = np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
+    _add_observations(_observed_points(obs, at), weights.observation, 1.0, made, *nothing)
     return made
 
 
@@ -214,39 +206,94 @@ def _no_observations(
     return PointEquations(*nothing, shares.offset * of_offset, of_offset[:, None] * at.offset_m)
 
 
-def _in_map_frame(
-    obs: OrderedObservations, at: Estimate, weight: Float
-) -> tuple[Float, Float, Float]:
-    """Transform the observations into the map frame.
+class _ObservedPoints(NamedTuple):
+    """Arrays of observations and of what they observe, for kernels.
 
-    Returns:
-        weighted information R W R' (N, 3, 3), residuals (N, 3) and observed points (N, 3).
+    Attributes:
+        frame: frame of each observation, shape (N,).
+        track: track of each observation, shape (N,).
+        position_m: observed positions in the robot frame, shape (N, 3).
+        information: inverses of their covariances, shape (N, 3, 3).
+        path: path, shape (T, 3).
+        turn: cosine and sine of each heading, shape (T, 2).
+        point_m: point of each track, shape (B, 3).
     """
-    point = (at.point_m[obs.landmark_of_track] + at.offset_m)[obs.track]
-    pose, z, (c, s) = at.path[obs.frame], obs.position_m, heading_cos_sin(at.path)[obs.frame].T
-    e = np.empty(point.shape)
-    e[:, 0] = point[:, 0] - pose[:, 0] - (c * z[:, 0] - s * z[:, 1])
-    e[:, 1] = point[:, 1] - pose[:, 1] - (s * z[:, 0] + c * z[:, 1])
-    e[:, 2] = point[:, 2] - z[:, 2]
-    own, W = obs.information, np.empty(obs.information.shape)
-    along, across, mixed = own[:, 0, 0], own[:, 1, 1], own[:, 0, 1]
-    W[:, 0, 0] = weight * (c * c * along - 2 * c * s * mixed + s * s * across)
-    W[:, 1, 1] = weight * (s * s * along + 2 * c * s * mixed + c * c * across)
-    W[:, 0, 1] = weight * (c * s * (along - across) + (c * c - s * s) * mixed)
-    W[:, 0, 2] = weight * (c * own[:, 0, 2] - s * own[:, 1, 2])
-    W[:, 1, 2] = weight * (s * own[:, 0, 2] + c * own[:, 1, 2])
-    W[:, 2, 2] = weight * own[:, 2, 2]
-    W[:, 1, 0], W[:, 2, 0], W[:, 2, 1] = W[:, 0, 1], W[:, 0, 2], W[:, 1, 2]
-    return W, e, point
+
+    frame: np.ndarray
+    track: np.ndarray
+    position_m: Float
+    information: Float
+    path: Float
+    turn: Float
+    point_m: Float
 
 
-def _put_points(
-    obs: OrderedObservations, W: Float, e: Float, share: float, made: PointEquations
+def _observed_points(obs: OrderedObservations, at: Estimate) -> _ObservedPoints:
+    point_m = at.point_m[obs.landmark_of_track] + at.offset_m
+    stated = obs.frame, obs.track, obs.position_m, obs.information
+    return _ObservedPoints(*stated, at.path, heading_cos_sin(at.path), point_m)
+
+
+@kernel
+def _add_observations(
+    seen: _ObservedPoints,
+    weight: Float,
+    share: float,
+    points: PointEquations,
+    pose_block: Float,
+    pose_gradient: Float,
+    coupling: Float,
 ) -> None:
-    """Write the sums of `share` W and of W e over each track."""
-    n = len(obs.has_offset)
-    made.track_gradient[:] = sums_by(obs.track, times_vectors(W, e), n)
-    made.track_block[:] = sums_by(obs.track, share * W, n)
+    """Add the observations to the equations of points and poses.
+
+    Args:
+        seen: the observations.
+        weight: weight of each observation, shape (N,).
+        share: share of the information in the matrix.
+        points: equations of the points.
+        pose_block: shape (T, 3, 3).
+        pose_gradient: shape (T, 3).
+        coupling: shape (N, 3, 3); empty to leave out the poses.
+    """
+    block, gradient = points.track_block, points.track_gradient
+    for i in range(len(weight)):
+        k, t, w, own = seen.frame[i], seen.track[i], weight[i], seen.information[i]
+        c, s = seen.turn[k, 0], seen.turn[k, 1]
+        u, v = seen.position_m[i, 0], seen.position_m[i, 1]
+        # residual, and weighted information in the map frame
+        x, y = seen.point_m[t, 0] - seen.path[k, 0], seen.point_m[t, 1] - seen.path[k, 1]
+        ex, ey = x - (c * u - s * v), y - (s * u + c * v)
+        ez = seen.point_m[t, 2] - seen.position_m[i, 2]
+        along, across, mixed = own[0, 0], own[1, 1], own[0, 1]
+        xx = w * (c * c * along - 2 * c * s * mixed + s * s * across)
+        yy = w * (s * s * along + 2 * c * s * mixed + c * c * across)
+        xy = w * (c * s * (along - across) + (c * c - s * s) * mixed)
+        xz = w * (c * own[0, 2] - s * own[1, 2])
+        yz = w * (s * own[0, 2] + c * own[1, 2])
+        zz = w * own[2, 2]
+        rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+        gx = xx * ex + xy * ey + xz * ez
+        gy = xy * ex + yy * ey + yz * ez
+        gradient[t, 0] += gx
+        gradient[t, 1] += gy
+        gradient[t, 2] += xz * ex + yz * ey + zz * ez
+        for r in range(3):
+            for q in range(3):
+                block[t, r, q] += share * rows[r][q]
+        if len(coupling) == 0:
+            continue
+        # (y, -x) is the lever arm, the last column of de/dx
+        pose_gradient[k, 0] -= gx
+        pose_gradient[k, 1] -= gy
+        pose_gradient[k, 2] += y * gx - x * gy
+        for q in range(3):
+            coupling[i, 0, q] = -share * rows[0][q]
+            coupling[i, 1, q] = -share * rows[1][q]
+            coupling[i, 2, q] = share * (y * rows[0][q] - x * rows[1][q])
+        for r in range(3):
+            pose_block[k, r, 0] -= coupling[i, r, 0]
+            pose_block[k, r, 1] -= coupling[i, r, 1]
+            pose_block[k, r, 2] += y * coupling[i, r, 0] - x * coupling[i, r, 1]
 
 
 def initial_landmarks(obs: OrderedObservations, path: Float) -> Float:
@@ -262,17 +309,26 @@ def squared_distances(obs: OrderedObservations, at: Estimate) -> Float:
 
     They are r' W r with the residuals r = R'(l + b - p) - z in the robot frame.
     """
-    point = (at.point_m[obs.landmark_of_track] + at.offset_m)[obs.track]
-    pose, W, (c, s) = at.path[obs.frame], obs.information, heading_cos_sin(at.path)[obs.frame].T
-    along, across = point[:, 0] - pose[:, 0], point[:, 1] - pose[:, 1]
-    r0 = c * along + s * across - obs.position_m[:, 0]
-    r1 = c * across - s * along - obs.position_m[:, 1]
-    r2 = point[:, 2] - obs.position_m[:, 2]
-    return (
-        r0 * (W[:, 0, 0] * r0 + 2 * W[:, 0, 1] * r1)
-        + r1 * (W[:, 1, 1] * r1 + 2 * W[:, 1, 2] * r2)
-        + r2 * (W[:, 2, 2] * r2 + 2 * W[:, 0, 2] * r0)
-    )
+    square = np.empty(len(obs))
+    _fill_squared_distances(_observed_points(obs, at), square)
+    return square
+
+
+@kernel
+def _fill_squared_distances(seen: _ObservedPoints, square: Float) -> None:
+    """Fill the squared Mahalanobis distances (N,) of `squared_distances`."""
+    for i in range(len(square)):
+        k, t, W = seen.frame[i], seen.track[i], seen.information[i]
+        c, s = seen.turn[k, 0], seen.turn[k, 1]
+        x, y = seen.point_m[t, 0] - seen.path[k, 0], seen.point_m[t, 1] - seen.path[k, 1]
+        r0 = c * x + s * y - seen.position_m[i, 0]
+        r1 = c * y - s * x - seen.position_m[i, 1]
+        r2 = seen.point_m[t, 2] - seen.position_m[i, 2]
+        square[i] = (
+            r0 * (W[0, 0] * r0 + 2 * W[0, 1] * r1)
+            + r1 * (W[1, 1] * r1 + 2 * W[1, 2] * r2)
+            + r2 * (W[2, 2] * r2 + 2 * W[0, 2] * r0)
+        )
 
 
 def expected_point_squares(obs: OrderedObservations, path: Float, covariance_m2: Float) -> Float:
@@ -286,20 +342,33 @@ def expected_point_squares(obs: OrderedObservations, path: Float, covariance_m2:
         path: path, shape (T, 3).
         covariance_m2: covariances C of the tracks' points, shape (B, 3, 3).
     """
-    C, W, (c, s) = covariance_m2[obs.track], obs.information, heading_cos_sin(path)[obs.frame].T
-    xx, xy, xz = C[:, 0, 0], C[:, 0, 1], C[:, 0, 2]
-    yy, yz, zz = C[:, 1, 1], C[:, 1, 2], C[:, 2, 2]
-    along = c * c * xx + 2 * c * s * xy + s * s * yy
-    across = s * s * xx - 2 * c * s * xy + c * c * yy
-    mixed = c * s * (yy - xx) + (c * c - s * s) * xy
-    return (
-        W[:, 0, 0] * along
-        + W[:, 1, 1] * across
-        + W[:, 2, 2] * zz
-        + 2 * W[:, 0, 1] * mixed
-        + 2 * W[:, 0, 2] * (c * xz + s * yz)
-        + 2 * W[:, 1, 2] * (c * yz - s * xz)
-    )
+    increase = np.empty(len(obs))
+    stated = obs.frame, obs.track, obs.information
+    _fill_expected_squares(*stated, heading_cos_sin(path), covariance_m2, increase)
+    return increase
+
+
+@kernel
+def _fill_expected_squares(
+    frame: np.ndarray,
+    track: np.ndarray,
+    information: Float,
+    turn: Float,
+    covariance_m2: Float,
+    increase: Float,
+) -> None:
+    """Fill the traces (N,) of `expected_point_squares`; `turn` is of `heading_cos_sin`."""
+    for i in range(len(increase)):
+        W, C, c, s = information[i], covariance_m2[track[i]], turn[frame[i], 0], turn[frame[i], 1]
+        xx, xy, xz, yy, yz = C[0, 0], C[0, 1], C[0, 2], C[1, 1], C[1, 2]
+        increase[i] = (
+            W[0, 0] * (c * c * xx + 2 * c * s * xy + s * s * yy)
+            + W[1, 1] * (s * s * xx - 2 * c * s * xy + c * c * yy)
+            + W[2, 2] * C[2, 2]
+            + 2 * W[0, 1] * (c * s * (yy - xx) + (c * c - s * s) * xy)
+            + 2 * W[0, 2] * (c * xz + s * yz)
+            + 2 * W[1, 2] * (c * yz - s * xz)
+        )
 
 
 def offset_squares(obs: OrderedObservations, at: Estimate, offset_prior: float) -> Float:

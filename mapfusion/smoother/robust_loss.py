@@ -15,8 +15,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import root_scalar
-from scipy.special import fdtri, gammaln, psi
+import scipy
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.smoother.normal_equations import (
@@ -67,7 +66,9 @@ def student_cost(squares: Float, dof: float, n_dimensions: Float | int) -> float
 def student_deviance(squares: Float, dof: float, n_dimensions: Float | int) -> float:
     """Return twice the negative log likelihood up to a constant."""
     n = np.broadcast_to(np.asarray(n_dimensions, dtype=np.float64), len(squares))
-    normal = gammaln((dof + n) / 2) - gammaln(dof / 2) - n / 2 * np.log(dof)
+    normal = (
+        scipy.special.gammaln((dof + n) / 2) - scipy.special.gammaln(dof / 2) - n / 2 * np.log(dof)
+    )
     return student_cost(squares, dof, n) - 2 * float(np.sum(normal))
 
 
@@ -76,7 +77,7 @@ def student_bound(probability: float, dof: float, n_dimensions: int) -> float:
 
     The square over the number of dimensions has an F distribution with (n, dof).
     """
-    return n_dimensions * float(fdtri(n_dimensions, dof, probability))
+    return n_dimensions * float(scipy.special.fdtri(n_dimensions, dof, probability))
 
 
 def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> float:
@@ -91,7 +92,7 @@ def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> floa
     of_tails = dof * sum_of_logs
     np.reciprocal(beside, out=beside)
     of_weights = np.sum((dof + dims) * (1 - beside))
-    of_normal = dof * (psi((dof + dims) / 2) - psi(dof / 2)) - dims
+    of_normal = dof * (scipy.special.psi((dof + dims) / 2) - scipy.special.psi(dof / 2)) - dims
     share = 1 if of_normal.ndim else n  # equal terms if all dimensions are equal
     return float(of_tails - of_weights - share * np.sum(of_normal))
 
@@ -118,7 +119,7 @@ def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -
         return MOST_DOF
     if slope(low) >= 0:
         return LEAST_DOF
-    found = root_scalar(slope, bracket=(low, high), method="brentq", xtol=_FOUND_TO)
+    found = scipy.optimize.root_scalar(slope, bracket=(low, high), method="brentq", xtol=_FOUND_TO)
     return float(np.exp(found.root))
 
 

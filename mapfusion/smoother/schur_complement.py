@@ -232,10 +232,22 @@ def coupling_times_poses(obs: OrderedObservations, coupling: Float, path_step: F
         coupling: blocks of pose and landmark, shape (N, 3, 3).
         path_step: step of each pose, shape (T, 3).
     """
-    moved, turned = path_step[obs.frame, :2, None], path_step[obs.frame, 2, None]
-    parts = coupling[:, 0] * moved[:, 0] + coupling[:, 1] * moved[:, 1], coupling[:, 2] * turned
-    both = np.stack(parts, axis=1).reshape(-1, 3)
-    return sums_by(np.repeat(obs.track, 2), both, len(obs.has_offset))
+    total = np.zeros((len(obs.has_offset), 3))
+    _add_coupling_times_poses(obs.track, obs.frame, coupling, path_step, total)
+    return total
+
+
+@kernel
+def _add_coupling_times_poses(
+    track: np.ndarray, frame: np.ndarray, coupling: Float, path_step: Float, total: Float
+) -> None:
+    """Add coupling' path_step of each observation to the total of its track."""
+    for i in range(len(track)):
+        x, y, turn = path_step[frame[i], 0], path_step[frame[i], 1], path_step[frame[i], 2]
+        for q in range(3):
+            total[track[i], q] += (
+                coupling[i, 0, q] * x + coupling[i, 1, q] * y + coupling[i, 2, q] * turn
+            )
 
 
 def coupling_times_points(

@@ -417,9 +417,9 @@ class Acceptance:
         if not 1 <= len(self.gates_m) <= _MAX_GATES:
             raise ValueError(f"gates_m: expected 1 to {_MAX_GATES} distances")
 
-    def judge(self, pairs: Pairs, alignment: Alignment) -> Verdict:
+    def verify(self, pairs: Pairs, alignment: Alignment) -> Verdict:
         """Test an alignment of these correspondences against chance."""
-        return self.on(pairs).judge(alignment)
+        return self.on(pairs).verify(alignment)
 
     def on(self, pairs: Pairs) -> "ChanceTest":
         """Prepare the test of any number of alignments of these correspondences."""
@@ -456,7 +456,7 @@ class ChanceTest:
     gates_m: Float
     pairs: IndependentPairs | tuple[Float, Float]
 
-    def judge(self, alignment: Alignment) -> Verdict:
+    def verify(self, alignment: Alignment) -> Verdict:
         """Test one alignment of the correspondences against chance."""
         if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
             return Verdict(alignment.status, math.nan, alignment.reason)

@@ -19,7 +19,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import betaln, logsumexp
+import scipy
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.verification import fitted_rates, fitted_twins
@@ -81,7 +81,8 @@ def log_likelihood(k: np.ndarray, n: np.ndarray, rates: Rates) -> Float:
     (..., 2): landmarks that must be seen, and that may be seen.
     """
     by_class = [
-        betaln(k[..., c] + rate.seen, n[..., c] - k[..., c] + rate.missed) - betaln(*rate)
+        scipy.special.betaln(k[..., c] + rate.seen, n[..., c] - k[..., c] + rate.missed)
+        - scipy.special.betaln(*rate)
         for c, rate in enumerate(rates)
     ]
     return np.sum(by_class, axis=0)
@@ -127,7 +128,9 @@ def log10_without_discovery(log10_ratios: Float) -> float:
     """
     if not len(log10_ratios):
         return 0.0
-    one = logsumexp(log10_ratios * np.log(10.0)) / np.log(10.0) - np.log10(len(log10_ratios))
+    one = scipy.special.logsumexp(log10_ratios * np.log(10.0)) / np.log(10.0) - np.log10(
+        len(log10_ratios)
+    )
     return float(np.sum(log10_ratios) - one)
 
 

@@ -299,7 +299,7 @@ class ViewedMap:
             near, position[:, 2].copy(), z_m2, np.ascontiguousarray(descriptor)
         )
         # results that depend on this map alone, by query: several pairs share a map
-        self.kept: dict[tuple, Any] = {}
+        self.cache: dict[tuple, Any] = {}
 
     @cached_property
     def n_near(self) -> np.ndarray:
@@ -339,9 +339,9 @@ class ViewedMapPair:
     def beside_itself(cls, own: ViewedMap, parameters: EvidenceParameters) -> "ViewedMapPair":
         """Return the pair of a map with itself, kept with the map for later queries."""
         key = cls, parameters
-        if key not in own.kept:
-            own.kept[key] = cls(own, own, parameters)
-        return own.kept[key]
+        if key not in own.cache:
+            own.cache[key] = cls(own, own, parameters)
+        return own.cache[key]
 
     @cached_property
     def _of(self) -> dict[str, "ViewedMapPair"]:

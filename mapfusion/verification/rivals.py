@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.align.alignment import MIN_PAIRS, Pairs
+from mapfusion.align.alignment import MIN_PAIRS, Pairs, Undetermined
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_descriptors
-from mapfusion.align.method import Undetermined
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import Float, kernel
@@ -181,7 +180,7 @@ def distinct_motions(
         refined = refinement.refine(pairs, fit.T_a_b)
         T = refined.T_a_b if np.isfinite(refined.T_a_b).all() else fit.T_a_b
         if not any(rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M for each in found):
-            log10 = chance.judge(refined).log10_false_alarms
+            log10 = chance.verify(refined).log10_false_alarms
             found.append(SupportedMotion(T, log10, _within(T, p_a, p_b, widest_m)))
         rows = rows[~(fit.inlier | _within(fit.T_a_b, p_a[rows], p_b[rows], widest_m))]
     return found
@@ -201,7 +200,7 @@ def self_motions(
         log10 = each.log10_false_alarms
         if again.any():
             refined = refinement.refine(once, each.T_a_b)
-            log10 = acceptance.judge(once, refined).log10_false_alarms
+            log10 = acceptance.verify(once, refined).log10_false_alarms
         found.append(each._replace(log10_false_alarms=log10))
     return pairs, found
 

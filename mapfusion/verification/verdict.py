@@ -163,9 +163,9 @@ def find_evidence(
     supporters = [pairs.p_a[motion.inlier] for _, motion in motions]
     for side, own in zip("ab", (viewed_maps.a, viewed_maps.b), strict=True):
         key = self_motions, acceptance, refinement
-        if key not in own.kept:
-            own.kept[key] = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
-        similar, onto_itself = own.kept[key]
+        if key not in own.cache:
+            own.cache[key] = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
+        similar, onto_itself = own.cache[key]
         for motion in onto_itself:
             motions.append((side, motion))
             supporters.append(similar.p_a[motion.inlier])
@@ -218,7 +218,7 @@ def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
 
 
 @dataclass(frozen=True)
-class Judge:
+class Verifier:
     """Verification of an alignment before use, the same for every estimator.
 
     The first test is against chance (`Acceptance`). The second test compares the regions that both
@@ -242,7 +242,7 @@ class Judge:
         pairs: Pairs,
         known: PairEvidence | None = None,
         viewed_maps: tuple[ViewedMap, ViewedMap] | None = None,
-    ) -> "PairJudge":
+    ) -> "PairVerifier":
         """Prepare the verification of any number of alignments of two maps.
 
         Args:
@@ -250,27 +250,27 @@ class Judge:
             known: evidence found earlier; by default it is found at first use.
             viewed_maps: both maps prepared for queries; by default they are prepared at first use.
         """
-        return PairJudge(self, pairs, known, viewed_maps)
+        return PairVerifier(self, pairs, known, viewed_maps)
 
 
-class PairJudge:
-    """`Judge` prepared for two maps."""
+class PairVerifier:
+    """`Verifier` prepared for two maps."""
 
     def __init__(
         self,
-        judge: Judge,
+        settings: Verifier,
         pairs: Pairs,
         known: PairEvidence | None,
         viewed_maps: tuple[ViewedMap, ViewedMap] | None,
     ) -> None:
-        self._judge, self._pairs, self._known, self._ready = judge, pairs, known, viewed_maps
-        self._chance = judge.acceptance.on(pairs)
-        self._bound = math.log10(judge.acceptance.false_alarms)
+        self._settings, self._pairs, self._known, self._ready = settings, pairs, known, viewed_maps
+        self._chance = settings.acceptance.on(pairs)
+        self._bound = math.log10(settings.acceptance.false_alarms)
 
     @cached_property
     def _viewed_maps(self) -> ViewedMapPair:
         a, b = self._ready or (ViewedMap(self._pairs.map_a), ViewedMap(self._pairs.map_b))
-        return ViewedMapPair(a, b, self._judge.evidence)
+        return ViewedMapPair(a, b, self._settings.evidence)
 
     @cached_property
     def evidence(self) -> PairEvidence | None:
@@ -279,13 +279,13 @@ class PairJudge:
             return None
         if self._known is not None:
             return self._known
-        judge = self._judge
-        settings = (judge.acceptance, judge.refinement, judge.evidence)
-        return find_evidence(self._pairs, self._viewed_maps, *settings)
+        own = self._settings
+        parts = (own.acceptance, own.refinement, own.evidence)
+        return find_evidence(self._pairs, self._viewed_maps, *parts)
 
-    def judge(self, alignment: Alignment) -> Verdict:
+    def verify(self, alignment: Alignment) -> Verdict:
         """Return the verdict on one alignment of the correspondences."""
-        by_chance = self._chance.judge(alignment)
+        by_chance = self._chance.verify(alignment)
         if not by_chance.accepted:
             return by_chance
         status, reason, told = Status.ACCEPTED, "", {}
@@ -298,7 +298,7 @@ class PairJudge:
             p = probability_correct(features)
             told |= {"n_contradicted": regions.n_contradicted, "probability": p}
             # a contradiction counts even together with the region that led to the alignment
-            settings = self._judge.evidence
+            settings = self._settings.evidence
             counts = f"{regions.n_confirmed} of {len(regions)} regions that both must have seen"
             counts = f"{counts} are in both maps"
             if regions.log10_ratio(evidence.shares) < -math.log10(settings.most_against):
@@ -325,14 +325,14 @@ class PairJudge:
         if self.evidence is None:
             return []
         others = self._others(alignment.T_a_b, self.evidence)
-        refined = (self._judge.refinement.refine(self._pairs, each.T_a_b) for each in others)
+        refined = (self._settings.refinement.refine(self._pairs, each.T_a_b) for each in others)
         return [replace(each, status=Status.AMBIGUOUS) for each in refined if each.ok]
 
     def features(self, alignment: Alignment) -> EvidenceFeatures | None:
         """Return the features of an alignment; None if the maps carry no evidence."""
         if self.evidence is None:
             return None
-        by_chance = self._chance.judge(alignment).log10_false_alarms
+        by_chance = self._chance.verify(alignment).log10_false_alarms
         regions = self.regions(alignment, self.evidence)
         return self._features(alignment, regions, self.evidence, by_chance)
 
@@ -367,7 +367,7 @@ class PairJudge:
 
         The text contains the placeholder `{told}` for the counts of regions.
         """
-        settings, extent_m = self._judge.evidence, self._extent_m(alignment)
+        settings, extent_m = self._settings.evidence, self._extent_m(alignment)
         ratio = regions.log10_evidence(evidence.shares)
         # Other motions beyond chance. Their regions count as well, since two copies of a texture
         # share the correspondences. Under a wrong motion the likelihood ratio of the regions
@@ -416,11 +416,11 @@ class PairJudge:
         """Return True if most of the smaller map agrees and lies within the size of a room."""
         smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
         most = np.count_nonzero(alignment.inlier) > smaller / 2
-        return bool(most) and extent_m < self._judge.evidence.place_m
+        return bool(most) and extent_m < self._settings.evidence.place_m
 
     def _why_unsure(self, alignment: Alignment) -> str:
         """Return why the covariance of an alignment is too large; empty if it is not."""
-        settings, p_a = self._judge.evidence, self._pairs.p_a[alignment.inlier, :2]
+        settings, p_a = self._settings.evidence, self._pairs.p_a[alignment.inlier, :2]
         # Labelled landmarks are few and far apart, so that their drift is independent.
         drift_m = 0.0 if self._pairs.by_name else alignment.drift_sigma_m
         stated = whole_map_covariance(alignment.T_a_b, alignment.covariance, drift_m, p_a)

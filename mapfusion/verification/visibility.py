@@ -196,16 +196,16 @@ class ObservedLandmarks(NamedTuple):
 
 
 @kernel
-def classify_visibility(seen: ObservedLandmarks, watch: ViewingHistory) -> np.ndarray:
+def classify_visibility(seen: ObservedLandmarks, history: ViewingHistory) -> np.ndarray:
     """Return UNSEEN, MAY or MUST for each landmark, shape (N,).
 
     A class needs at least LEAST_FRAMES frames with the landmark in view.
     """
     p, direction, distance_m = seen
     # unpacked once: each access through the tuple would count references
-    blocks, poses, parts, reach_m, bearing_rad, range_m, height_m = watch
+    blocks, poses, parts, reach_m, bearing_rad, range_m, height_m = history
     x, y, radius, cos, sin, least_cos, block_reach_m = blocks
-    how = np.zeros(len(p), np.int64)
+    how, n_sectors = np.zeros(len(p), np.int64), reach_m.shape[1]
     eights = np.zeros((len(x) + WORD - 1) // WORD * 8, np.uint64)
     possible = eights.view(np.uint8)[: len(x)]
     lanes = np.zeros(1, np.uint64)
@@ -229,7 +229,17 @@ def classify_visibility(seen: ObservedLandmarks, watch: ViewingHistory) -> np.nd
                 while unsure:
                     k = trailing_zeros(unsure) >> 3
                     unsure &= unsure - np.uint64(1)
-                    flags[k] *= _is_in_view(sight, c, k, poses, bearing_rad, reach_m)
+                    # the exact bearing decides
+                    dx, dy = p[i, 0] - poses.x_m[c, k], p[i, 1] - poses.y_m[c, k]
+                    own_cos, own_sin = poses.cos[c, k], poses.sin[c, k]
+                    bearing = math.atan2(own_cos * dy - own_sin * dx, own_cos * dx + own_sin * dy)
+                    low, high = bearing_rad[0], bearing_rad[1]
+                    in_view = low <= bearing <= high
+                    if in_view:
+                        sector = int((bearing - low) / (high - low) * n_sectors)
+                        farthest = reach_m[c * FRAMES_PER_BLOCK + k, min(sector, n_sectors - 1)]
+                        in_view = math.sqrt(dx * dx + dy * dy) <= farthest + BEHIND_M
+                    flags[k] *= in_view
                 may += popcount((lanes[0] >> np.uint64(_MAY_BIT)) & _ONES)
                 must += popcount((lanes[0] >> np.uint64(_ALIKE_BIT)) & _ONES)
             if must >= LEAST_FRAMES:
@@ -324,26 +334,3 @@ def _flag_poses(
             & (along * along >= _MUST_COS2 * square)
         )
         flags[k] = may * ((1 << _MAY_BIT) + (alike << _ALIKE_BIT) + (unsure << _UNSURE_BIT))
-
-
-@kernel
-def _is_in_view(
-    sight: tuple[float, float, float, float, float],
-    c: int,
-    k: int,
-    poses: Poses,
-    bearings: Float,
-    reach_m: np.ndarray,
-) -> bool:
-    """Return True if a landmark is in view of pose k of block c and not occluded.
-
-    The bearing is computed exactly. `bearings` (2,) limits the field of view; `reach_m` is (T, B).
-    """
-    dx, dy = sight[0] - poses.x_m[c, k], sight[1] - poses.y_m[c, k]
-    cos, sin = poses.cos[c, k], poses.sin[c, k]
-    bearing = math.atan2(cos * dy - sin * dx, cos * dx + sin * dy)
-    low, high, parts = bearings[0], bearings[1], reach_m.shape[1]
-    if not low <= bearing <= high:
-        return False
-    part = min(int((bearing - low) / (high - low) * parts), parts - 1)
-    return math.sqrt(dx * dx + dy * dy) <= reach_m[c * FRAMES_PER_BLOCK + k, part] + BEHIND_M

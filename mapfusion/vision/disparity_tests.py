@@ -14,8 +14,6 @@ below the middle row; it is vectorised over all pixels. The second step sums the
 of x.
 """
 
-from functools import cache
-
 import numpy as np
 
 from mapfusion.geometry.numerics import Float, cholesky, kernel, solve_lower
@@ -58,16 +56,6 @@ def moment(product: int, p: int = 0, s: int = ALL, q: int = 0, t: int = ALL) -> 
     """
     s, t = (ALL if power and side == _SQUARED else side for power, side in ((p, s), (q, t)))
     return product + q, t, s * _POWERS + p
-
-
-@cache
-def column_weights(half: int) -> Float:
-    """Return the weights of a window's columns, shape (S, 2 half + 1), S as in `Moment`."""
-    x = np.arange(-half, half + 1)
-    powers = np.vander(x.astype(np.float64), _POWERS, increasing=True).T
-    weights = (SIDES[:, None, np.sign(x) + 1] * powers).reshape(-1, len(x))
-    weights.setflags(write=False)
-    return weights
 
 
 # Disparities x^p sgn(x)^s y^q sgn(y)^t as (p, s, q, t): the plane, then further terms: steps at the
@@ -202,6 +190,7 @@ _PART = np.uintp(N_PRODUCTS) * WIDE
 _INSIDE = FIELDS  # further field of a window's pixels: 1 inside both images, else 0
 
 
+@kernel
 def window_statistics(
     left: np.ndarray,
     right: np.ndarray,
@@ -227,32 +216,20 @@ def window_statistics(
         of the plane test, and the mean squared slopes along u and along v.
     """
     squares, scores = np.empty((len(pixel), 4, 4)), np.empty((len(pixel), 3))
-    weight = column_weights(max(silhouette_half, plane_half))
-    _fill_statistics(
-        left, right, pixel, plane, silhouette_half, plane_half, weight, squares, scores
-    )
-    return squares, scores
-
-
-@kernel
-def _fill_statistics(
-    left: np.ndarray,
-    right: np.ndarray,
-    pixel: np.ndarray,
-    plane: Float,
-    silhouette_half: int,
-    plane_half: int,
-    weight: Float,
-    squares: Float,
-    scores: Float,
-) -> None:
-    """Fill in the halves and the scores of all windows; `weight` is from `column_weights`."""
     half = max(silhouette_half, plane_half)
     area = (2 * half + 1) ** 2
     window, share = np.empty((FIELDS + 1, area)), np.empty(area)
     levels, down = np.empty((LEVEL_FIELDS, area), np.uint32), np.empty(3 * N_PRODUCTS * WIDE)
     column, sums = np.empty(2 * half + 1), np.empty(len(_SUMS))
     normal, moments = np.empty((COLUMNS, COLUMNS)), np.empty(COLUMNS)
+    # Weights of the columns, by the index in `Moment`.
+    weight = np.empty((len(SIDES) * _POWERS, 2 * half + 1))
+    for x in range(-half, half + 1):
+        for k in range(len(SIDES)):
+            power = SIDES[k, 1 + (x > 0) - (x < 0)]
+            for p in range(_POWERS):
+                weight[k * _POWERS + p, x + half] = power
+                power *= x
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
         fill_left(left, u, v, half, window)
@@ -340,3 +317,4 @@ def _fill_statistics(
             if own == silhouette_half:
                 fill_in_halves(sums, _OF_HALVES, squares, n)
                 break
+    return squares, scores

@@ -66,7 +66,7 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
     if min(image.shape) <= 2 * parameters.border_px:
         return np.zeros((0, 2))
     smooth = cv2.GaussianBlur(image, (0, 0), parameters.smoothing_px)
-    response = harris_response(smooth, parameters)
+    response = cv2.cornerHarris(smooth, parameters.block_px, _SOBEL_APERTURE_PX, parameters.k)
     pixels = strongest_maxima(response, parameters)
     if len(pixels) == 0:
         return np.zeros((0, 2))
@@ -84,11 +84,6 @@ def detect(image: np.ndarray, parameters: HarrisParameters) -> Float:
             curvature < 0, (before - after) / np.where(curvature < 0, 2 * curvature, 1), 0
         )
     return pixels + offset
-
-
-def harris_response(image: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
-    """Compute the Harris response (H, W) float32 of an image (H, W)."""
-    return cv2.cornerHarris(image, parameters.block_px, _SOBEL_APERTURE_PX, parameters.k)
 
 
 def strongest_maxima(response: np.ndarray, parameters: HarrisParameters) -> np.ndarray:
@@ -122,6 +117,7 @@ def local_maxima(response: np.ndarray, border: int, least: float) -> np.ndarray:
     return np.stack([u, v], -1) + border
 
 
+@kernel
 def spread(
     candidates: np.ndarray,
     size: tuple[int, ...],
@@ -147,33 +143,14 @@ def spread(
     Returns:
         Shape (N,) bool, True for the selected candidates.
     """
-    selected, blocked = np.zeros(len(candidates), dtype=np.bool_), np.zeros(size, dtype=np.uint8)
-    filled = np.zeros((size[0] // cell + 1, size[1] // cell + 1), dtype=np.int64)
-    _select(candidates, min_distance, cell, per_cell, most, blocked, filled, selected)
-    return selected
-
-
-# The callers of kernels allocate the work arrays: allocations inside a kernel take long to compile.
-
-
-@kernel
-def _select(
-    candidates: np.ndarray,
-    min_distance: int,
-    cell: int,
-    per_cell: int,
-    most: int,
-    blocked: np.ndarray,
-    filled: np.ndarray,
-    selected: np.ndarray,
-) -> None:
-    """Mark the `selected` candidates (N,); all arrays after `most` are zero at the start."""
-    count, (height, width) = 0, blocked.shape
+    selected, blocked = np.zeros(len(candidates), np.bool_), np.zeros(size, np.uint8)
+    filled = np.zeros((size[0] // cell + 1, size[1] // cell + 1), np.int64)
+    count, (height, width) = 0, size
     for share in (per_cell, most):
         for n in range(len(candidates)):
             u, v = candidates[n, 0], candidates[n, 1]
             if count == most:
-                return
+                return selected
             if selected[n] or blocked[v, u] or filled[v // cell, u // cell] >= share:
                 continue
             selected[n] = True
@@ -183,3 +160,4 @@ def _select(
                 for x in range(max(u - min_distance + 1, 0), min(u + min_distance, width)):
                     if (x - u) * (x - u) + (y - v) * (y - v) < min_distance * min_distance:
                         blocked[y, x] = 1
+    return selected

@@ -239,11 +239,9 @@ def fit_patches(
         Shape (N,) bool: False where the window leaves the patch, has too little texture, or does
         not agree with the template.
     """
-    given = (templates.window, templates.factor, templates.tolerated, rows, after, warp, bend)
-    found, area = np.zeros(len(rows), dtype=np.bool_), len(WEIGHT)
-    cell, share, residual = np.empty(area, np.uint32), np.empty((2, area)), np.empty(area)
-    _fit_patches(*given, cell, share, residual, np.empty(len(_PIXEL_AT) * WIDE), found)
-    return found
+    return _fit_patches(
+        templates.window, templates.factor, templates.tolerated, rows, after, warp, bend
+    )
 
 
 @kernel
@@ -255,13 +253,11 @@ def _fit_patches(
     after: np.ndarray,
     warp: Float,
     bend: Float,
-    cell: np.ndarray,
-    share: Float,
-    residual: Float,
-    down: Float,
-    found: np.ndarray,
-) -> None:
-    """Fit all warps and mark the good fits in `found`; `cell` to `down` are work arrays."""
+) -> np.ndarray:
+    """Fit all warps and return the mask (N,) of the good fits, see `fit_patches`."""
+    found, area = np.zeros(len(rows), np.bool_), len(WEIGHT)
+    cell, share, residual = np.empty(area, np.uint32), np.empty((2, area)), np.empty(area)
+    down = np.empty(len(_PIXEL_AT) * WIDE)
     side, step = np.uintp(after.shape[2]), np.empty(N_PARAMETERS)
     for n in range(len(rows)):
         i, own, patch = rows[n], warp[n], after[n].ravel()
@@ -332,6 +328,7 @@ def _fit_patches(
                 square = max(total, 0.0)
                 break
         found[n] = 0 <= square <= tolerated[i]
+    return found
 
 
 @kernel(error_model="numpy")  # without checks for division by zero, which slow the loop down

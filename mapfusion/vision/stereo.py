@@ -55,6 +55,7 @@ _CROSS, _SUM, _SQUARE = range(3)
 _VECTOR_LENGTH = 8  # candidates are padded to whole vectors of the processor
 
 
+@kernel
 def search_rows(
     left: np.ndarray,
     right: np.ndarray,
@@ -84,34 +85,11 @@ def search_rows(
         Disparities, shape (N,), valid for MATCHED windows, and `MatchStatus` values, shape (N,)
         int8.
     """
-    width = left.shape[1]
-    disparity, status = np.zeros(len(pixel), dtype=np.int64), np.empty(len(pixel), dtype=np.int8)
-    sums = np.zeros((3, width + _VECTOR_LENGTH), dtype=np.int32)
-    strip = np.zeros(width + _VECTOR_LENGTH, dtype=np.uint8)
-    limits = (min_disparity, max_disparity, half, min_correlation, max_ambiguity, max_round_trip)
-    _search_rows(left, right, pixel, *limits, np.empty(width), strip, sums, disparity, status)
-    return disparity, status
-
-
-@kernel
-def _search_rows(
-    left: np.ndarray,
-    right: np.ndarray,
-    pixel: np.ndarray,
-    min_disparity: int,
-    max_disparity: int,
-    half: int,
-    min_correlation: float,
-    max_ambiguity: float,
-    max_round_trip: int,
-    scores: np.ndarray,
-    strip: np.ndarray,
-    sums: np.ndarray,
-    disparity: np.ndarray,
-    status: np.ndarray,
-) -> None:
-    """Fill in disparities and statuses; `scores`, `strip` and `sums` are work arrays."""
     height, width = left.shape
+    disparity, status = np.zeros(len(pixel), np.int64), np.empty(len(pixel), np.int8)
+    # Work arrays.
+    scores, strip = np.empty(width), np.zeros(width + _VECTOR_LENGTH, np.uint8)
+    sums = np.zeros((3, width + _VECTOR_LENGTH), np.int32)
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
         first, last = max(u - max_disparity, half), u - min_disparity
@@ -119,30 +97,21 @@ def _search_rows(
         if not inside or first > last:
             status[n] = MatchStatus.OUTSIDE
             continue
+        limits = min_correlation, max_ambiguity
         found, status[n] = _search_row(
-            left,
-            right,
-            u,
-            v,
-            first,
-            last,
-            half,
-            min_correlation,
-            max_ambiguity,
-            scores,
-            strip,
-            sums,
+            left, right, u, v, first, last, half, limits, scores, strip, sums
         )
         if status[n] != MatchStatus.MATCHED:
             continue
         back_first, back_last = found + min_disparity, min(found + max_disparity, width - half - 1)
         back, _ = _search_row(
-            right, left, found, v, back_first, back_last, half, -1.0, 1.0, scores, strip, sums
+            right, left, found, v, back_first, back_last, half, (-1.0, 1.0), scores, strip, sums
         )
         if abs(back - u) > max_round_trip:
             status[n] = MatchStatus.ONE_SIDED
             continue
         disparity[n] = u - found
+    return disparity, status
 
 
 @kernel
@@ -154,52 +123,20 @@ def _search_row(
     first: int,
     last: int,
     half: int,
-    min_correlation: float,
-    max_ambiguity: float,
+    limits: tuple[float, float],
     scores: np.ndarray,
     strip: np.ndarray,
     sums: np.ndarray,
 ) -> tuple[int, int]:
     """Return the column first..last of `other` that is most like (u, v) of `image`, and a status.
 
-    The last three arguments are work arrays.
+    Integer arithmetic and an inner loop over the candidates let the compiler vectorise. `limits`
+    are the smallest correlation and the largest ambiguity of a match. The last three arguments are
+    work arrays.
     """
+    min_correlation, max_ambiguity = limits
     if last < first:
         return u, MatchStatus.OUTSIDE
-    if not _correlate(image, other, u, v, first, last, half, scores, strip, sums):
-        return u, MatchStatus.FLAT
-    best = 0
-    for k in range(1, last - first + 1):
-        if scores[k] > scores[best]:
-            best = k
-    if scores[best] < min_correlation:
-        return first + best, MatchStatus.WEAK
-    rival = -1.0
-    for k in range(last - first + 1):
-        if abs(k - best) > _PEAK_HALF_WIDTH_PX and scores[k] > rival:
-            rival = scores[k]
-    if 1 - scores[best] >= max_ambiguity * (1 - rival):
-        return first + best, MatchStatus.AMBIGUOUS
-    return first + best, MatchStatus.MATCHED
-
-
-@kernel
-def _correlate(
-    image: np.ndarray,
-    other: np.ndarray,
-    u: int,
-    v: int,
-    first: int,
-    last: int,
-    half: int,
-    scores: np.ndarray,
-    strip: np.ndarray,
-    sums: np.ndarray,
-) -> bool:
-    """Fill `scores` with the correlation at columns first..last; False when the window is flat.
-
-    Integer arithmetic and an inner loop over the candidates let the compiler vectorise.
-    """
     side = 2 * half + 1
     area, candidates = side * side, last - first + 1
     padded = -(-candidates // _VECTOR_LENGTH) * _VECTOR_LENGTH
@@ -238,7 +175,7 @@ def _correlate(
         total_square += row_square
     spread = area * total_square - total * total
     if spread == 0:
-        return False
+        return u, MatchStatus.FLAT
 
     # Correlation of each candidate by running sums over the columns.
     strip_total, strip_square = np.int64(0), np.int64(0)
@@ -255,7 +192,21 @@ def _correlate(
         )
         strip_total -= sums[_SUM, k]
         strip_square -= sums[_SQUARE, k]
-    return True
+
+    # Best candidate and second peak.
+    best = 0
+    for k in range(1, candidates):
+        if scores[k] > scores[best]:
+            best = k
+    if scores[best] < min_correlation:
+        return first + best, MatchStatus.WEAK
+    rival = -1.0
+    for k in range(candidates):
+        if abs(k - best) > _PEAK_HALF_WIDTH_PX and scores[k] > rival:
+            rival = scores[k]
+    if 1 - scores[best] >= max_ambiguity * (1 - rival):
+        return first + best, MatchStatus.AMBIGUOUS
+    return first + best, MatchStatus.MATCHED
 
 
 _MAX_HALF_PX = 90  # (2 * 90 + 1)^2 squared grey levels still fit a 32-bit sum

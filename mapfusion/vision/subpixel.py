@@ -143,6 +143,7 @@ _AT = tuple(np.uintp(k) * WIDE for k in range(4))  # offsets of the column sums
 _SINGULAR = 1e-9  # largest pivot by rounding errors, as a share of its diagonal entry
 
 
+@kernel
 def fit_planes(
     left: np.ndarray,
     right: np.ndarray,
@@ -174,29 +175,6 @@ def fit_planes(
     Returns:
         Planes d, a, b, shape (N, 3), and the variances of d + a x + b y at the offsets, shape (N,).
         Both are NaN where the fit leaves the image or the texture is too poor.
-    """
-    plane, variance = np.zeros((len(pixel), 3)), np.empty(len(pixel))
-    plane[:, 0] = start
-    noises = (slope_sigma, noise, correlation_px, row_sigma)
-    _fit_planes(left, right, pixel, offset, half, *noises, plane, variance)
-    return plane, variance
-
-
-@kernel
-def _fit_planes(
-    left: np.ndarray,
-    right: np.ndarray,
-    pixel: np.ndarray,
-    offset: np.ndarray,
-    half: int,
-    slope_sigma: float,
-    noise: float,
-    correlation_px: float,
-    row_sigma: float,
-    plane: Float,
-    variance: Float,
-) -> None:
-    """Fit planes (N, 3), which hold the initial disparities, and fill in the variances (N,).
 
     The estimate is w' J^T r with w = (N_0 + prior)^-1 row. N is the normal matrix of the observed
     slopes, N_0 is N without the contribution of noise. The moments J^T r have the covariance
@@ -204,15 +182,14 @@ def _fit_planes(
     the left image cancels between neighbours. So the variance is w' (M + prior) w times the
     variance of the grey levels; the prior accounts for the bias of the slopes.
     """
+    plane, variance = np.zeros((len(pixel), 3)), np.empty(len(pixel))
     area, side = (2 * half + 1) ** 2, 2 * half + 1
-    window, levels, share = (
-        np.empty((FIELDS, area)),
-        np.empty((LEVEL_FIELDS, area), np.uint32),
-        np.empty(area),
-    )
+    window, share = np.empty((FIELDS, area)), np.empty(area)
+    levels = np.empty((LEVEL_FIELDS, area), np.uint32)
     normal, factor, weight = np.zeros((4, 4)), np.empty((4, 4)), np.empty(4)
     for n in range(len(pixel)):
         u, v = pixel[n, 0], pixel[n, 1]
+        plane[n, 0] = start[n]
         fill_left(left, u, v, half, window)
 
         # Lower half of J^T J of the brightness offset, d, a and b. Slopes are multiples of a half,
@@ -286,6 +263,7 @@ def _fit_planes(
                     along = weight[1] + weight[2] * x + weight[3] * (y - v)
                     change += (weight[0] + slope * along) * down
             variance[n] += (row_sigma * change) ** 2
+    return plane, variance
 
 
 @kernel

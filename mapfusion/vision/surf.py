@@ -70,14 +70,9 @@ class USurfParameters:
         return np.clip(metric, self.min_scale_px, self.max_scale_px)
 
 
-def gaussian_weights() -> np.ndarray:
-    """Return the weights of the samples, shape (20, 20); the scaling cancels in normalisation."""
-    offset = np.arange(SAMPLES) - (SAMPLES - 1) / 2
-    falloff = np.exp(-(offset**2) / (2 * GAUSSIAN_SIGMA**2))
-    return np.outer(falloff, falloff)
-
-
-_WEIGHTS = gaussian_weights()
+_OFFSET = np.arange(SAMPLES) - (SAMPLES - 1) / 2
+_FALLOFF = np.exp(-(_OFFSET**2) / (2 * GAUSSIAN_SIGMA**2))
+_WEIGHTS = np.outer(_FALLOFF, _FALLOFF)  # of the samples; the scaling cancels in normalisation
 
 
 def describe(image: np.ndarray, uv_px: Float, scale_px: Float) -> np.ndarray:
@@ -106,20 +101,15 @@ def describe(image: np.ndarray, uv_px: Float, scale_px: Float) -> np.ndarray:
     require_shape("scale_px", scale, (len(uv),))
     if not np.all((scale > 0) & np.isfinite(scale)):
         raise ValueError("scale_px: must be positive and finite")
-    descriptor = np.empty((len(uv), LENGTH), dtype=np.float32)
-    _describe(cv2.integral(image, sdepth=cv2.CV_32S), uv, scale, _WEIGHTS, descriptor)
-    return descriptor
+    return _describe(cv2.integral(image, sdepth=cv2.CV_32S), uv, scale)
 
 
 @kernel
-def _describe(
-    integral: np.ndarray, uv: np.ndarray, scale: np.ndarray, weights: np.ndarray, out: np.ndarray
-) -> None:
-    """Fill `out` (N, 64) with descriptors, by the integral image (H + 1, W + 1)."""
-    node = np.empty((NODES, NODES))
-    column = np.empty(NODES, dtype=np.int64)
-    fraction = np.empty(NODES)
-    sums = np.empty((4, SAMPLES))
+def _describe(integral: np.ndarray, uv: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return the descriptors (N, 64) by the integral image (H + 1, W + 1)."""
+    descriptor = np.empty((len(uv), LENGTH), np.float32)
+    node, sums = np.empty((NODES, NODES)), np.empty((4, SAMPLES))
+    column, fraction = np.empty(NODES, np.int64), np.empty(NODES)
     for n in range(len(uv)):
         # Interpolate the integral image at the wavelets' corners.
         u = uv[n, 0]
@@ -155,8 +145,8 @@ def _describe(
                     right = node[i + 2, j + 2] - node[i, j + 2]
                     bend_left = node[i, j] - 2.0 * node[i + 1, j] + node[i + 2, j]
                     bend_right = node[i, j + 2] - 2.0 * node[i + 1, j + 2] + node[i + 2, j + 2]
-                    dx = weights[i, j] * (left - 2.0 * centre + right)
-                    dy = weights[i, j] * (bend_right - bend_left)
+                    dx = _WEIGHTS[i, j] * (left - 2.0 * centre + right)
+                    dy = _WEIGHTS[i, j] * (bend_right - bend_left)
                     sums[0, j] += dx
                     sums[1, j] += dy
                     sums[2, j] += abs(dx)
@@ -167,10 +157,11 @@ def _describe(
                     total = 0.0
                     for j in range(first, first + SAMPLES_PER_CELL):
                         total += sums[k, j]
-                    out[n, 4 * (CELLS * cell_row + cell_column) + k] = total
+                    descriptor[n, 4 * (CELLS * cell_row + cell_column) + k] = total
                     norm_squared += total * total
         # a wavelet's two halves have an area of 2 s^2 each
         flat = np.sqrt(norm_squared) < FLAT_NORM * 2 * scale[n] ** 2
         factor = 0.0 if flat else 1.0 / np.sqrt(norm_squared)
         for k in range(LENGTH):
-            out[n, k] *= factor
+            descriptor[n, k] *= factor
+    return descriptor

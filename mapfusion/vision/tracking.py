@@ -282,6 +282,11 @@ class Tracker:
         parameters: limits of the links.
         camera: the rectified pair.
         sigma_uv_px: standard deviation of a feature's position in the image.
+
+    Attributes:
+        parameters: limits of the links.
+        points_m: points of the last frame in the robot frame, shape (N, 3), and their covariances,
+            shape (N, 3, 3).
     """
 
     def __init__(
@@ -291,13 +296,8 @@ class Tracker:
         self._camera = camera
         self._sigma_uv_px = sigma_uv_px
         self._previous: tuple[Features, TrackedPoints, Tracks] | None = None
-        self._points_m = np.empty((0, 3)), np.empty((0, 3, 3))
+        self.points_m: tuple[Float, Float] = np.empty((0, 3)), np.empty((0, 3, 3))
         self._next_id = 0
-
-    @property
-    def points_m(self) -> tuple[Float, Float]:
-        """Points of the last frame in the robot frame (N, 3), and their covariances (N, 3, 3)."""
-        return self._points_m
 
     def update(
         self, features: Features, steps: float = 1.0, R_after_before: Float | None = None
@@ -319,7 +319,7 @@ class Tracker:
                 n, self.parameters.noise_grey, self.parameters.max_misfit_px
             )
             points, motion = TrackedPoints.at_corners(features, templates), None
-            self._points_m = self._triangulate(points, features, slice(None))
+            self.points_m = self._triangulate(points, features, slice(None))
         else:
             before, points_before, tracks = self._previous
             expected = before
@@ -332,7 +332,7 @@ class Tracker:
 
             # Remove links that contradict the rigid motion; their features stand for the corners.
             rows = np.flatnonzero(source != _NO_MATCH)
-            p_before, covariance_before = (values[source[rows]] for values in self._points_m)
+            p_before, covariance_before = (values[source[rows]] for values in self.points_m)
             p, covariance = self._triangulate(points, features, slice(None))
             agree, motion = estimate_rigid_motion(
                 p_before,
@@ -345,7 +345,7 @@ class Tracker:
             source[removed] = _NO_MATCH
             if len(removed):
                 p[removed], covariance[removed] = self._triangulate(features, features, removed)
-            self._points_m = p, covariance
+            self.points_m = p, covariance
             linked = source != _NO_MATCH
             track_id[linked] = tracks.track_id[source[linked]]
             length[linked] += tracks.length[source[linked]]
@@ -393,8 +393,7 @@ def link(
         Row in `previous` of each feature of `current`, or -1, shape (N,).
     """
     steps = min(steps, _LONGEST_PAUSE)
-    forward, backward = np.full(len(previous), _NO_MATCH), np.full(len(current), _NO_MATCH)
-    _link_mutually(
+    return _link_mutually(
         previous.uv_px,
         previous.disparity_px,
         previous.descriptor,
@@ -405,12 +404,7 @@ def link(
         steps * parameters.max_shift_v_px,
         parameters.max_disparity_ratio**steps,
         parameters.max_descriptor_distance**2,
-        forward,
-        np.full(len(previous), np.inf),
-        backward,
-        np.full(len(current), np.inf),
     )
-    return backward
 
 
 @kernel
@@ -425,15 +419,13 @@ def _link_mutually(
     max_shift_v: float,
     max_ratio: float,
     max_squared: float,
-    forward: np.ndarray,
-    forward_squared: Float,
-    backward: np.ndarray,
-    backward_squared: Float,
-) -> None:
-    """Fill in the nearest features and squared distances of both frames; keep mutual links."""
-    n = len(uv)
+) -> np.ndarray:
+    """Return the row of the previous feature that each feature is linked to, or -1, shape (N,)."""
+    n, n_previous = len(uv), len(previous_uv)
+    forward, forward_squared = np.full(n_previous, _NO_MATCH), np.full(n_previous, np.inf)
+    backward, backward_squared = np.full(n, _NO_MATCH), np.full(n, np.inf)
     for i in range(n):
-        for j in range(len(previous_uv)):
+        for j in range(n_previous):
             if abs(uv[i, 0] - previous_uv[j, 0]) > max_shift_u:
                 continue
             if abs(uv[i, 1] - previous_uv[j, 1]) > max_shift_v:
@@ -453,3 +445,4 @@ def _link_mutually(
         j = backward[i]
         if j != _NO_MATCH and (forward[j] != i or backward_squared[i] > max_squared):
             backward[i] = _NO_MATCH
+    return backward

@@ -101,11 +101,8 @@ def estimate_rigid_motion(
         return np.ones(n, dtype=bool), None
     gate = chi_square_bound(probability, 3)
     start = initial_subsets(p_before_m)
-    agree, T = start.copy(), np.zeros((len(start), 4, 4))
-    T[:, range(4), range(4)] = 1.0
-    square, normal = np.empty((len(start), n)), np.empty((len(start), _SIZE, _SIZE))
     points = (p_before_m, covariance_before_m2, p_after_m, covariance_after_m2)
-    _fit_motions(start, agree, *points, gate, T, square, normal)
+    agree, T, square, normal = _fit_motions(start, *points, gate)
     best = int(np.argmax(agree.sum(axis=1)))
     own = agree[best]
     n_links = int(own.sum())
@@ -130,35 +127,30 @@ def initial_subsets(p_before_m: Float) -> np.ndarray:
 
 @kernel(error_model="numpy")
 def _fit_motions(
-    start: np.ndarray,
-    agree: np.ndarray,
-    p_before: Float,
-    S_before: Float,
-    p_after: Float,
-    S_after: Float,
-    gate: float,
-    T: Float,
-    square: Float,
-    normal: Float,
-) -> None:
+    start: np.ndarray, p_before: Float, S_before: Float, p_after: Float, S_after: Float, gate: float
+) -> tuple[np.ndarray, Float, Float, Float]:
     """Fit a motion to the links of each start.
 
     Args:
         start: links of each start, shape (B, N) bool.
-        agree: links that agree with the motion, shape (B, N) bool; `start` at first.
         p_before: points, shape (N, 3).
         S_before: covariances, shape (N, 3, 3).
         p_after: points, shape (N, 3).
         S_after: covariances, shape (N, 3, 3).
         gate: largest squared Mahalanobis distance of a link that agrees.
-        T: motions, shape (B, 4, 4), the identity at first.
-        square: squared Mahalanobis distances, shape (B, N); filled in.
-        normal: damped normal matrices, shape (B, 6, 6); filled in.
+
+    Returns:
+        Links that agree with the motion, shape (B, N) bool; motions, shape (B, 4, 4); squared
+        Mahalanobis distances, shape (B, N); and damped normal matrices, shape (B, 6, 6).
     """
-    n = start.shape[1]
+    n_starts, n = start.shape
+    agree, T, square = start.copy(), np.zeros((n_starts, 4, 4)), np.empty((n_starts, n))
+    normal = np.empty((n_starts, _SIZE, _SIZE))
     lever, residual, information = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 6))
     step, factor = np.zeros(_SIZE), np.empty((_SIZE, _SIZE))
-    for b in range(len(start)):
+    for b in range(n_starts):
+        for k in range(4):
+            T[b, k, k] = 1.0
         for i in range(len(_TOLERANCES_M)):
             variance = _TOLERANCES_M[i] ** 2
             for _ in range(_STEPS):
@@ -237,6 +229,7 @@ def _fit_motions(
                     + 2 * (xy * x * y + xz * x * z + yz * y * z)
                 )
                 agree[b, j] = square[b, j] <= gate and (i >= _ALL_AFTER or start[b, j])
+    return agree, T, square, normal
 
 
 @kernel(error_model="numpy")

@@ -1,8 +1,6 @@
-"""A renderer of our own worlds: upright walls of one height, a floor, a ceiling and the robots.
+"""Ray caster for painted worlds, and the frame source of all renderers.
 
-In plan a pixel column of a level camera is a wedge, and what it sees is the nearest wall, all the
-way up (`plan`); above and below it lie ceiling and floor. So walls are drawn column by column and
-levels row by row, each pixel the mean of what its footprint covers (`wall_columns`, `levels`,
-`picture`), and over them the other robots (`robots`). Or each pixel is the texel that its middle
-hits, as PyBullet's TinyRenderer has it.
+A pixel column of a level camera is a wedge in plan and shows the nearest wall over its whole height
+(`walls`), the ceiling above and the floor below (`floor_and_ceiling`), and other robots in front
+(`robots`). `ray_caster` combines them; `frame_source` renders any frame of a simulation.
 """

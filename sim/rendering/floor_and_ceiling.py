@@ -124,6 +124,7 @@ def _fill(
 ) -> None:
     """Draw row by row: the footprints of a row have one depth and lie on a line."""
     height, width = picture.shape
+    (right_0, right_z, right_zu), (up_0, up_z, up_zu) = way
     place, cell = np.empty((3, PIECE), dtype=np.int32), np.empty(PIECE, dtype=np.uint32)
     sums = np.empty(PIECE, dtype=np.uint32)
     for first in range(0, width, PIECE):
@@ -152,7 +153,13 @@ def _fill(
                     u = begin + (0.0 if across == 1 else side / 2 - 0.25)
                     for s in range(n if count else 0):
                         z = rise / (v - 0.5 + (s + 0.5) / n - center_v)
-                        line = _line(way, u, z, size)
+                        # the line of the row's footprints on the pyramid level, from `u` on
+                        line = (
+                            (right_0 + (right_z + right_zu * u) * z) * size[1] + 0.5,
+                            (up_0 + (up_z + up_zu * u) * z) * size[0] + 0.5,
+                            right_zu * z * size[1],
+                            up_zu * z * size[0],
+                        )
                         lowest, leftmost = _lowest_cell(line, count, size)
                         if lowest < 0:
                             _add_at_the_edge(cells, corner, line, size, count, sums)
@@ -188,16 +195,6 @@ def _fill(
                 for i in range(count):
                     shown = np.int32(scale * np.float32(sums[i]) + np.float32(0.5))
                     picture[v, at + np.uintp(i)] = np.uint8(shown)
-
-
-@kernel
-def _line(way: tuple[RayCoefficients, RayCoefficients], u: float, z: float, size: Size) -> Line:
-    """Return the line of a row's footprints on a pyramid level, in cells, from `u` on."""
-    (right_0, right_z, right_zu), (up_0, up_z, up_zu) = way
-    height, width = size
-    x = (right_0 + (right_z + right_zu * u) * z) * width + 0.5
-    y = (up_0 + (up_z + up_zu * u) * z) * height + 0.5
-    return x, y, right_zu * z * width, up_zu * z * height
 
 
 @kernel

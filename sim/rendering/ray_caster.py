@@ -39,7 +39,6 @@ from sim.rendering.robots import (
     is_occluded,
     project_robot,
     read_solids,
-    sorted_by_distance,
     within_view,
 )
 from sim.rendering.scene import REFUSED, HorizontalPlane, Scene, Walls, read_scene
@@ -79,7 +78,7 @@ class VisibleScene(NamedTuple):
 def find_visible(camera: Pinhole, walls: Walls, solids: Solids, poses: Float) -> VisibleScene:
     """Return the visible geometry of a scene with robots at poses (R, 3)."""
     plan, bodies = find_visible_walls(camera, walls), list[ProjectedRobot]()
-    for pose in sorted_by_distance(camera, within_view(camera, solids.reach_m, poses)):
+    for pose in within_view(camera, solids.reach_m, poses):
         if not is_occluded(camera, plan, solids.reach_m, pose):
             bodies.append(project_robot(camera, solids, pose))
     return VisibleScene(camera, plan, [body for body in bodies if len(body.shown)])

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull
+import scipy
 
 from mapfusion.geometry.numerics import Float, kernel
 from sim.rendering.walls import Pinhole, VisibleWalls, inverse_depths
@@ -118,7 +118,7 @@ def _shape(visual: ElementTree.Element, place_m: Float) -> tuple[Float, _Hull]:
         radius, half_m = float(cylinder.attrib["radius"]), float(cylinder.attrib["length"]) / 2
         corners = _cylinder_corners(radius, half_m)
     # edges between two triangles, seen from outside with the first triangle to the left
-    hull = ConvexHull(corners)
+    hull = scipy.spatial.ConvexHull(corners)
     a, b, c = np.moveaxis(corners[hull.simplices], 1, 0)
     normals = hull.equations[:, :3]
     turned = np.sum(np.cross(b - a, c - a) * normals, axis=1) < 0
@@ -305,7 +305,13 @@ class ProjectedRobot(NamedTuple):
 
 def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobot:
     """Project a robot at a pose (3,) into a camera."""
-    eye, axes = camera_in_robot_frame(camera, pose)
+    # optical centre, and axes ahead, left and up, in the robot's frame
+    theta = float(pose[2])
+    cos, sin = math.cos(theta), math.sin(theta)
+    dx, dy = camera.eye_x_m - pose[0], camera.eye_y_m - pose[1]
+    eye = np.array([cos * dx + sin * dy, cos * dy - sin * dx, camera.eye_z_m])
+    cos, sin = math.cos(camera.theta - theta), math.sin(camera.theta - theta)
+    axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     outside = solids.planes[:, :3] @ eye - solids.planes[:, 3]
     x, y, up = (solids.corners_m - eye).T
     ahead, left = axes[0, 0] * x + axes[0, 1] * y, axes[1, 0] * x + axes[1, 1] * y
@@ -346,26 +352,8 @@ def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobo
     )
 
 
-def camera_in_robot_frame(camera: Pinhole, pose: Float) -> tuple[Float, Float]:
-    """Return optical centre (3,) and axes (3, 3: ahead, left, up) in a robot's frame."""
-    theta = float(pose[2])
-    cos, sin = math.cos(theta), math.sin(theta)
-    x, y = camera.eye_x_m - pose[0], camera.eye_y_m - pose[1]
-    eye = np.array([cos * x + sin * y, cos * y - sin * x, camera.eye_z_m])
-    cos, sin = math.cos(camera.theta - theta), math.sin(camera.theta - theta)
-    return eye, np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
-def sorted_by_distance(camera: Pinhole, poses: Float) -> Float:
-    """Return the poses (R, 3) from the nearest to the farthest."""
-    if len(poses) < 2:
-        return poses
-    x, y = poses[:, 0] - camera.eye_x_m, poses[:, 1] - camera.eye_y_m
-    return poses[np.argsort(x * x + y * y, kind="stable")]
-
-
 def within_view(camera: Pinhole, reach_m: float, poses: Float) -> Float:
-    """Return the poses (R, 3) at which robots may be visible in a scene without walls.
+    """Return the poses at which robots may be visible without walls, the nearest first.
 
     Args:
         camera: level camera.
@@ -378,7 +366,9 @@ def within_view(camera: Pinhole, reach_m: float, poses: Float) -> Float:
     # half a pixel to the edge of the last one, and half a pixel margin
     widest = max(camera.center_u, camera.width_px - 1 - camera.center_u) + 1
     beside = aside - ahead * (widest / camera.focal_px)
-    return poses[(ahead > -reach_m) & (beside <= reach_m * math.hypot(1, widest / camera.focal_px))]
+    limit = reach_m * math.hypot(1, widest / camera.focal_px)
+    rows = np.flatnonzero((ahead > -reach_m) & (beside <= limit))
+    return poses[rows[np.argsort((x * x + y * y)[rows], kind="stable")]]
 
 
 def is_occluded(camera: Pinhole, plan: VisibleWalls, reach_m: float, pose: Float) -> bool:

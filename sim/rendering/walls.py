@@ -224,6 +224,9 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
     below = np.empty(height + 1, dtype=np.float32)
     # per pixel: grey level times covered share, and covered share
     total, covered = np.empty(height, dtype=np.float32), np.empty(height, dtype=np.float32)
+    # height of a wall beyond the horizon, and rows of the image beyond it
+    highest_m = max(camera.eye_z_m, height_m - camera.eye_z_m)
+    middle_rows = max(camera.center_v, camera.height_px - 1 - camera.center_v)
     for j in range(camera.width_px):
         first, last = height - 1, 0
         lowest_top, highest_bottom = 0, height - 1
@@ -231,13 +234,30 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
             total[v], covered[v] = 0.0, 0.0
         for s in range(plan.first[j], plan.first[j + 1]):
             i, low, high = face[s], lows[s], highs[s]
-            n = 0 if i == NO_WALL else _cuts(camera, height_m, seen, i, low, high)
+            n = 0  # parts that the strip is cut into
+            if i != NO_WALL:
+                slope = seen[i, 3]
+                w = seen[i, 2] + slope * (low + high) / 2
+                crossed = min(highest_m * camera.focal_px * w, middle_rows)
+                crossed = crossed * abs(slope) / w * (high - low)
+                n = min(int(crossed / STEEPEST_ROWS) + 1, MOST_CUTS)
             for k in range(n):
                 a, b = low + k * (high - low) / n, low + (k + 1) * (high - low) / n
-                top, bottom, step = _rows(camera, height_m, seen, i, a, b, size)
+                # start and end of the strip in v, and the height of a row in texels
+                w_0, w_u = seen[i, 2], seen[i, 3]
+                w = w_0 + w_u * (a + b) / 2
+                top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
+                bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
+                step = size[i, 1] / (height_m * camera.focal_px * w)
                 upper = int(max(np.floor(top + 0.5), 0.0))
                 lower = int(min(np.floor(bottom + 0.5), camera.height_px - 1.0))
-                begin, end = _texels(seen, i, a, b, width_m, size)
+                # start and end of the strip along the face in texels
+                t_0, t_u, n_texels = seen[i, 4], seen[i, 5], float(size[i, 0])
+                per_m = size[i, 0] / width_m[i]
+                begin = ((t_0 + t_u * a) / (w_0 + w_u * a) - seen[i, 6]) * per_m
+                end = ((t_0 + t_u * b) / (w_0 + w_u * b) - seen[i, 6]) * per_m
+                begin = min(max(begin, 0.0), n_texels - LEAST_TEXELS)
+                end = min(max(end, begin + LEAST_TEXELS), n_texels)
                 # rows of texels in the rows of the strip
                 at_center = camera.eye_z_m / height_m * size[i, 1]
                 highest_q = at_center - (upper - 0.5 - camera.center_v) * step
@@ -279,47 +299,6 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
             else:
                 columns[j, v] = np.uint8(np.int32(total[v] + np.float32(0.5)))
             v += 1
-
-
-@kernel
-def _cuts(camera: Pinhole, height_m: float, seen: Float, i: int, low: float, high: float) -> int:
-    """Return the number of parts that a strip of face i is cut into."""
-    slope = seen[i, 3]
-    w = seen[i, 2] + slope * (low + high) / 2
-    highest = max(camera.eye_z_m, height_m - camera.eye_z_m) * camera.focal_px * w
-    from_middle = min(highest, max(camera.center_v, camera.height_px - 1 - camera.center_v))
-    crossed = from_middle * abs(slope) / w * (high - low)
-    return min(int(crossed / STEEPEST_ROWS) + 1, MOST_CUTS)
-
-
-@kernel
-def _rows(
-    camera: Pinhole,
-    height_m: float,
-    seen: Float,
-    i: int,
-    low: float,
-    high: float,
-    size: np.ndarray,
-) -> tuple[float, float, float]:
-    """Return start and end of a strip of face i in v, and the height of a row in texels."""
-    w = seen[i, 2] + seen[i, 3] * (low + high) / 2
-    top = camera.center_v - (height_m - camera.eye_z_m) * camera.focal_px * w
-    bottom = camera.center_v + camera.eye_z_m * camera.focal_px * w
-    return top, bottom, size[i, 1] / (height_m * camera.focal_px * w)
-
-
-@kernel
-def _texels(
-    seen: Float, i: int, low: float, high: float, width_m: Float, size: np.ndarray
-) -> tuple[float, float]:
-    """Return start and end of a strip along face i in texels; its width is positive."""
-    w_0, w_u, t_0, t_u = seen[i, 2], seen[i, 3], seen[i, 4], seen[i, 5]
-    begin = (t_0 + t_u * low) / (w_0 + w_u * low) - seen[i, 6]
-    end = (t_0 + t_u * high) / (w_0 + w_u * high) - seen[i, 6]
-    n, per_m = float(size[i, 0]), size[i, 0] / width_m[i]
-    begin = min(max(begin * per_m, 0.0), n - LEAST_TEXELS)
-    return begin, min(max(end * per_m, begin + LEAST_TEXELS), n)
 
 
 @kernel

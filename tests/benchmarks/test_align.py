@@ -16,8 +16,8 @@ from mapfusion.align.ransac import Ransac
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import as_aligner
 from mapfusion.verification.false_alarms import Acceptance
+from mapfusion.verification.registration import as_aligner
 
 SIZE_M = np.array([20.0, 20.0, 2.5])
 NOISE_M = 0.05
@@ -97,7 +97,7 @@ def test_refinement_200_pairs(benchmark):
 def test_acceptance(benchmark, n_pairs):
     maps = maps_with_pairs(n_pairs, n_pairs, 0.3)
     refined = Refinement().refine(Pairs(*maps), T_A_B)
-    assert benchmark(lambda: Acceptance().judge(Pairs(*maps), refined)).accepted
+    assert benchmark(lambda: Acceptance().verify(Pairs(*maps), refined)).accepted
 
 
 @pytest.mark.parametrize("planar", [False, True])

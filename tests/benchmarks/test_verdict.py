@@ -11,8 +11,8 @@ import pytest
 
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import match
-from mapfusion.align.oracle import Oracle
-from mapfusion.verification.verdict import Judge
+from mapfusion.align.refinement import Oracle
+from mapfusion.verification.verdict import Verifier
 from tests.mapfusion.verification.two_rooms import Wall, mapped
 
 PER_M = 40  # landmarks along a wall, as in rooms
@@ -30,15 +30,15 @@ def pairs_of(n: int) -> Pairs:
 @pytest.mark.parametrize("n", [1600, 5000])
 def test_verdict(benchmark, n):
     pairs = pairs_of(n)
-    judge = Judge().on(pairs)
+    judge = Verifier().on(pairs)
     alignment = Oracle().align(pairs, np.ones(len(pairs), bool))
-    judge.judge(alignment)  # seeks what is found once for two maps
+    judge.verify(alignment)  # seeks what is found once for two maps
     steps = itertools.count(1)
 
     def verdict():
         """Of a motion that was not asked about before: what must be seen under one is kept."""
         T_a_b = alignment.T_a_b + next(steps) * 1e-12
-        return judge.judge(replace(alignment, T_a_b=T_a_b))
+        return judge.verify(replace(alignment, T_a_b=T_a_b))
 
     assert benchmark(verdict).accepted
 
@@ -46,4 +46,4 @@ def test_verdict(benchmark, n):
 @pytest.mark.parametrize("n", [1600, 5000])
 def test_evidence_of_two_maps(benchmark, n):
     pairs = pairs_of(n)
-    assert benchmark(lambda: Judge().on(pairs).evidence) is not None
+    assert benchmark(lambda: Verifier().on(pairs).evidence) is not None

@@ -8,12 +8,12 @@ from tests.bounds.interpreted import interpret_kernels
 
 
 def main() -> int:
-    calls = interpret_kernels()
     for package in ("mapfusion", "experiments", "sim"):
         for path in sorted((SOURCE_ROOT / package).rglob("*.py")):
             if "from mapfusion.geometry.numerics" in path.read_text(encoding="utf-8"):
                 of_root = path.relative_to(SOURCE_ROOT).with_suffix("")
                 importlib.import_module(".".join(of_root.parts))
+    calls = interpret_kernels()
     importlib.import_module("tests.bounds.all_kernels").call_all()
     unreached = sorted(name for name, n in calls.items() if n == 0)
     sys.stdout.write(f"{len(calls)} kernels, not reached: {' '.join(unreached) or 'none'}\n")

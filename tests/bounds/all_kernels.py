@@ -12,8 +12,8 @@ from mapfusion.align.clique import full_set, larger_clique
 from mapfusion.align.correspondences import match
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se3 import in_space
-from mapfusion.registration import Registration
 from mapfusion.smoother.smooth import condensed_points
+from mapfusion.verification.registration import Registration
 from mapfusion.vision.disparity_tests import window_statistics
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
 from mapfusion.vision.harris import HarrisParameters

@@ -1,11 +1,11 @@
 """Kernels as the Python that they are written in: NumPy looks at each index before it is used."""
 
 import functools
+import sys
 from collections.abc import Callable
 from typing import Any
 
-import numba
-import numba.extending
+from mapfusion.geometry.numerics import Compiled
 
 # What an instruction of the processor does, in Python.
 _INSTRUCTIONS: dict[str, Callable[[Any], int]] = {
@@ -15,9 +15,9 @@ _INSTRUCTIONS: dict[str, Callable[[Any], int]] = {
 
 
 def interpret_kernels() -> dict[str, int]:
-    """Have Numba compile nothing that is imported from here on.
+    """Run the kernels of all imported modules as Python.
 
-    Returns how often each kernel, by its full name, was called; it goes on counting.
+    Returns the number of calls of each kernel by its full name; it goes on counting.
     """
     calls: dict[str, int] = {}
 
@@ -32,9 +32,8 @@ def interpret_kernels() -> dict[str, int]:
 
         return call
 
-    def njit(kernel: Callable[..., Any] | None = None, **_: Any) -> Callable[..., Any]:
-        return counted if kernel is None else counted(kernel)
-
-    numba.njit = njit
-    numba.extending.intrinsic = lambda generator: _INSTRUCTIONS[generator.__name__]
+    for module in list(sys.modules.values()):
+        for name, value in vars(module).items():
+            if isinstance(value, Compiled) and value.py_func.__module__ == module.__name__:
+                value.compiled = _INSTRUCTIONS.get(name) or counted(value.py_func)
     return calls

@@ -14,7 +14,7 @@ from experiments.pipeline.tables import ESTIMATES, read_rows, write_rows
 from experiments.plugins.discovery import callable_aligner, require_usable
 from experiments.plugins.isolated_process import end_children
 from mapfusion.align.alignment import Status
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 from tests.campaign import misbehaviours as kinds
 from tests.campaign.parts import Found
 from tests.helpers.made_up_maps import landmark_map, paired

@@ -5,7 +5,7 @@ import builtins, ctypes, faulthandler, json, os, pickle, resource, signal, socke
 import stat, struct, sys, threading, time
 from dataclasses import dataclass, replace
 import numpy as np
-from mapfusion.align.method import Fit, Undetermined
+from mapfusion.align.alignment import Fit, Undetermined
 from mapfusion.align.alignment import Alignment, Status, degenerate
 
 T, COVARIANCE = np.array([1.0, 2.0, 0.5]), np.diag([1.0, 4.0, 0.01])

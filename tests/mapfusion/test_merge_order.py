@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.fused_map import AlignedPair, MergeParameters
-from mapfusion.fusion.fusers import FUSERS, make_fuser
+from mapfusion.fusion.fusers import FUSERS, AlignedPair, MergeParameters, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.fusion.team_graph import TeamParameters, Unconfirmed
 from mapfusion.geometry import se2

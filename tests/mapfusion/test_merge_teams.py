@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.fused_map import AlignedPair, MergeParameters
+from mapfusion.fusion.fusers import AlignedPair, MergeParameters
 from mapfusion.fusion.kalman import KalmanDrift
 from mapfusion.fusion.merge import merge
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters, Unconfirmed

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.align.method import Needs, supported
+from mapfusion.align.alignment import Needs, supported
 from mapfusion.align.rigid_motion import fit_rigid
 
 

@@ -25,7 +25,7 @@ from sim.plan_generator import (
     RouteParameters,
     generate_plan,
     generate_world,
-    ground_overlap,
+    ground_overlaps,
     length_m,
 )
 from sim.routes import Route, check_routes
@@ -155,6 +155,11 @@ def routes(world: GeneratedWorld) -> list[Route]:
         Route(f"R{i}", route.T_world_start, route.waypoints_m, loop=True)
         for i, route in enumerate(world.routes)
     ]
+
+
+def ground_overlap(path_a_m: np.ndarray, path_b_m: np.ndarray) -> float:
+    """Return intersection over union of the ground along two paths."""
+    return float(ground_overlaps([path_a_m, path_b_m])[0, 1])
 
 
 def test_overlap_of_straight_paths_is_that_of_their_areas() -> None:

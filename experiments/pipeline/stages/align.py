@@ -38,12 +38,12 @@ from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.correspondences import Correspondences, MatchParameters, match
 from mapfusion.align.refinement import Refinement
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import EstimateVerifier, PairRegistration
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.likelihood import TwinShares
 from mapfusion.verification.regions import EvidenceParameters, ViewedMap
+from mapfusion.verification.registration import PairRegistration, VerifiedRefinement
 from mapfusion.verification.rivals import RepeatedLandmarks
-from mapfusion.verification.verdict import Judge, PairEvidence, RivalMotion, why_not_sought
+from mapfusion.verification.verdict import PairEvidence, RivalMotion, Verifier, why_not_sought
 
 _RIVAL_COUNTS = ("n_support", "n_confirmed", "n_contradicted", "n_regions")
 
@@ -71,7 +71,7 @@ class MatchSettings:
 def run_match(settings: MatchSettings, job: Job) -> None:
     """Find correspondences and rival motions of one batch of iterations."""
     made, rivals = [], []
-    judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
+    verifier = Verifier(settings.acceptance, settings.evidence, settings.refinement)
     for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
         pairs = match(map_a, map_b, settings.match)
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
@@ -79,7 +79,7 @@ def run_match(settings: MatchSettings, job: Job) -> None:
         if not why_not_sought(map_a, map_b):
             a, b = folders_of_both(job)
             viewed_maps = _viewed_map(a, k), _viewed_map(b, k)
-        if evidence := judge.on(Pairs(map_a, map_b, pairs), viewed_maps=viewed_maps).evidence:
+        if evidence := verifier.on(Pairs(map_a, map_b, pairs), viewed_maps=viewed_maps).evidence:
             rivals += rival_rows(names, evidence)
         columns = names | {"index_a": pairs.index_a, "index_b": pairs.index_b}
         made.append(pd.DataFrame(columns | {"descriptor_distance": pairs.distance}))
@@ -255,11 +255,11 @@ class AlignerSettings:
 def run_aligner(settings: AlignerSettings, job: Job) -> None:
     """Run the aligner at one batch of iterations on the correspondences of the match stage."""
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
-    judge = Judge(settings.acceptance, settings.evidence, settings.refinement)
+    verifier = Verifier(settings.acceptance, settings.evidence, settings.refinement)
     inputs = tuple(job.inputs.items())
     rows = []
-    for k, verifier in _verifiers(inputs, job.part, judge, settings.iterations):
-        pairs, on_pair = verifier.pairs, PairRegistration(aligner, verifier)
+    for k, refinement in _refinements(inputs, job.part, verifier, settings.iterations):
+        pairs, on_pair = refinement.pairs, PairRegistration(aligner, refinement)
         for repetition in range(settings.repetitions if aligner.randomised else 1):
             names = {"robot_a": pairs.map_a.name, "robot_b": pairs.map_b.name, "iteration": k}
             names |= {"aligner": settings.name, "repetition": repetition}
@@ -272,9 +272,9 @@ ALIGNER_STAGE = StageKind("aligner", _LABEL, run_aligner, (_BATCH_FILE,))
 
 
 @functools.lru_cache(maxsize=_BATCHES_KEPT)
-def _verifiers(
-    inputs: tuple[tuple[str, Path], ...], part: str, judge: Judge, iterations: tuple[int, ...]
-) -> Sequence[tuple[int, EstimateVerifier]]:
+def _refinements(
+    inputs: tuple[tuple[str, Path], ...], part: str, verifier: Verifier, iterations: tuple[int, ...]
+) -> Sequence[tuple[int, VerifiedRefinement]]:
     """Return iterations of a batch with the data that complete an estimate of any aligner.
 
     Tasks of several aligners follow each other, so the last batches stay in memory. The name of a
@@ -283,12 +283,12 @@ def _verifiers(
     job = Job(dict(inputs), Path(), part)
     offered = read_rows(batch_path(job.inputs["match"], part), CORRESPONDENCES)
     rivals = read_rows(rivals_path(job.inputs["match"], part), RIVALS)
-    verifiers = []
+    refinements = []
     for k, map_a, map_b in pairs_of_maps(job, iterations):
         pairs = Pairs(map_a, map_b, correspondences_of(at_iteration(offered, k)))
-        evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), judge.evidence)
-        verifiers.append((k, EstimateVerifier(pairs, judge.refinement, judge, evidence)))
-    return verifiers
+        evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), verifier.evidence)
+        refinements.append((k, VerifiedRefinement(pairs, verifier.refinement, verifier, evidence)))
+    return refinements
 
 
 _JOINED_FILES = ("estimates.parquet", "correspondences.parquet", "rivals.parquet")

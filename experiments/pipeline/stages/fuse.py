@@ -48,8 +48,7 @@ from mapfusion.files import (
     schema,
 )
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import AlignedPair, FusedMap, MergeParameters
-from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.fusers import AlignedPair, FusedMap, MergeParameters, make_fuser
 from mapfusion.fusion.merge import ConnectedMaps, connect
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.smoother.joint_smoothing import AssociatedLog

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from experiments.pipeline.stage import RecordedLog, Stage, StageKind, in_dependency_order
 from experiments.pipeline.stages import align, drive, features, fuse, log, slam, smooth
 from experiments.pipeline.stages.drive import Walls
-from experiments.plugins.discovery import Kind, find_method, fingerprint
+from experiments.plugins.discovery import find_method, fingerprint
 from experiments.scenario.settings import (
     AnyScenario,
     Recording,
@@ -30,13 +30,12 @@ from experiments.scenario.settings import (
 )
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section
 from mapfusion.errors import InputError
-from mapfusion.fusion.fused_map import name_order
-from mapfusion.fusion.fusers import FUSERS, target_of
+from mapfusion.fusion.fusers import FUSERS, name_order, target_of
 from mapfusion.robot_log import read_log
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.tables import is_csv, table_path
 from mapfusion.vision.front_end import FrontEndParameters
-from sim.renderer import renderer_name
+from sim.renderer import renderer_name, require_pybullet
 from sim.textures import STYLES
 
 
@@ -113,7 +112,8 @@ def build_pipeline(scenario: AnyScenario) -> Pipeline:
     """Return the stages of a scenario; names and lengths of recorded logs are read.
 
     Raises:
-        InputError: a recorded log cannot be read, or names of robots are invalid.
+        InputError: a recorded log cannot be read, names of robots are invalid, or a simulated
+            world cannot be driven because PyBullet is not installed.
     """
     recorded = isinstance(scenario, Recording)
     robots = tuple(_recorded(scenario) if recorded else _simulated(scenario))
@@ -132,6 +132,7 @@ def _stage(kind: StageKind, *sections: Section, own: dict[str, Any], **more: Any
 
 def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
     """Yield the stages of simulated robots."""
+    require_pybullet()  # here rather than in a worker, after the first stages
     world, render, keep = scenario.world, scenario.render, scenario.keep
     lines = tuple(tuple(wall.points) for wall in world.walls)
     walls = Walls(lines, world.wall_height_m, world.wall_thickness_m)
@@ -252,16 +253,13 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
     estimates: dict[str, Stage] = {}
     for entry in scenario.align.aligners:
         method = find_method(entry.method)
-        module = method.target.partition(":")[0]
-        if method.kind is Kind.PLUG_IN:
-            module = "mapfusion.align"  # a plug-in may import any of its modules
         estimates[entry.name] = _stage(
             align.ALIGNER_STAGE,
             *(scenario, scenario.align, entry),
             own=own | {"origin": method.origin()},
             before=maps | {"match": matched},
             parts=parts,
-            loads=(module,),
+            loads=(method.own_module,),
             # fusing waits for the merging aligner only
             shares="" if entry.name == scenario.merge.aligner else f"estimates on {matched.key}",
         )
@@ -341,13 +339,18 @@ def require_memory(pipeline: Pipeline, jobs: int, machine_bytes: float | None = 
     """
     has = memory_bytes() if machine_bytes is None else machine_bytes
     need = max(needs(pipeline), key=lambda need: need.n_bytes)
-    wanted = jobs * (need.n_bytes + _PROCESS_BYTES)
+    wanted = jobs * process_bytes(pipeline)
     if wanted > has:
         processes = f" in each of {jobs} processes (--jobs 1 needs least)" if jobs > 1 else ""
         raise InputError(
             f"{need.setting}: {need.why} take about {need.n_bytes / _GB:.1f} GB{processes}, this "
             f"machine has {has / _GB:.1f} GB"
         )
+
+
+def process_bytes(pipeline: Pipeline) -> float:
+    """Return the memory of a process that does the largest task of a run, in bytes."""
+    return _PROCESS_BYTES + max(need.n_bytes for need in needs(pipeline))
 
 
 def needs(pipeline: Pipeline) -> Iterator[Need]:

@@ -11,7 +11,7 @@ import io
 import pkgutil
 import time
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache, cached_property
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -151,21 +151,13 @@ class _Record:
     def __init__(self, result: Path) -> None:
         self._result = result
         self._file = result / "figures" / _RECORD
-        self._now: dict[str, dict[str, Any]] = {}  # new entries
-
-    @cached_property
-    def _known(self) -> dict[str, Any]:
-        """The record of the last drawing; empty if there is no readable one."""
         try:
-            return dict(read_json(self._file, "record of drawn figures")["figures"])
+            self._known = dict(read_json(self._file, "record of drawn figures")["figures"])
         except (OSError, KeyError, TypeError, ValueError):
-            return {}
-
-    @cached_property
-    def _common_inputs(self) -> str:
-        """Digest of the inputs of all figures."""
-        frames = sorted((self._result / "keyframes").glob("*.png"))
-        return _digest([self._result / "world.json", *frames])
+            self._known = {}  # there is no readable record of the last drawing
+        self._now: dict[str, dict[str, Any]] = {}  # new entries
+        frames = sorted((result / "keyframes").glob("*.png"))
+        self._common_inputs = _digest([result / "world.json", *frames])  # of all figures
 
     def unchanged(self, name: str) -> Drawn | None:
         """Return the last drawing of a figure if its inputs and pictures have not changed."""
@@ -298,6 +290,14 @@ def draw_all(
         return Drawing(pool, again=True).finish(result, on_progress)
 
 
+def remove_figures(result: Path) -> None:
+    """Remove the figures of an earlier run from a result folder."""
+    for name in FIGURES:
+        for picture in _pictures(result, name):
+            picture.unlink(missing_ok=True)
+    (result / "figures" / _RECORD).unlink(missing_ok=True)
+
+
 def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Drawn:
     """Draw one of `FIGURES` into a folder, by default `figures` in the folder of the result.
 
@@ -344,12 +344,8 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
         with matplotlib.rc_context({"figure.constrained_layout.use": False}):
             figure.set_layout_engine(None)
             for file, kind in zip(files, _DPI, strict=True):
-                picture = _picture(figure, kind)
+                stream = io.BytesIO()
+                figure.savefig(stream, format=kind, dpi=_DPI[kind], **_SAVED[kind])
+                picture = stream.getvalue()
                 write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
     return files
-
-
-def _picture(figure: Figure, kind: str) -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, format=kind, dpi=_DPI[kind], **_SAVED[kind])
-    return stream.getvalue()

@@ -4,6 +4,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -15,7 +16,6 @@ from matplotlib.transforms import Bbox
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
-from scipy.spatial import KDTree
 
 from experiments.pipeline.stages.align import unpacked
 from experiments.reports.figures import floor_plan as plan
@@ -146,7 +146,7 @@ def _without_outliers(position_m: Float) -> Float:
     return np.where(inside[:, None], position_m, np.nan)
 
 
-def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, tuple[str, str]]:
+def classify_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, tuple[str, str]]:
     """Classify the last correspondences as right or wrong.
 
     The truth decides where it is known, else the refined inliers of the first aligner that has any.
@@ -174,7 +174,7 @@ def _add_correspondences(
 ) -> None:
     """Draw a sample of the right and of the wrong correspondences as lines."""
     rows = data.last_correspondences(pair)
-    right, names = judge_correspondences(data, pair)
+    right, names = classify_correspondences(data, pair)
     ends = np.stack([position_a[rows["index_a"]], position_b[rows["index_b"]]], axis=1)
     drawable = np.isfinite(ends).all(axis=(1, 2))
     styles: tuple[dict[str, Any], ...] = (
@@ -356,7 +356,9 @@ def choose_zoom(position_m: Float, covariance_m2: Float) -> Zoom:
     middle = (low + high) / 2
     some = np.unique(np.linspace(0, len(middle) - 1, _MAX_CANDIDATES).round().astype(int))
     count = min(_ZOOM_LANDMARKS, len(middle))
-    near = np.reshape(KDTree(middle).query(middle[some], k=count)[1], (len(some), count))
+    near = np.reshape(
+        scipy.spatial.KDTree(middle).query(middle[some], k=count)[1], (len(some), count)
+    )
     ends = low[near].min(axis=1), high[near].max(axis=1)
     side = _ZOOM_MARGIN * (ends[1] - ends[0]).max(axis=1)
     corner = (ends[0] + ends[1] - side[:, None]) / 2

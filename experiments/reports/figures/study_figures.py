@@ -137,8 +137,21 @@ def draw_independence(teams: pd.DataFrame, costs: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(style.PAGE_WIDTH_IN, _HEIGHT_IN))
     panels = figure.subplots(len(_PANELS), len(sizes), sharex="col", sharey="row", squeeze=False)
     for size, column in zip(sizes, panels.T, strict=True):
-        for (_, bold, thin), axes in zip(_PANELS, column, strict=True):
-            _add_strategies(axes, rows[rows["n_robots"] == size], bold, thin)
+        of_size = rows[rows["n_robots"] == size]
+        for strategy in STRATEGIES:
+            line = _STRATEGY_STYLES[strategy.name]
+            for _, own in of_size[of_size["strategy"] == strategy.name].groupby("seed"):
+                part = own[own["n_merged"] < own["n_robots"]]
+                for (_, bold, thin), axes in zip(_PANELS, column, strict=True):
+                    unit = _MM_PER_M if _is_error(bold) else 1.0
+                    axes.plot(own["since"], own[bold] * unit, **line)
+                    if thin:
+                        axes.plot(own["since"], own[thin], **line | _OF_TEAM)
+                    if _is_error(bold):
+                        axes.plot(part["since"], part[bold] * unit, **line | _HOLLOW)
+        for axes in column:
+            axes.axvline(0.0, color=GRAY, linewidth=0.8)
+            axes.set_yscale("log")
         column[0].set_title(f"{size} robots")
         column[-1].set_xlabel("iterations since robots first share ground")
         column[-1].xaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -179,21 +192,6 @@ def _is_error(column: str) -> bool:
     return column.endswith("rmse_m")
 
 
-def _add_strategies(axes: Axes, rows: pd.DataFrame, bold: str, thin: str) -> None:
-    """Draw one column for every strategy and seed, and a second one as thin lines."""
-    for strategy in STRATEGIES:
-        mine, line = rows[rows["strategy"] == strategy.name], _STRATEGY_STYLES[strategy.name]
-        for _, own in mine.groupby("seed"):
-            axes.plot(own["since"], own[bold] * (_MM_PER_M if _is_error(bold) else 1.0), **line)
-            if thin:
-                axes.plot(own["since"], own[thin], **line | _OF_TEAM)
-            part = own[own["n_merged"] < own["n_robots"]]
-            if _is_error(bold):
-                axes.plot(part["since"], part[bold] * _MM_PER_M, **line | _HOLLOW)
-    axes.axvline(0.0, color=GRAY, linewidth=0.8)
-    axes.set_yscale("log")
-
-
 def draw_refusal(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms: float) -> Figure:
     """Draw false against missed merges, the shares accepted, and the calibration.
 
@@ -209,7 +207,23 @@ def draw_refusal(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms
     label = f"{_SUPPORT_OF}, number of inliers alone"
     line = {"color": GRAY, "linestyle": ":", "label": label}
     _draw_sweep(curve, own.assign(score=-own["n_inliers"]), _floor(refusals), **line)
-    _draw_accepted_shares(rates, refusals[refusals["aligner"] == first])
+    # Share accepted by the first aligner against the threshold, by kind of ground
+    own = refusals[refusals["aligner"] == first]
+    kinds = [
+        (without_common_ground(own), "no common ground", GRAY, "-"),
+        (mergeable(own), f"{MERGEABLE_PAIRS} or more true pairs", BLACK, "-"),
+        (own[own["ground"] == FEW], "20, in one corner", BLACK, "--"),
+    ]
+    for radius_m, colour in zip(POSTER_RADII_M, _POSTER_COLOURS, strict=True):
+        label = f"a {2 * radius_m:g} m picture in both"
+        kinds.append((own[own["poster_radius_m"] == radius_m], label, colour, ":"))
+    for rows, label, colour, dashes in kinds:
+        if len(rows):
+            accepted = share_up_to(rows["log10_false_alarms"], _THRESHOLDS)
+            line = {"color": colour, "linestyle": dashes, "label": f"{label} ({len(rows)})"}
+            rates.plot(_THRESHOLDS, accepted, **line)
+    rates.set_xlabel("threshold on log10 of the false alarms")
+    rates.set_ylabel(f"share accepted, {first}")
     # Measured against stated number of false alarms
     stated, measured = calibration["stated"], calibration["motions_a_pair"]
     n = int(calibration["n_pairs"].iloc[0])
@@ -230,25 +244,6 @@ def draw_refusal(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms
     legend = {"loc": "upper left", "title": f"Above: {first} (pairs of maps)", "alignment": "left"}
     key.legend(*rates.get_legend_handles_labels(), **legend)
     return figure
-
-
-def _draw_accepted_shares(axes: Axes, own: pd.DataFrame) -> None:
-    """Draw the share accepted by one aligner against the threshold, by kind of ground."""
-    kinds = [
-        (without_common_ground(own), "no common ground", GRAY, "-"),
-        (mergeable(own), f"{MERGEABLE_PAIRS} or more true pairs", BLACK, "-"),
-        (own[own["ground"] == FEW], "20, in one corner", BLACK, "--"),
-    ]
-    for radius_m, colour in zip(POSTER_RADII_M, _POSTER_COLOURS, strict=True):
-        label = f"a {2 * radius_m:g} m picture in both"
-        kinds.append((own[own["poster_radius_m"] == radius_m], label, colour, ":"))
-    for rows, label, colour, dashes in kinds:
-        if len(rows):
-            accepted = share_up_to(rows["log10_false_alarms"], _THRESHOLDS)
-            text = f"{label} ({len(rows)})"
-            axes.plot(_THRESHOLDS, accepted, color=colour, linestyle=dashes, label=text)
-    axes.set_xlabel("threshold on log10 of the false alarms")
-    axes.set_ylabel(f"share accepted, {own['aligner'].iloc[0]}")
 
 
 def draw_refusal_kinds(refusals: pd.DataFrame) -> Figure:

@@ -5,7 +5,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,21 +53,14 @@ from experiments.reports.report.charts import (
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
 from experiments.reports.terminal.run_screen import team_lines
 from experiments.scenario.settings import Bound
+from experiments.studies.comparison import natural_key
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, install_command
 
 _SOURCE_DIGITS = 16
-
-
-def _natural(text: object) -> tuple[float, str]:
-    """Return a sorting key that puts 50 before 200."""
-    try:
-        return float(str(text)), ""
-    except ValueError:
-        return math.inf, str(text)
 
 
 def _provenance(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
@@ -110,7 +103,7 @@ def _provenance(path: Path, runs: Runs) -> tuple[dict[str, str], list[str]]:
     # Three or more consecutive whole numbers are written as `--seeds` takes them.
     shown: dict[str, str] = {}
     for name, different in values.items():
-        texts = sorted(different, key=_natural)
+        texts = sorted(different, key=natural_key)
         shown[name] = ", ".join(texts)
         if len(texts) > 2 and all(text.isdigit() for text in texts):
             first, last = int(texts[0]), int(texts[-1])
@@ -189,12 +182,30 @@ def contents_of(path: Path) -> dict[str, Any]:
     runs = find_runs(path)
     if not runs.sweeps:
         require_result(path)
-    if not runs.has("errors") or (reduced := reduced_errors(runs)).maps.empty:
-        if runs.sweeps or not (data := ResultTables(path)).no_truth:
-            raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
-        return _without_truth(path, runs, data)
+    reduced = reduced_errors(runs) if runs.has("errors") else None
+    has_errors = reduced is not None and not reduced.maps.empty
+    data = None if runs.sweeps else ResultTables(path)
+    if not has_errors and (data is None or not data.no_truth):
+        raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
+    provenance, stages = _provenance(path, runs)
+    timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
+    common = {
+        "provenance": provenance,
+        "stages": stages,
+        "stage_times": _stage_times(runs),
+        "failed": runs.failed.to_dict("records"),
+    }
+    if data is not None and not has_errors:
+        # Without truth there are no errors and no success.
+        own, styles = _of_result(data), _page_styles(data.aligners)
+        times = time_curves(timings, data.aligners) if len(timings) else {}
+        charts = {"errors": None, "success": None, "times": time_figure(times, styles)}
+        absent = [name for name, label in data.labels.items() if label != name]
+        own |= {"charts": own["charts"] | charts, "absent": absent, "outcomes": ()}
+        return own | common | {"no_truth": True, "ranking": None, "styles": styles}
+    assert reduced is not None
     maps = reduced.maps
-    if runs.sweeps:
+    if data is None:
         # The sections of single results are empty.
         empty = ("outcomes", "robots", "fits", "smoother", "team", "edges", "figures", "missing")
         empty += ("scenario_text", "fusers", "fuser_figures", "places", "findings")
@@ -206,60 +217,41 @@ def contents_of(path: Path) -> dict[str, Any]:
         }
         groups = list(_by_configuration(reduced.medians))
     else:
-        data = ResultTables(path)
         own, errors = _of_result(data), runs.read("errors")
         groups = [(f"{a} – {b}", of_pair(errors, (a, b))) for a, b in data.pairs]
         if len(data.pairs) > 1:
             groups.append(("all pairs", errors))
     aligners = methods_in(maps, oracle=True)
-    drawn_in = aligner_styles(aligners)
-    styles = {name: chart_style(drawn_in[name]) for name in aligners}
-    timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
-    provenance, stages = _provenance(path, runs)
-    return own | {
-        "no_truth": False,
-        "ranking": recommend(maps, timings, aligners),
-        "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
-        "settings": setting_columns(maps),
-        "styles": styles,
-        "charts": own["charts"]
+    styles = _page_styles(aligners)
+    times = time_curves(timings, aligners) if len(timings) else {}
+    charts = {
+        "errors": error_figure([(n, error_curves(r, aligners)) for n, r in groups], styles),
+        "success": success_figure(success_curves(maps, aligners), styles),
+        "times": time_figure(times, styles),
+    }
+    own |= {"charts": own["charts"] | charts, "absent": reduced.absent}
+    return (
+        own
+        | common
         | {
-            "errors": error_figure([(n, error_curves(r, aligners)) for n, r in groups], styles),
-            "success": success_figure(success_curves(maps, aligners), styles),
-            "times": time_figure(time_curves(timings, aligners) if len(timings) else {}, styles),
-        },
-        "absent": reduced.absent,
-        "provenance": provenance,
-        "stages": stages,
-        "stage_times": _stage_times(runs),
-        "failed": runs.failed.to_dict("records"),
-    }
+            "no_truth": False,
+            "ranking": recommend(maps, timings, aligners),
+            "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
+            "settings": setting_columns(maps),
+            "styles": styles,
+        }
+    )
 
 
-def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]:
-    """Collect the contents for a result without truth, which has no errors and no success."""
-    styles = {name: chart_style(style) for name, style in data.styles.items()}
-    times = time_curves(runs.read("aligner_timings"), data.aligners)
-    provenance, stages = _provenance(path, runs)
-    own = _of_result(data)
-    return own | {
-        "no_truth": True,
-        "outcomes": (),
-        "ranking": None,
-        "styles": styles,
-        "charts": own["charts"]
-        | {"errors": None, "success": None, "times": time_figure(times, styles)},
-        "absent": [name for name, label in data.labels.items() if label != name],
-        "provenance": provenance,
-        "stages": stages,
-        "stage_times": _stage_times(runs),
-        "failed": [],
-    }
+def _page_styles(aligners: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return the styles of aligners in the page's and Plotly's terms."""
+    styles = aligner_styles(aligners)
+    return {name: chart_style(styles[name]) for name in aligners}
 
 
 def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield the runs of each scenario and setting with a label."""
-    ordered = sorted(configurations(spread), key=lambda each: [*map(_natural, each[0].values())])
+    ordered = sorted(configurations(spread), key=lambda each: [*map(natural_key, each[0].values())])
     for labels, rows in ordered:
         scenario = labels.pop("scenario")
         if scenario == ALL_SCENARIOS:
@@ -288,7 +280,7 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
         "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
         "description": data.scenario.get("description", ""),
         "spread_text": "repetitions on the same maps",
-        "charts": {"map": map_figure(data, {n: chart_style(s) for n, s in data.styles.items()})},
+        "charts": {"map": map_figure(data, _page_styles(data.aligners))},
         "outcomes": outcomes,
         "findings": list(finding_row_lines(data.rows("findings"))),
         "robots": path_rms(data.table("robots")).to_dict("records"),
@@ -365,6 +357,6 @@ def templates() -> jinja2.Environment:
     )
     environment.globals |= {"text": formatting, "criteria": criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
-    environment.globals["gross_m"] = GROSS_M
+    environment.globals |= {"gross_m": GROSS_M, "install_command": install_command}
     environment.tests["nan"] = math.isnan
     return environment

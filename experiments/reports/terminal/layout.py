@@ -25,11 +25,13 @@ from rich.table import Table
 from rich.text import Text
 
 from experiments.reports.formatting import UNKNOWN, interval, number, plain
+from mapfusion.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:  # listings without data frames skip this slow import
     import pandas as pd
 
 Column = tuple[str, str]  # heading and format
+MANUAL = Path(__file__).parents[2] / "docs"  # folder of the manual's pages
 _LEAST_TEXT = 8  # characters of a column of text: folded names stay legible
 NO_ESTIMATE = "given: share with an estimate; without one the error is infinite"
 _GAP = 2  # characters between columns
@@ -182,6 +184,39 @@ def print_methods() -> None:
     print_table([(heading, "") for heading in headings], rows, "Alignment methods")
     absent = [f"{each.name}: {each.absence}" for each in methods if each.absence]
     print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
+
+
+def print_pages() -> None:
+    """Print the names and titles of the manual's pages, and their folder."""
+    titles = [
+        (page.stem, page.open(encoding="utf-8").readline().strip("# \n")) for page in _pages()
+    ]
+    print_table([("page", ""), ("title", "")], titles)
+    print_lines(["`mapfusion docs PAGE` shows a page.", f"The pages are in {MANUAL}."])
+
+
+def print_page(name: str) -> None:
+    """Print a page of the manual: formatted on a terminal, else as it is.
+
+    Raises:
+        InputError: no page has this name.
+    """
+    from rich.markdown import Markdown
+
+    page = MANUAL / f"{name.removesuffix('.md')}.md"
+    if page not in _pages():
+        known = [each.stem for each in _pages()]
+        unknown = f"docs {name}: no such page, known are {', '.join(known)}"
+        raise InputError(unknown + did_you_mean(name, known))
+    text, console = page.read_text(encoding="utf-8"), _console()
+    if console.is_terminal:
+        console.print(Markdown(text), soft_wrap=False)
+    else:
+        console.print(Text(text.rstrip("\n")))
+
+
+def _pages() -> list[Path]:
+    return sorted(MANUAL.glob("*.md"))
 
 
 def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:

@@ -244,7 +244,9 @@ def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
         first = [own[0][name] for name in ("first_iteration", "first_iteration_by_chance")]
         times = ["–" if math.isnan(value) else f"{value:.0f}" for value in first]
         found.append([kind, *shares, *times])
-    shown = columns(">", kept="accepted", ambiguous="ambi-\nguous", uncertain="too un-\ncertain")
+    shown = columns(
+        ">", accepted="accepted", ambiguous="ambi-\nguous", uncertain="too un-\ncertain"
+    )
     shown |= columns(">", refused="refused", first="first at\niteration", chance="by\nchance")
     print_table(
         [("kind of world", ""), *shown.values()],

@@ -1,6 +1,7 @@
-"""What any command offers: its version, `python -m`, completion in the shell."""
+"""What any command offers: its version, `python -m`, completion in the shell, and the manual."""
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -8,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.tiny_scenario import command
+from mapfusion.errors import DISTRIBUTION
+from tests.helpers.tiny_scenario import assert_refused, command
 
 ROOT = Path(__file__).parents[3]
+PAGES = sorted((ROOT / "experiments" / "docs").glob("*.md"))
 
 
 def asked(*arguments: str, **settings: str) -> str:
@@ -26,6 +29,35 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     reply = command(capsys, "--version")
     assert (reply.code, reply.out) == (0, f"mapfusion {version}\n")
     assert asked("--version") == f"mapfusion {version}"
+
+
+def test_texts_name_our_distribution_and_pages_that_exist() -> None:
+    """`pip install mapfusion` would install another project's package."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["name"] == DISTRIBUTION
+    extras, pages = set(project["optional-dependencies"]), {each.stem for each in PAGES}
+    folders = [ROOT / name for name in ("mapfusion", "sim", "experiments", "scenarios")]
+    for path in (path for folder in folders for path in folder.rglob("*.*")):
+        if path.suffix not in (".py", ".md", ".yaml", ".j2"):
+            continue
+        text = path.read_text(encoding="utf-8")
+        installed = re.findall(r"pip install\s+'?(mapfusion[\w-]*)", text)
+        asked = re.findall(r"\bmapfusion(-\w+)?\[(\w+)\]", text)
+        assert set(installed) <= {DISTRIBUTION}, path
+        assert {f"mapfusion{end}" for end, _ in asked} <= {DISTRIBUTION}, path
+        assert {extra for _, extra in asked} <= extras, path
+        assert set(re.findall(r"`mapfusion docs\s+([a-z]+)`", text)) <= pages, path
+        assert path.suffix == ".md" or "experiments/docs" not in text, path
+
+
+def test_the_manual_is_listed_and_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    listed = command(capsys, "docs").out
+    assert str(PAGES[0].parent) in listed
+    for page in PAGES:
+        assert page.stem in listed
+        assert command(capsys, "docs", page.stem).out.strip() == page.read_text("utf-8").strip()
+    assert_refused(command(capsys, "docs", "formatz"), "formatz", "did you mean formats?")
+    assert_refused(command(capsys, "docs", "../../README"), "no such page")
 
 
 def test_the_citation_is_of_this_version() -> None:

@@ -2,8 +2,7 @@
 
 from experiments.evaluation.map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.truth import EvaluatedRobot, PathTruth
-from mapfusion.fusion.fused_map import MergeParameters
-from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.fusers import MergeParameters, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.robot_log import RobotTruth
 from tests.mapfusion.fusion.drawn_maps import DrawnTeam

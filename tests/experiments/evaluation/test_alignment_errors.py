@@ -16,7 +16,7 @@ from experiments.pipeline.stages.align import alignment_of, estimate_row, unpack
 from mapfusion.align.alignment import Alignment, Status, degenerate
 from mapfusion.geometry import se2
 from mapfusion.verification.false_alarms import Verdict
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 from tests.helpers.made_up_maps import (
     ACCEPTED,
     ITERATION,
@@ -40,7 +40,7 @@ def judged(estimated: Alignment, refined: Alignment, index_b: list[int]) -> pd.D
     estimates = pd.DataFrame([row | estimate_row(len(pairs), estimated, refined, ACCEPTED)])
     a, b = robot("A", POINTS, T_WORLD_A), robot("B", POINTS, T_WORLD_B)
     (met,) = join_map_pairs([a, b], estimates, offered("A", "B", pairs), NO_RIVALS)
-    return error_rows(met, Judge(), 0.1).set_index("aligner")
+    return error_rows(met, Verifier(), 0.1).set_index("aligner")
 
 
 def alignment(T_a_b: np.ndarray, inlier: list[bool]) -> Alignment:

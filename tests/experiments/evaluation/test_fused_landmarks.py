@@ -24,7 +24,7 @@ from experiments.pipeline.stages.align import estimate_row, unpacked
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import AlignedPair, FusedMap, Fusion, MergeParameters
+from mapfusion.fusion.fusers import AlignedPair, FusedMap, Fusion, MergeParameters
 from mapfusion.fusion.kalman import KalmanDrift
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2

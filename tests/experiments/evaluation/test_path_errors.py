@@ -27,7 +27,7 @@ from experiments.evaluation.path_errors import (
 )
 from experiments.evaluation.truth import EvaluatedRobot, MapPair, PathTruth
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.fused_map import FusedMap, Fusion
+from mapfusion.fusion.fusers import FusedMap, Fusion
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float

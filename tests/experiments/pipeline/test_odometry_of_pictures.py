@@ -11,7 +11,7 @@ from experiments.scenario.settings import Simulation
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.fusion.fusers import AlignedPair
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from tests.helpers.by_pictures import Mapped, mapped_by_pictures

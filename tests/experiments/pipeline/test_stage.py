@@ -241,7 +241,7 @@ def test_source_libraries_and_stages_before_it_are_in_the_key(
     first, other = made_up(), made_up(settings={"a": 1})
     befores: list[dict[str, Stage]] = [{}, {"x": first}, {"x": other}, {"y": first}]
     assert len({made_up("two", before=before).key for before in befores}) == 4
-    monkeypatch.setattr(stage_module, "library_versions", lambda: {"numpy": "0.0"})
+    monkeypatch.setattr(stage_module, "library_versions", lambda **_: {"numpy": "0.0"})
     assert made_up().key != first.key
     monkeypatch.undo()
     monkeypatch.setattr(stage_module, "source_hash", lambda _: "other")

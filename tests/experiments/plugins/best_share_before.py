@@ -7,7 +7,7 @@ import numpy as np
 
 from mapfusion.align.alignment import gather, undetermined, why_too_few
 from mapfusion.align.rigid_motion import fit_rigid
-from mapfusion.registration import supported_by
+from mapfusion.verification.registration import supported_by
 
 
 @dataclass(frozen=True)

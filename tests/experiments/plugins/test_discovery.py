@@ -140,6 +140,6 @@ def test_ours_depend_on_nothing_but_our_source():
 def test_an_absent_package_is_told_with_what_installs_it():
     method = KnownMethod("far", Kind.PEER, "m:Far", "far-package", "no_such_module_far")
     assert method.absence == (
-        "the package far-package is not installed; pip install 'mapfusion[peers]' installs it"
+        "the package far-package is not installed; pip install 'mapfusion-bench[peers]' installs it"
     )
     assert (method.version, method.origin()["files"]) == ("", "")

@@ -23,7 +23,7 @@ from experiments.plugins.isolated_process import (
 from experiments.scenario.seeds import generator
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.geometry import se2
-from mapfusion.registration import Registration, as_aligner
+from mapfusion.verification.registration import Registration, as_aligner
 from tests.helpers.answered_here import answered_here
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again
@@ -290,7 +290,7 @@ NOW = HERE.parents[1] / "plugin_example" / "mapfusion_best_share.py"
 BEFORE = HERE / "best_share_before.py"
 FINDER = """
 import numpy as np
-from mapfusion.align.method import Fit, Needs, Undetermined
+from mapfusion.align.alignment import Fit, Needs, Undetermined
 
 T = np.array([1.0, 2.0, 0.5])
 

@@ -215,7 +215,7 @@ def test_an_absent_package_is_shown_as_absent(tmp_path: Path, maps: tuple[Path, 
     assert (ended.code, ended.err) == (0, "")
     line = (
         "theirs: absent: the package kiss-matcher is not installed; "
-        "pip install 'mapfusion[peers]' installs it"
+        "pip install 'mapfusion-bench[peers]' installs it"
     )
     assert line in ended.out
 

@@ -214,7 +214,7 @@ def test_g2os_odometry_chains_to_the_tables(graph: Graph, trio_result: Path) -> 
 def test_g2os_weights_are_mahalanobis_distances_in_the_frame_of_a(
     graph: Graph, trio_result: Path
 ) -> None:
-    """Whatever its error turns: a T that is off by d has d' S^-1 d, with S as in `estimates`."""
+    """An edge with error d has the cost d' S^-1 d, with S as in `estimates`."""
     data = ResultTables(trio_result)
     sizes = [
         len(data.of_robot("paths", robot)) + len(read_map(trio_result / f"maps/{robot}.parquet"))
@@ -314,7 +314,7 @@ Logged = dict[str, dict[int, Any]]  # by entity and frame
 
 
 def stand_in(logged: Logged) -> ModuleType:
-    """A module of that name that notes what is logged."""
+    """Module of that name that records the calls."""
 
     class Stream:
         def __init__(self, *_: object, **__: object) -> None:
@@ -401,7 +401,7 @@ def test_without_the_package_it_is_one_line(
 ) -> None:
     monkeypatch.setattr(result_export, "find_spec", lambda _: None)
     reply = command(capsys, "export", tiny_result, "--format", "rerun", "-o", tmp_path / "out")
-    assert_refused(reply, "rerun-sdk", "mapfusion[rerun]")
+    assert_refused(reply, "rerun-sdk", "mapfusion-bench[rerun]")
     assert not (tmp_path / "out").exists()
 
 

@@ -7,7 +7,7 @@ import pytest
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import SHIPPED as SUITE
-from experiments.scenario.suite import copy_to_edit, entries, scenarios_of
+from experiments.scenario.suite import entries, scenarios_of
 from mapfusion.errors import InputError
 from tests.helpers.tiny_scenario import assert_refused, command
 
@@ -121,22 +121,6 @@ def test_own_files_go_before_shipped_ones_of_their_name(
     assert scenarios_of(["quick", "a"]) == [own / "quick.yaml", own / "a.yaml"]
     assert scenarios_of(["ci"]) == [own / "a.yaml", own / "quick.yaml"]
     assert scenarios_of(["dark"]) == [SUITE / "dark.yaml"]
-
-
-def test_a_copy_to_edit_is_written_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    reply = command(capsys, "scenarios", "--copy", "quick")
-    assert (reply.code, reply.out.strip()) == (0, "scenarios/quick.yaml")
-    copy = Path("scenarios/quick.yaml")
-    assert copy.read_bytes() == (SCENARIOS / "quick.yaml").read_bytes()
-    copy.write_text("mine")
-    with pytest.raises(InputError, match=r"scenarios/quick\.yaml: exists"):
-        copy_to_edit("quick")
-    assert copy.read_text() == "mine"
-    for name in ("none", "../../quick", ""):
-        assert_refused(command(capsys, "scenarios", "--copy", name), "no scenario of the suite")
 
 
 @pytest.mark.parametrize("name", SHIPPED)

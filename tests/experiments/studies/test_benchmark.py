@@ -30,7 +30,7 @@ from experiments.studies.benchmark import (
     synthetic_pair,
     true_pairs_of,
 )
-from mapfusion.align.peers.kiss_matcher import KissMatcher
+from mapfusion.align.peers import KissMatcher
 from mapfusion.align.rigid_motion import residual_covariances
 from mapfusion.errors import InputError
 from mapfusion.files import read_table

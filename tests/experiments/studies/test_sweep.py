@@ -54,7 +54,7 @@ GRID = ("--set", "slam.filter.n_particles=5,10", "--set", "align.repetitions=1")
 
 @pytest.fixture(scope="module")
 def short_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny scenario with fewer frames, and of two aligners one that draws nothing."""
+    """Write the tiny scenario with fewer frames and two aligners."""
     path = tmp_path_factory.mktemp("short") / "short.yaml"
     asked = SHORT.replace("    - {name: icp, method: icp}\n", "")
     # so that all runs have something to fuse: small maps of few particles, which see one place
@@ -247,7 +247,7 @@ def _whole_runs(sweep: Path) -> int:
 
 
 def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path: Path) -> None:
-    """They do some work twice, and nothing wrong."""
+    """Both sweeps may compute a stage twice, but results are right."""
     arguments = ("sweep", short_path, "--seeds", "1", *GRID)
     with (
         KilledCommand((*arguments, "-o", tmp_path / "one"), tmp_path, jobs=1) as one,

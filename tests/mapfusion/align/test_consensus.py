@@ -12,18 +12,17 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from mapfusion.align.aligners import make_aligner
-from mapfusion.align.alignment import Pairs, Status
+from mapfusion.align.alignment import Fit, Pairs, Status
 from mapfusion.align.clique import Clique, CliqueSearch
 from mapfusion.align.consensus import consistency_graphs, packed_rows
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.gnc import Gnc
 from mapfusion.align.mahalanobis_gate import mean_variances, refit_to_support
-from mapfusion.align.method import Fit
-from mapfusion.align.oracle import Oracle
-from mapfusion.align.ransac_mahalanobis import RansacMahalanobis, least_truncated_squares
+from mapfusion.align.ransac import RansacMahalanobis, least_truncated_squares
+from mapfusion.align.refinement import Oracle
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
-from mapfusion.registration import as_aligner
+from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import (
     blurred,
     error,

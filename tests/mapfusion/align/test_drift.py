@@ -9,16 +9,16 @@ from scipy.stats import chi2
 
 from mapfusion.align.aligners import make_aligner
 from mapfusion.align.alignment import Pairs
-from mapfusion.align.drift import DRIFT_FLOOR_M, calibration_covariance, estimate_drift_m
+from mapfusion.align.drift import calibration_covariance, estimate_drift_m
+from mapfusion.align.mahalanobis_gate import DRIFT_FLOOR_M
 from mapfusion.align.refinement import Refinement
-from mapfusion.fusion.fused_map import AlignedPair
-from mapfusion.fusion.fusers import make_fuser
+from mapfusion.fusion.fusers import AlignedPair, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.geometry.camera import EXACT, CalibrationError
 from mapfusion.geometry.se2 import rotation
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 from tests.mapfusion.align.map_pairs import MapPair, given_pairs, stretched
 
 OF_A, OF_B = CalibrationError(0.002, 0.003), CalibrationError(0.001, 0.004)
@@ -87,7 +87,7 @@ def test_fused_motions_are_no_surer_than_the_cameras(pair: MapPair) -> None:
 
     def motion_covariance(pair: MapPair) -> np.ndarray:
         maps, c = (pair.map_a, pair.map_b), pair.correspondences
-        aligned = Registration(make_aligner("ransac"), judge=None).on(*maps, c)
+        aligned = Registration(make_aligner("ransac"), verifier=None).on(*maps, c)
         found = aligned.register(np.random.default_rng(0)).refined
         fused = merge(maps, [AlignedPair(0, 1, found, c)], fuser=make_fuser()).fused[0]
         return fused.motion_covariance[1]

@@ -8,7 +8,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.icp import ClosestPoints, Icp, ImpIcp
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
-from mapfusion.registration import as_aligner
+from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 
 

@@ -7,11 +7,10 @@ from scipy.stats import chisquare
 
 from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.oracle import Oracle
 from mapfusion.align.ransac import Ransac, draw_pair, list_supporters, most_supported
-from mapfusion.align.refinement import Refinement
+from mapfusion.align.refinement import Oracle, Refinement
 from mapfusion.geometry import se2
-from mapfusion.registration import as_aligner
+from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 from tests.mapfusion.align.slow_twins import draw
 

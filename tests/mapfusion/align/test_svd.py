@@ -6,7 +6,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import motion_covariance
 from mapfusion.align.svd import Svd, solve
 from mapfusion.geometry import se2
-from mapfusion.registration import as_aligner
+from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks, moved
 
 RNG = np.random.default_rng(0)  # SVD draws nothing

@@ -17,7 +17,7 @@ from mapfusion.datasets.levelling import (
 )
 from mapfusion.datasets.stereo_import import RecordingPart, StereoImport, write_imported
 from mapfusion.datasets.stereo_recording import StereoRecording
-from mapfusion.datasets.tum import TimedPoses
+from mapfusion.datasets.text_files import TimedPoses
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera

@@ -11,7 +11,7 @@ from mapfusion.datasets.levelling import (
     level_observations,
     robot_in_body,
 )
-from mapfusion.datasets.tum import TimedPoses
+from mapfusion.datasets.text_files import TimedPoses
 from mapfusion.geometry import se3
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations

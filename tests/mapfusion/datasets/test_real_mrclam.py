@@ -25,8 +25,8 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
 from mapfusion.robot_log import first_frames, read_log, read_truth
+from mapfusion.verification.registration import Registration
 
 DATASET = Path(os.environ.get("MAPFUSION_RECORDINGS", "none")) / "MRCLAM_Dataset7"
 pytestmark = pytest.mark.skipif(

@@ -15,7 +15,7 @@ from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fastslam.mapping import build_map
 from mapfusion.geometry import se2, se3
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
+from mapfusion.verification.registration import Registration
 from mapfusion.vision.front_end import FrontEnd
 from tests.mapfusion.datasets.extracts import RECORDINGS, WHOLE, dead_reckoned, needs_recordings
 from tests.mapfusion.datasets.written_layouts import read_yaml

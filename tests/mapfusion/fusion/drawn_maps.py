@@ -6,7 +6,7 @@ import numpy as np
 
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.fused_map import AlignedPair
+from mapfusion.fusion.fusers import AlignedPair
 from mapfusion.geometry import se2
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.landmark_map import LandmarkMap

@@ -7,7 +7,7 @@ import numpy as np
 
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.fused_map import AlignedPair, Component, FusedMap
+from mapfusion.fusion.fusers import AlignedPair, Component, FusedMap
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
@@ -110,7 +110,7 @@ class LoggedTeam:
 
 
 def labels(landmarks: LandmarkMap) -> np.ndarray:
-    """Which landmarks of the world they are."""
+    """Return the labels of the world's landmarks."""
     assert landmarks.label is not None
     return landmarks.label
 

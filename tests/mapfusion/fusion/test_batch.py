@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.batch import Batch
-from mapfusion.fusion.fused_map import FusedMap, MergeParameters
+from mapfusion.fusion.fusers import FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.fusion.merge import connect
 from mapfusion.geometry.numerics import Float

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fused_map import FusedMap, MergeParameters
+from mapfusion.fusion.fusers import FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.fusion.joint_estimate import JointMap, estimate_jointly
 from mapfusion.fusion.kalman import KalmanDrift
@@ -230,7 +230,7 @@ def test_a_known_identity_needs_no_gate() -> None:
 
 
 def test_the_gate_keeps_the_share_of_true_pairs_that_it_promises() -> None:
-    """What two maps share cancels in their difference, else it would keep nearly all of them."""
+    """Errors that two maps share cancel; otherwise the gate would keep nearly all pairs."""
     kept = []
     for seed in range(8):
         team = DrawnTeam([slice(0, 300), slice(0, 300)], seed)

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from mapfusion.align.alignment import degenerate
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.fusion.aligned_landmarks import ABSENT, one_to_one
-from mapfusion.fusion.fused_map import AlignedPair, MergeParameters
+from mapfusion.fusion.fusers import AlignedPair, MergeParameters
 from mapfusion.fusion.kalman import Kalman, KalmanDrift
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import mapfusion.fusion.joint
 import mapfusion.smoother.smooth
-from mapfusion.fusion.fused_map import MergeParameters
+from mapfusion.fusion.fusers import MergeParameters
 from mapfusion.geometry.numerics import (
     chi_square_bound,
     cholesky,

@@ -17,7 +17,6 @@ from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration, as_aligner
 from mapfusion.verification.false_alarms import (
     Acceptance,
     Verdict,
@@ -30,6 +29,7 @@ from mapfusion.verification.false_alarms import (
     minimal_motion,
     named_false_alarms,
 )
+from mapfusion.verification.registration import Registration, as_aligner
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks, motion, moved, swapped
 
 GATES_M = np.array([0.05, 0.1, 0.2, 0.4])
@@ -42,7 +42,7 @@ def alignment(T_a_b, n):
 def judged(pair, T_a_b=None, **parameters):
     T_a_b = pair.T_a_b if T_a_b is None else T_a_b
     answer = alignment(T_a_b, len(pair.correspondences))
-    return Acceptance(**parameters).judge(
+    return Acceptance(**parameters).verify(
         Pairs(pair.map_a, pair.map_b, pair.correspondences), answer
     )
 
@@ -77,7 +77,7 @@ def test_false_alarms_are_at_most_the_stated_number(planar):
         map_a, map_b, pairs = random_pairs(rng, 60, planar)
         found = as_aligner(Ransac(max_draws=3000)).align(map_a, map_b, pairs, rng)
         refined = Refinement().refine(Pairs(map_a, map_b, pairs), found.T_a_b)
-        verdict = test.judge(Pairs(map_a, map_b, pairs), refined)
+        verdict = test.verify(Pairs(map_a, map_b, pairs), refined)
         hits += verdict.accepted
         low += verdict.log10_false_alarms <= -1
     # a stated rate of 0.1 must not be rejected by the count of those below it
@@ -166,7 +166,7 @@ def test_a_few_landmarks_with_known_labels_pass_when_all_agree():
         p_b[:, :2] += rng.normal(0, 0.02, (n, 2))
         maps = landmarks(p_a, 0.02, planar=True), landmarks(p_b, 0.02, planar=True)
         pairs = Correspondences(np.arange(n), np.arange(n), np.zeros(n))
-        verdict = Acceptance().judge(Pairs(*maps, pairs), alignment([1, 2, 0.5], n))
+        verdict = Acceptance().verify(Pairs(*maps, pairs), alignment([1, 2, 0.5], n))
         assert verdict.accepted is accepted, n
     assert verdict.log10_false_alarms < -15
 
@@ -189,7 +189,7 @@ def test_the_threshold_is_the_stated_number():
 def test_a_failed_alignment_is_not_judged():
     pair = given_pairs(np.random.default_rng(11), 30)
     failed = degenerate("no shape", 30)
-    verdict = Acceptance().judge(Pairs(pair.map_a, pair.map_b, pair.correspondences), failed)
+    verdict = Acceptance().verify(Pairs(pair.map_a, pair.map_b, pair.correspondences), failed)
     assert (verdict.accepted, verdict.reason) == (False, "no shape")
     assert math.isnan(verdict.log10_false_alarms)
     assert verdict.applied_to(failed) is failed
@@ -233,7 +233,7 @@ def test_wrong_indices_are_named():
     pair = given_pairs(np.random.default_rng(13), 10)
     outside = replace(pair.correspondences, index_b=pair.correspondences.index_b + 1)
     with pytest.raises(ValueError, match="index_b"):
-        Acceptance().judge(Pairs(pair.map_a, pair.map_b, outside), alignment(pair.T_a_b, 10))
+        Acceptance().verify(Pairs(pair.map_a, pair.map_b, outside), alignment(pair.T_a_b, 10))
 
 
 @pytest.mark.parametrize(("n", "p"), [(5, 0.3), (40, 0.004), (300, 0.01), (2000, 0.05), (1, 0.5)])

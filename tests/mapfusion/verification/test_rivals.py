@@ -124,7 +124,7 @@ def test_a_room_that_is_its_own_half_turn_says_so_once() -> None:
     np.testing.assert_allclose(motion.T_a_b[:2], [20, 12], atol=1e-6)
     one_order = pairs[pairs.index_a < pairs.index_b]
     refined = Refinement().refine(one_order, motion.T_a_b)
-    expected = Acceptance().judge(one_order, refined).log10_false_alarms
+    expected = Acceptance().verify(one_order, refined).log10_false_alarms
     assert motion.log10_false_alarms == pytest.approx(expected, rel=1e-6)
     assert expected < -20
 

@@ -12,19 +12,19 @@ from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.registration import Registration
 from mapfusion.verification import verdict as verdict_module
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.regions import EvidenceParameters, ViewedMap
+from mapfusion.verification.registration import Registration
 from mapfusion.verification.rivals import BETWEEN, RepeatedLandmarks, self_motions
-from mapfusion.verification.verdict import Judge, RivalMotion, landmark_sigma_m
+from mapfusion.verification.verdict import RivalMotion, Verifier, landmark_sigma_m
 from tests.mapfusion.verification.two_rooms import Wall, between, mapped
 
-JUDGE = Judge()
+JUDGE = Verifier()
 
 
-def verdict(a: LandmarkMap, b: LandmarkMap, judge: Judge = JUDGE) -> tuple[Verdict, Alignment]:
-    registration = Registration(Clique(), judge=judge)
+def verdict(a: LandmarkMap, b: LandmarkMap, judge: Verifier = JUDGE) -> tuple[Verdict, Alignment]:
+    registration = Registration(Clique(), verifier=judge)
     done = registration.register(a, b, match(a, b), np.random.default_rng(0))
     return done.verdict, done.refined
 
@@ -45,7 +45,7 @@ def test_common_ground_is_accepted_with_evidence() -> None:
 def test_what_is_likelier_wrong_is_not_accepted_whatever_else_speaks_for_it() -> None:
     said, _ = verdict(A, B)
     bound = {"least_probability": min(1.0, said.probability + 1e-6)}
-    asked, _ = verdict(A, B, Judge(evidence=EvidenceParameters(**bound)))
+    asked, _ = verdict(A, B, Verifier(evidence=EvidenceParameters(**bound)))
     assert asked.status is Status.AMBIGUOUS
     assert f"probability {said.probability:.2g}" in asked.reason
     assert asked.log10_evidence == said.log10_evidence
@@ -58,8 +58,8 @@ def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
     """Another motion with as many confirmed regions is a rival only beyond chance."""
     pairs = match(A, B)
     sought = Registration(Clique()).on(A, B, pairs)
-    assert sought.judge is not None
-    evidence, (said, refined) = sought.judge.evidence, verdict(A, B)
+    assert sought.verifier is not None
+    evidence, (said, refined) = sought.verifier.evidence, verdict(A, B)
     assert evidence is not None
     elsewhere = refined.T_a_b + np.array([0.0, 30.0, 0.0])
     none = RepeatedLandmarks.none(len(A), len(B))
@@ -77,8 +77,8 @@ def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str
     """Other motions are beyond chance by their pairs and have no confirmed region."""
     pairs, (said, refined) = match(A, B), verdict(A, B)
     sought = Registration(Clique()).on(A, B, pairs)
-    assert sought.judge is not None
-    evidence = sought.judge.evidence
+    assert sought.verifier is not None
+    evidence = sought.verifier.evidence
     assert evidence is not None
     none = RepeatedLandmarks.none(len(A), len(B))
     others = [
@@ -89,7 +89,7 @@ def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str
     ]
     known = replace(evidence, motions=(*evidence.motions, *others))
     enough = EvidenceParameters(least_ratio=10**said.log10_evidence / 4)
-    registration = Registration(Clique(), judge=Judge(evidence=enough)).on(A, B, pairs, known)
+    registration = Registration(Clique(), verifier=Verifier(evidence=enough)).on(A, B, pairs, known)
     answer = registration.register(np.random.default_rng(0)).verdict
     assert str(answer.status) == status
     assert ("too few beside" in answer.reason) == (status == "ambiguous")
@@ -108,7 +108,7 @@ def walls_with_one_picture(first_x: float, last_x: float) -> tuple[Wall, Wall]:
 def test_what_is_missing_makes_doubt_though_nothing_repeats() -> None:
     """A texture covers several regions, one of which led to the motion; as many are missing."""
     first, second = walls_with_one_picture(4, 8)
-    anyhow = Judge(evidence=EvidenceParameters(least_probability=0.0))
+    anyhow = Verifier(evidence=EvidenceParameters(least_probability=0.0))
     said, _ = verdict(mapped(first, 4, 12, seed=4), mapped(second, 4, 12, seed=5), anyhow)
     assert said.status is Status.AMBIGUOUS
     assert said.n_confirmed == said.n_contradicted == 2
@@ -130,7 +130,7 @@ def test_a_picture_that_hangs_twice_leaves_two_places() -> None:
     other = Wall(30, seed=7)
     picture = (wall.p[:, 0] >= 4) & (wall.p[:, 0] < 6)
     other.p, other.look = wall.p[picture], wall.look[picture]  # on a wall that is bare
-    small = Judge(evidence=EvidenceParameters(place_m=1.0))  # b is one place
+    small = Verifier(evidence=EvidenceParameters(place_m=1.0))  # b is one place
     said, _ = verdict(mapped(wall, 1, 15, seed=8), mapped(other, 3, 7, seed=9), small)
     assert said.status is Status.AMBIGUOUS
     assert "T_a_b" in said.reason or "hold things twice" in said.reason
@@ -143,7 +143,7 @@ def test_a_room_that_is_all_there_is_may_be_another_s_like() -> None:
     assert refined.ok
     assert said.status is Status.AMBIGUOUS
     assert "little else than this place" in said.reason
-    small = Judge(evidence=EvidenceParameters(place_m=1.0))
+    small = Verifier(evidence=EvidenceParameters(place_m=1.0))
     trusted, _ = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13), small)
     assert trusted.status is Status.ACCEPTED
 
@@ -157,7 +157,7 @@ def test_without_viewing_evidence_it_is_said_that_none_was_sought() -> None:
 
 
 def test_an_alignment_that_is_not_sure_enough_says_how_sure_it_is() -> None:
-    strict = Judge(evidence=EvidenceParameters(max_sigma_m=1e-3))
+    strict = Verifier(evidence=EvidenceParameters(max_sigma_m=1e-3))
     said, _ = verdict(A, B, strict)
     assert said.status is Status.TOO_UNCERTAIN
     assert "0.001 m, 0.05 rad are allowed" in said.reason
@@ -170,8 +170,8 @@ def test_what_was_found_before_gives_the_same_verdict() -> None:
     pairs = match(A, B)
     registration = Registration(Clique())
     sought = registration.on(A, B, pairs)
-    assert sought.judge is not None
-    known = registration.on(A, B, pairs, sought.judge.evidence)
+    assert sought.verifier is not None
+    known = registration.on(A, B, pairs, sought.verifier.evidence)
     both = [each.register(np.random.default_rng(0)).verdict for each in (sought, known)]
     assert both[0] == both[1]
 

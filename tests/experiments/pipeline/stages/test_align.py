@@ -7,7 +7,7 @@ from experiments.pipeline.stages.align import evidence_of, rival_rows
 from experiments.pipeline.tables import at_iteration
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import match
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 from tests.mapfusion.verification.two_rooms import Wall, mapped
 
 
@@ -15,7 +15,7 @@ def test_evidence_comes_back_from_the_rows_of_rivals() -> None:
     """Of a wall that hangs twice: there are motions, and what they lay on their like."""
     wall = Wall(16, seed=1, copies=[(0.0, 8.0, 8.0)])
     maps = mapped(wall, 0, 16, seed=2, name="A"), mapped(wall, 2, 14, seed=3, name="B")
-    judge = Judge()
+    judge = Verifier()
     found = judge.on(Pairs(*maps, match(*maps))).evidence
     assert found is not None
     assert any(each.copies.in_a.any() and each.copies.in_b.any() for each in found.motions)

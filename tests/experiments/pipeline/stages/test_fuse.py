@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.pipeline.stages.fuse import fused_map_files, read_fusions, write_fusions
-from mapfusion.fusion.fused_map import MergeParameters
-from mapfusion.fusion.fusers import FUSERS, make_fuser
+from mapfusion.fusion.fusers import FUSERS, MergeParameters, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.landmark_map import read_map
 from tests.mapfusion.fusion.drawn_maps import DrawnTeam

@@ -1,4 +1,4 @@
-"""Each figure on ordinary and on degenerate results."""
+"""Tests of each figure, on ordinary and on degenerate results."""
 
 import hashlib
 import re
@@ -248,7 +248,7 @@ def test_a_figure_without_data_is_remembered_with_its_reason(
 
 
 class _Asked:
-    """A pool that only keeps what it is asked for."""
+    """Pool that records the submitted tasks and runs none."""
 
     def __init__(self) -> None:
         self.tags: list[str] = []

@@ -1,4 +1,4 @@
-"""The report of a sweep: many runs, no maps."""
+"""Tests of the report of a sweep: many runs, no maps."""
 
 from pathlib import Path
 

@@ -10,14 +10,18 @@ from mapfusion.align.alignment import (
     MIN_PAIRS,
     NOT_RUN,
     Alignment,
+    Fit,
+    Method,
+    Needs,
     Pairs,
     Status,
+    Undetermined,
+    supported,
     undetermined,
     why_too_few,
 )
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.drift import calibration_covariance, estimate_drift_m
-from mapfusion.align.method import Fit, Method, Needs, Undetermined, supported
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (
     least_squares_gain,
@@ -28,18 +32,18 @@ from mapfusion.align.rigid_motion import (
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Verdict
-from mapfusion.verification.verdict import Judge, PairEvidence, PairJudge
+from mapfusion.verification.verdict import PairEvidence, PairVerifier, Verifier
 
 
-class EstimateVerifier:
+class VerifiedRefinement:
     """Refinement and verdict for estimates on one pair of maps.
 
-    Equal estimates are refined once, and equal refined alignments are judged once.
+    Equal estimates are refined once, and equal refined alignments are verified once.
 
     Args:
         pairs: correspondences of the two maps.
         refinement: least squares after the estimate.
-        judge: gives the verdict; None accepts what the refinement accepts.
+        verifier: gives the verdict; None accepts what the refinement accepts.
         evidence: evidence found earlier for these maps; None to compute it when needed.
     """
 
@@ -47,13 +51,13 @@ class EstimateVerifier:
         self,
         pairs: Pairs,
         refinement: Refinement,
-        judge: Judge | None,
+        verifier: Verifier | None,
         evidence: PairEvidence | None = None,
     ) -> None:
         self.pairs, self._refinement = pairs, refinement
-        self.judge: PairJudge | None = judge.on(pairs, evidence) if judge is not None else None
+        self.verifier: PairVerifier | None = verifier and verifier.on(pairs, evidence)
         self._refined: dict[tuple, Alignment] = {}
-        self._judged: dict[tuple, Verdict] = {}
+        self._verdicts: dict[tuple, Verdict] = {}
 
     def verify(self, estimated: Alignment) -> tuple[Alignment, Verdict]:
         """Return the refined alignment of an estimate, and the verdict on it."""
@@ -68,13 +72,13 @@ class EstimateVerifier:
             refined = self._refined[known]
         arrays = (array.tobytes() for array in (refined.T_a_b, refined.covariance, refined.inlier))
         known = (*arrays, refined.drift_sigma_m, refined.status, refined.reason)
-        if known not in self._judged:
-            self._judged[known] = (
+        if known not in self._verdicts:
+            self._verdicts[known] = (
                 Verdict(refined.status, np.nan, refined.reason)
-                if self.judge is None
-                else self.judge.judge(refined)
+                if self.verifier is None
+                else self.verifier.verify(refined)
             )
-        return refined, self._judged[known]
+        return refined, self._verdicts[known]
 
 
 class Aligner(Protocol):
@@ -119,14 +123,11 @@ class MethodAligner:
         Raises:
             ValueError: an index of the correspondences lies outside its map.
         """
+        return self.align_pairs(Pairs(map_a, map_b, correspondences), rng)
+
+    def align_pairs(self, pairs: Pairs, rng: np.random.Generator) -> Alignment:
+        """Estimate T_a_b from pairs, for which the method may hold cached data."""
         started_s = time.perf_counter()
-        return self._align(Pairs(map_a, map_b, correspondences), rng, started_s)
-
-    def align_again(self, pairs: Pairs, rng: np.random.Generator) -> Alignment:
-        """Estimate T_a_b again from the same pairs, for which the method may hold cached data."""
-        return self._align(pairs, rng, time.perf_counter())
-
-    def _align(self, pairs: Pairs, rng: np.random.Generator, started_s: float) -> Alignment:
         height = getattr(self.method, "height", None)
         needs = getattr(self.method, "needs", None) or Needs()
         gate = height if isinstance(height, HeightGate) else None
@@ -170,7 +171,7 @@ class _MethodInput(NamedTuple):
     @classmethod
     def select(cls, pairs: Pairs, height: HeightGate | None, needs: Needs) -> "_MethodInput":
         """Return the input for a height gate and needs; equal calls share one object."""
-        inputs: dict[tuple, _MethodInput] = pairs.kept.setdefault(cls, {})
+        inputs: dict[tuple, _MethodInput] = pairs.cache.setdefault(cls, {})
         if (height, needs) not in inputs:
             rows = np.arange(len(pairs)) if height is None else pairs.of_one_height(height)
             given = pairs if len(rows) == len(pairs) else pairs[rows]
@@ -265,17 +266,17 @@ class Registered(NamedTuple):
 
 @dataclass(frozen=True)
 class Registration:
-    """Registration of two maps: estimate, refine, judge.
+    """Registration of two maps: estimate, refine, verify.
 
     Attributes:
         method: estimates the motion.
         refinement: least squares after the estimate.
-        judge: gives the verdict; None accepts what the refinement accepts.
+        verifier: gives the verdict; None accepts what the refinement accepts.
     """
 
     method: Method | Aligner
     refinement: Refinement = field(default_factory=Refinement)
-    judge: Judge | None = field(default_factory=Judge)
+    verifier: Verifier | None = field(default_factory=Verifier)
 
     @property
     def randomised(self) -> bool:
@@ -302,7 +303,7 @@ class Registration:
         """
         pairs = Pairs(map_a, map_b, correspondences)
         return PairRegistration(
-            self.method, EstimateVerifier(pairs, self.refinement, self.judge, evidence)
+            self.method, VerifiedRefinement(pairs, self.refinement, self.verifier, evidence)
         )
 
     def register(
@@ -323,25 +324,25 @@ class Registration:
 class PairRegistration:
     """Registration of one pair of maps with one method.
 
-    Several methods on the same pair may share the verifier.
+    Several methods on the same pair may share the refinement.
     """
 
-    def __init__(self, method: Method | Aligner, verifier: EstimateVerifier) -> None:
-        self._aligner, self._verifier = as_aligner(method), verifier
+    def __init__(self, method: Method | Aligner, refinement: VerifiedRefinement) -> None:
+        self._aligner, self._refinement = as_aligner(method), refinement
 
     @property
-    def judge(self) -> PairJudge | None:
-        """Judge that gives the verdict; None accepts what the refinement accepts."""
-        return self._verifier.judge
+    def verifier(self) -> PairVerifier | None:
+        """Verifier of the pair; None accepts what the refinement accepts."""
+        return self._refinement.verifier
 
     def register(self, rng: np.random.Generator) -> Registered:
-        """Estimate, refine and judge once."""
-        pairs = self._verifier.pairs
+        """Estimate, refine and verify once."""
+        pairs = self._refinement.pairs
         if isinstance(self._aligner, MethodAligner):
-            estimated = self._aligner.align_again(pairs, rng)
+            estimated = self._aligner.align_pairs(pairs, rng)
         else:
             estimated = self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
-        registered = Registered(estimated, *self._verifier.verify(estimated))
+        registered = Registered(estimated, *self._refinement.verify(estimated))
         if registered.verdict.accepted:
             return registered
         n_support = int(np.count_nonzero(registered.refined.inlier))

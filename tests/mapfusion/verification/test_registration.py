@@ -1,4 +1,4 @@
-"""Tests of `mapfusion.registration`."""
+"""Tests of `mapfusion.verification.registration`."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 
 from mapfusion.align.aligners import ALIGNERS, make_aligner
-from mapfusion.align.alignment import Alignment, Pairs, Status, without_answer
+from mapfusion.align.alignment import (
+    Alignment,
+    Fit,
+    Needs,
+    Pairs,
+    Status,
+    Undetermined,
+    supported,
+    without_answer,
+)
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.method import Fit, Needs, Undetermined, supported
 from mapfusion.align.ransac import Ransac
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (
@@ -19,15 +27,15 @@ from mapfusion.align.rigid_motion import (
     motion_jacobian,
     residual_covariances,
 )
-from mapfusion.registration import (
-    EstimateVerifier,
+from mapfusion.verification.false_alarms import Acceptance, Verdict
+from mapfusion.verification.registration import (
     PairRegistration,
     Registered,
     Registration,
+    VerifiedRefinement,
     as_aligner,
 )
-from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.verdict import Judge
+from mapfusion.verification.verdict import Verifier
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks
 
 
@@ -80,14 +88,18 @@ def assert_same(first, second):
 @pytest.mark.parametrize("true_share", [0.0, 0.6])
 def test_equals_the_steps_by_hand(name, true_share):
     pair = given_pairs(np.random.default_rng(0), 80, true_share, 0.05)
-    method, refinement, judge = make_aligner(name), Refinement(gate_m=0.4), Judge(Acceptance(1e-4))
+    method, refinement, judge = (
+        make_aligner(name),
+        Refinement(gate_m=0.4),
+        Verifier(Acceptance(1e-4)),
+    )
     registration = Registration(method, refinement, judge)
     done = registration.register(*maps_of(pair), np.random.default_rng(1))
     estimated = as_aligner(method).align(*maps_of(pair), np.random.default_rng(1))
     refined = refinement.refine(Pairs(*maps_of(pair)), estimated.T_a_b)
     if np.isnan(estimated.T_a_b).any():
         refined = replace(refined, reason=estimated.reason)
-    verdict = judge.on(Pairs(*maps_of(pair))).judge(refined)
+    verdict = judge.on(Pairs(*maps_of(pair))).verify(refined)
     assert_same(done.estimated, estimated)
     assert_same(done.refined, refined)
     assert done.verdict == pytest.approx(verdict) or done.verdict == verdict
@@ -227,7 +239,7 @@ def test_what_chance_would_give_is_refused_when_applied():
     assert done.refined.ok
     assert done.applied.status is Status.REFUSED
     assert done.applied.reason == done.verdict.reason != ""
-    trusting = Registration(Ransac(), judge=None)
+    trusting = Registration(Ransac(), verifier=None)
     assert trusting.register(*maps_of(pair), np.random.default_rng(0)).applied.ok
 
 
@@ -268,7 +280,7 @@ def test_equal_fits_are_one_answer_and_others_are_not():
         replace(first, refusal="unsure"),
     ]
     aligner = as_aligner(Answers(fits))
-    again = [aligner.align_again(pairs, rng) for _ in fits]
+    again = [aligner.align_pairs(pairs, rng) for _ in fits]
     for fit, found in zip(fits, again, strict=True):
         assert_same(found, as_aligner(Answers([fit])).align(*maps_of(pair), rng))
     covariances = [found.covariance.tobytes() for found in again]
@@ -284,15 +296,15 @@ def test_the_height_gate_and_needs_of_each_method_are_its_own():
     raised = replace(pair.map_b, position_m=pair.map_b.position_m + np.array([0, 0, 5.0]))
     pairs, everyone = Pairs(pair.map_a, raised, pair.correspondences), np.ones(50, bool)
     rng, plain = np.random.default_rng(0), Answers([Fit(pair.T_a_b, everyone)])
-    assert as_aligner(plain).align_again(pairs, rng).ok
+    assert as_aligner(plain).align_pairs(pairs, rng).ok
     gated = Answers([Fit(pair.T_a_b, everyone)])
     gated.height = HeightGate()
-    assert "heights of 0" in as_aligner(gated).align_again(pairs, rng).reason
+    assert "heights of 0" in as_aligner(gated).align_pairs(pairs, rng).reason
     assert not gated.given
     wants = Answers([Fit(pair.T_a_b, everyone)])
     wants.needs = Needs(51)
-    assert "51 are needed" in as_aligner(wants).align_again(pairs, rng).reason
-    assert as_aligner(plain).align_again(pairs, rng).ok
+    assert "51 are needed" in as_aligner(wants).align_pairs(pairs, rng).reason
+    assert as_aligner(plain).align_pairs(pairs, rng).ok
     assert [len(given) for given in plain.given] == [50, 50]
 
 
@@ -326,25 +338,25 @@ def test_a_refusal_tells_what_about_the_maps_explains_it():
 
 
 @dataclass
-class CountedJudge:
+class CountedVerifier:
     """Keeps what it was asked to judge."""
 
     asked: list = field(default_factory=list)
 
     def on(self, pairs, known):
-        self.ready = Judge().on(pairs, known)
+        self.ready = Verifier().on(pairs, known)
         return self
 
-    def judge(self, alignment):
+    def verify(self, alignment):
         self.asked.append(alignment)
-        return self.ready.judge(alignment)
+        return self.ready.verify(alignment)
 
 
 def test_methods_on_one_pair_share_what_completes_their_estimates():
     pair = given_pairs(np.random.default_rng(8), 60, 0.8, 0.02)
     methods = [make_aligner(name) for name in ("ransac", "icp", "impicp", "clique", "gnc")] * 2
-    refinement, judge = CountedRefinement(), CountedJudge()
-    verifier = EstimateVerifier(Pairs(*maps_of(pair)), refinement, judge)
+    refinement, judge = CountedRefinement(), CountedVerifier()
+    verifier = VerifiedRefinement(Pairs(*maps_of(pair)), refinement, judge)
     motions, refined = set(), set()
     for k, method in enumerate(methods):
         rng, same_rng = np.random.default_rng(k), np.random.default_rng(k)
@@ -363,8 +375,8 @@ def test_what_becomes_the_same_is_judged_once_and_what_differs_by_itself():
     pair = given_pairs(np.random.default_rng(8), 60, 1.0, 0.02)
     motions = [pair.T_a_b + np.array([k * 0.01, 0, 0]) for k in range(6)]
     fits = [Fit(T, np.ones(60, bool)) for T in motions]
-    method, refinement, judge = Answers(fits), CountedRefinement(), CountedJudge()
-    verifier = EstimateVerifier(Pairs(*maps_of(pair)), refinement, judge)
+    method, refinement, judge = Answers(fits), CountedRefinement(), CountedVerifier()
+    verifier = VerifiedRefinement(Pairs(*maps_of(pair)), refinement, judge)
     answer, _ = verifier.verify(as_aligner(method).align(*maps_of(pair), None))
     refinement.refine = lambda pairs, T_a_b: answer  # all to one place
     n = len(judge.asked)

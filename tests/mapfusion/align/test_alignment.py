@@ -1,13 +1,12 @@
-"""Tests of `mapfusion.align.method`: extent of landmarks against its definition."""
+"""Tests of `mapfusion.align.alignment`: extent of landmarks against its definition."""
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapfusion.align import method as module
-from mapfusion.align.alignment import Pairs
+from mapfusion.align import alignment as module
+from mapfusion.align.alignment import SHAPE_FALSE_ALARM, Pairs, lacks_extent, why_angle_is_open
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.align.method import SHAPE_FALSE_ALARM, lacks_extent, why_angle_is_open
 from tests.mapfusion.align.map_pairs import covariances, landmarks
 
 

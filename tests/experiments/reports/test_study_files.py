@@ -1,3 +1,5 @@
+"""Tests of the files that studies write."""
+
 import csv
 from io import StringIO
 from pathlib import Path
@@ -48,7 +50,7 @@ def test_screen_files_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def test_eighty_columns_hold_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The longest name, verdicts, and maps without common ground: nothing is cut."""
+    """Nothing is cut: the longest name, verdicts, and maps without common ground fit."""
     methods = {"ransac_mahalanobis": (1.0, 0.1, 0.0), "icp": (8.0, 0.8, 0.4)}
     made = {seed: tables_of(seed, methods=methods) for seed in range(8)}
     for seed in (6, 7):
@@ -178,7 +180,7 @@ def test_quantiles_of_groups_along_the_count() -> None:
 
 
 def test_memory_does_not_grow_with_the_rows_of_a_run(tmp_path: Path) -> None:
-    """What is kept of a run is one row per map and method, however often it was repeated."""
+    """A run is reduced to one row per map and method, whatever the number of repetitions."""
     folder = write_result(tmp_path, 0, tables_of(0, repetitions=50))
     runs = find_runs([folder])
     summary = summarise(runs)

@@ -1,1 +1,0 @@
-"""Adapters for aligners of other packages, one per module (extra `[peers]`)."""
