@@ -286,7 +286,7 @@ class EvaluatedRun:
 
         Args:
             jobs: number of processes.
-            on_progress: is told of finished tasks.
+            on_progress: called with the number of finished tasks.
             only: stages that are needed; empty for all stages.
 
         Raises:

@@ -264,7 +264,7 @@ def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.Da
     T_true = se2.between(T_world_map[a], T_world_map[b])
     errors_of_team = np.full((2, len(a)), np.nan)
     for T_first_map in _placements(team):
-        found = np.stack(motion_errors(se2.between(T_first_map[a], T_first_map[b]), T_true))
-        errors_of_team = np.where(np.isfinite(found), found, errors_of_team)
+        known = np.stack(motion_errors(se2.between(T_first_map[a], T_first_map[b]), T_true))
+        errors_of_team = np.where(np.isfinite(known), known, errors_of_team)
     translation_m, rotation_rad = errors_of_team
     return rows.assign(team_translation_error_m=translation_m, team_rotation_error_rad=rotation_rad)

@@ -252,7 +252,7 @@ def run_scenario(
         scenario: the scenario.
         results: folder of results and of the store.
         jobs: number of processes.
-        on_progress: is told of finished tasks.
+        on_progress: called with the number of finished tasks.
         fresh: discard stored stages first.
         output: folder of the result; `results/NAME-SEED` by default.
         on_written: is called as by `write_result`.

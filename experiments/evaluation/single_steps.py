@@ -14,7 +14,7 @@ from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.align import estimate_row
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.pipeline.stages.features import render_frame
-from experiments.pipeline.stages.log import measured_odometry, told_tilt
+from experiments.pipeline.stages.log import measured_odometry, measured_tilt
 from experiments.pipeline.stages.pipeline import SimulatedRobotStages
 from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tasks import OnProgress
@@ -280,7 +280,7 @@ def write_drives(
         output: folder of the datasets.
         results: folder of the store.
         jobs: number of processes.
-        on_progress: is told of finished tasks and frames.
+        on_progress: called with the number of finished tasks and frames.
 
     Returns:
         The paths that `mapfusion import` reads.
@@ -327,7 +327,7 @@ def _stereo_drive(
         measured_odometry(robot.log.settings, trajectory),
         pair,
         None if tilts is None else tilts[index],
-        told_tilt(robot.observed.settings, trajectory),
+        measured_tilt(robot.observed.settings, trajectory),
     )
 
 
@@ -343,7 +343,7 @@ def calibrate_logs(
         logs: folders of logs, one for each robot.
         output: folder of the corrected logs; None writes nothing.
         settings: settings of the filter and of the smoother.
-        on_progress: is told of finished frames and steps.
+        on_progress: called with the number of finished frames and steps.
 
     Raises:
         InputError: a log cannot be read or calibrated, or a corrected log cannot be written.

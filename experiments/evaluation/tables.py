@@ -304,12 +304,12 @@ def require_as_written(result: Path) -> None:
 
 
 def _checked(path: Path, what: str, model: type[BaseModel]) -> dict[str, Any]:
-    found = read_json(path, what)
-    require_version(path, found, RESULT_SCHEMA_VERSION)
+    content = read_json(path, what)
+    require_version(path, content, RESULT_SCHEMA_VERSION)
     try:
-        model.model_validate(found)
+        model.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(map(str, first["loc"]))
         raise DamagedFileError(path, f"{field}: {first['msg']} (expected a {what})") from error
-    return found
+    return content

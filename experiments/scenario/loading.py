@@ -314,7 +314,7 @@ def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:
             for name, problem in ((cause.name, cause.problem), *cause.also):
                 yield Problem((*location, *_parts(name)), problem)
         elif isinstance(cause, ContradictingSections):
-            yield from map(_told, cause.problems)
+            yield from map(_problem_of_line, cause.problems)
         elif each["type"] in _UNKNOWN:
             yield Problem(location, _about_unknown(location, _known_keys(kind)))
         elif each["type"] != "value_error" and not isinstance(each["input"], dict):
@@ -338,10 +338,10 @@ def _contradictions(
             if name in data
             else field.get_default(call_default_factory=True)
         )
-    yield from map(_told, broken_rules(kind.RULES, sections))
+    yield from map(_problem_of_line, broken_rules(kind.RULES, sections))
 
 
-def _told(line: str) -> Problem:
+def _problem_of_line(line: str) -> Problem:
     """Split a line of a rule into the key at its beginning and the text."""
     name, _, text = line.partition(": ")
     section, _, metric = name.partition(".")
@@ -419,8 +419,8 @@ def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, A
 
 def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]) -> str:
     """Return a message with the known names and the most similar ones."""
-    if told := _RETIRED.get(".".join(map(str, location))):
-        return f"retired; {told}"
+    if replacement := _RETIRED.get(".".join(map(str, location))):
+        return f"retired; {replacement}"
     *above, wrong = location
     beside = [path for path in known if len(path) == len(location)]
     for i, part in enumerate(above):

@@ -50,26 +50,26 @@ def run_observed(settings: ObservedSettings, job: Job) -> None:
     If the robot's body sways, its measured attitude levels the observations and is written too.
     """
     observer = Observer.of(settings.camera, settings.vision)
-    told = told_tilt(settings, read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE))
-    levelling = None if told is None else AttitudeEstimator()
+    tilt_rad = measured_tilt(settings, read_trajectory(job.inputs["drive"] / TRAJECTORY_FILE))
+    levelling = None if tilt_rad is None else AttitudeEstimator()
     # the floor is level, so the height is known
     sigma = np.array([settings.attitude.sigma_rad, settings.attitude.sigma_rad, 0.0])
     observed, truth, tracks = [], [], []
-    kept = range(settings.images_at, settings.images_at + settings.images)
+    with_images = range(settings.images_at, settings.images_at + settings.images)
     frames = read_features(job.inputs["features"], settings.n_frames)
-    for iteration, (found, points) in enumerate(frames):
-        if levelling is None or told is None:
-            frame = observer.observe(found)
+    for iteration, (extracted, points) in enumerate(frames):
+        if levelling is None or tilt_rad is None:
+            frame = observer.observe(extracted)
             observed.append(frame.observations)
         else:
-            measured = AttitudeMeasurement(np.array([*told[iteration], 0.0]), sigma)
+            measured = AttitudeMeasurement(np.array([*tilt_rad[iteration], 0.0]), sigma)
             turn = levelling.expected_turn(measured)
-            frame = observer.observe(found, R_after_before=turn)
+            frame = observer.observe(extracted, R_after_before=turn)
             levelling.add(frame.tracks.motion, measured)
             observed.append(levelling.to_level_frame(frame.observations))
         state = frame.tracks
-        truth.append(points.at(state.uv_px - found.uv_px)[frame.rows])
-        if iteration in kept:
+        truth.append(points.at(state.uv_px - extracted.uv_px)[frame.rows])
+        if iteration in with_images:
             seen = pd.DataFrame(state.uv_px, columns=pd.Index(["u_px", "v_px"]))
             seen = seen.assign(robot=settings.robot, iteration=iteration)
             tracks.append(seen.assign(track=state.track_id, length=state.length))
@@ -82,7 +82,7 @@ def run_observed(settings: ObservedSettings, job: Job) -> None:
 OBSERVED_STAGE = StageKind("observed", _LABEL, run_observed, (*_LOGGED, "tracks.parquet"))
 
 
-def told_tilt(settings: ObservedSettings, trajectory: Trajectory) -> Float | None:
+def measured_tilt(settings: ObservedSettings, trajectory: Trajectory) -> Float | None:
     """Return measured roll and pitch (T, 2); None if the robot assumes a level body."""
     if trajectory.tilt_rad is None or not settings.attitude.measured:
         return None

@@ -154,7 +154,7 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
         own["radiometry"] = robot.radiometry or scenario.radiometry
         own["odometry"] = robot.odometry or scenario.odometry
         chunks, to_find = features.chunks(n_frames), own | {"vision": finding}
-        found = _stage(
+        extracted = _stage(
             features.FEATURES_STAGE,
             scenario,
             render,
@@ -163,14 +163,16 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
             before=before,
             parts=chunks,
         )
-        to_track, images = own | {"vision": tracking}, {"drive": driven, "features": found}
+        to_track, images = own | {"vision": tracking}, {"drive": driven, "features": extracted}
         tracked = _stage(log.OBSERVED_STAGE, scenario, keep, own=to_track, before=images)
         logged = _stage(
             log.LOG_STAGE, scenario, own=own, before={"drive": driven, "observed": tracked}
         )
         mapped = _slam(scenario, logged)
         smoothed = _smooth(scenario, logged, mapped, n_frames, n_frames)
-        yield SimulatedRobotStages(robot.name, n_frames, logged, mapped, smoothed, found, tracked)
+        yield SimulatedRobotStages(
+            robot.name, n_frames, logged, mapped, smoothed, extracted, tracked
+        )
 
 
 def _recorded(scenario: Recording) -> Iterable[RobotStages]:

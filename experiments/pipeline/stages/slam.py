@@ -107,18 +107,18 @@ def evaluated_iterations(n_frames: int, every: int) -> list[int]:
 def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
     log = read_log(job.inputs["log"])
-    found = check_log(log, settings.filter.motion)
+    checked = check_log(log, settings.filter.motion)
     known = read_odometry_covariance(job.inputs["log"], len(log))
-    log, covariance = without_jumps(log, found.jumps, known)
+    log, covariance = without_jumps(log, checked.jumps, known)
     last = len(log) - 1
     steps = list[dict[str, float]]()
     maps, associations, clouds, paths = _Rows(), _Rows(), _Rows(), _Rows()
     counted = np.empty(0, dtype=np.int64)
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
-    told = covariance, read_attitude(job.inputs["log"], len(log))
+    measured = covariance, read_attitude(job.inputs["log"], len(log))
     filtered = run_log(
-        log, settings.filter, rng, iterations, settings.min_count, *told, viewing=False
+        log, settings.filter, rng, iterations, settings.min_count, *measured, viewing=False
     )
     for frame in filtered:
         k, result = frame.iteration, frame.result
@@ -149,8 +149,8 @@ def run(settings: SlamSettings, job: Job) -> None:
     for file, table_schema, rows in zip(WRITES[:-1], schemas, tables, strict=True):
         write_table(job.output / file, rows, table_schema, evaluated)
     gate = gate_finding(log, counted)
-    findings = [*found.findings, *([] if gate is None else [gate])]
-    write_findings(job.output, findings, found.jumps)
+    findings = [*checked.findings, *([] if gate is None else [gate])]
+    write_findings(job.output, findings, checked.jumps)
 
 
 SLAM_STAGE = StageKind("slam", "FastSLAM", run, WRITES)

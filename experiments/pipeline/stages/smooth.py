@@ -139,7 +139,7 @@ def smooth_log(
     If the log cannot be smoothed, the map is None and the path is empty.
     """
     try:
-        found = smooth(log, landmark, path, settings.smoother, settings.max_memory_gb)
+        smoothed_log = smooth(log, landmark, path, settings.smoother, settings.max_memory_gb)
     except MemoryError as error:
         reason = f"smoothing {error}: smooth.max_memory_gb is {settings.max_memory_gb:g}"
     except np.linalg.LinAlgError as error:
@@ -148,10 +148,10 @@ def smooth_log(
             "slam.filter.motion states of its odometry, differ by too many orders of magnitude"
         )
     else:
-        ended = (found.n_steps, *found.tails, found.observation_scale, "")
+        ended = (smoothed_log.n_steps, *smoothed_log.tails, smoothed_log.observation_scale, "")
         try:
-            made = smoothed_map(log, found, attitude=attitude)
-            return made, found.estimate.path, found.landmark, ended
+            made = smoothed_map(log, smoothed_log, attitude=attitude)
+            return made, smoothed_log.estimate.path, smoothed_log.landmark, ended
         except np.linalg.LinAlgError:
             reason = "has a map whose covariance cannot be computed"
     return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, reason)
