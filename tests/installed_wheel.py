@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import pytest
 
-from experiments.pipeline.code_version import source_hash
+from experiments.pipeline.stage import source_hash
 from mapfusion.errors import install_command
 from tests.helpers.tiny_scenario import TINY
 
@@ -138,7 +138,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_is_the_same_program(installed: Installed) -> None:
-    code = "import sim; from experiments.pipeline.code_version import *; print(sim, source_hash())"
+    code = "import sim; from experiments.pipeline.stage import *; print(sim, source_hash())"
     told = installed.answer("python", "-c", code)
     assert str(installed.environment) in told
     assert source_hash() in told  # no file is missing, and none of other packages is among them

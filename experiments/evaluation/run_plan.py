@@ -11,9 +11,9 @@ from pathlib import Path
 
 from experiments.evaluation import tables
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.result_files import read_scenario
+from experiments.evaluation.tables import read_scenario
 from experiments.pipeline.stage import Stage
-from experiments.pipeline.stages.memory import process_bytes, require_memory
+from experiments.pipeline.stages.pipeline import process_bytes, require_memory
 from experiments.pipeline.store import Store
 from experiments.pipeline.tasks import task_names
 from experiments.scenario.loading import scenario_of

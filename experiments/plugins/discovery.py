@@ -19,11 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.plugins.isolated_process import (
-    IsolatedAligner,
-    ProcessFailedError,
-    process_for,
-)
+from experiments.plugins.isolated_process import IsolatedAligner, ProcessFailedError, process_for
 from mapfusion.align.aligners import ALIGNERS, PEERS, construct
 from mapfusion.errors import did_you_mean, not_installed
 from mapfusion.verification.registration import Aligner, as_aligner
