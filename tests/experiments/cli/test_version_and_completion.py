@@ -44,7 +44,7 @@ def test_the_shell_completes_commands() -> None:
         ("experiments.cli.main", "numpy numba scipy pandas cv2 matplotlib pydantic"),
         ("experiments.scenario.suite, sim.plan_generator", "numba scipy pandas cv2 pyarrow"),
         ("experiments.reports.inspect", "numba scipy.linalg pandas cv2 mapfusion.vision"),
-        ("experiments.scenario.loading", "numba scipy.linalg pandas matplotlib"),
+        ("experiments.scenario.loading", "numba scipy.special scipy.linalg pandas matplotlib"),
     ],
 )
 def test_a_command_imports_no_library_that_it_does_not_use(module: str, slow: str) -> None:
