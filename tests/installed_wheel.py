@@ -211,7 +211,8 @@ def test_logs_become_maps_that_are_aligned_and_merged(installed: Installed, reco
 
 def test_a_recording_is_imported(installed: Installed, recorded: Path) -> None:
     folder = recorded / "pictures" / "R1"
-    installed.answer("mapfusion", "import", "kitti", folder, "-o", "imported")
+    command = ("import", "kitti", folder, "--odometry", "images", "-o", "imported")
+    installed.answer("mapfusion", *command)
     assert [*(installed.folder / "imported").rglob("observations.parquet")]
 
 
