@@ -51,6 +51,7 @@ from experiments.reports.report.charts import (
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
+from experiments.reports.study_files import claims_table
 from experiments.reports.terminal.run_screen import images_by, team_lines
 from experiments.scenario.settings import Bound
 from experiments.studies.comparison import (
@@ -62,6 +63,7 @@ from experiments.studies.comparison import (
 )
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
+from experiments.studies.paper_claims import SCENARIOS, compare_with_paper
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
 from mapfusion.errors import InputError, install_command
@@ -208,7 +210,17 @@ def contents_of(path: Path) -> dict[str, Any]:
         charts = {"errors": None, "success": None, "times": time_figure(times, styles)}
         absent = [name for name, label in data.labels.items() if label != name]
         own |= {"charts": own["charts"] | charts, "absent": absent, "outcomes": ()}
-        return own | common | {"no_truth": True, "ranking": None, "styles": styles}
+        claims: list[dict[Any, Any]] = []
+        return (
+            own
+            | common
+            | {
+                "no_truth": True,
+                "ranking": None,
+                "styles": styles,
+                "claims": claims,
+            }
+        )
     assert reduced is not None
     maps = reduced.maps
     if data is None:
@@ -246,8 +258,16 @@ def contents_of(path: Path) -> dict[str, Any]:
             "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
             "settings": setting_columns(maps),
             "styles": styles,
+            "claims": _claims(runs),
         }
     )
+
+
+def _claims(runs: Runs) -> list[dict[Any, Any]]:
+    """Return the table of the paper's claims for runs of the paper's experiment; else nothing."""
+    if not set(SCENARIOS) & set(runs.described["scenario"]):
+        return []
+    return claims_table(compare_with_paper([runs])).to_dict("records")
 
 
 def _page_styles(aligners: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -304,7 +324,8 @@ def _compared_settings(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
 def _of_result(data: ResultTables) -> dict[str, Any]:
     """Return the title and the sections of a result; a section without its tables is empty."""
     outcomes: list[Outcome] = []  # of this run alone
-    needed = set(metrics.USED_TABLES) - {"smoother", "fusers"}  # older results lack these two
+    # older results lack some tables
+    needed = set(metrics.USED_TABLES) - {"smoother", "fusers", "sightings"}
     if all(map(data.has, needed)):
         used = {name: data.rows(name).assign(seed=0) for name in metrics.USED_TABLES}
         for metric, bound in data.scenario.get("expect", {}).items():
@@ -348,7 +369,7 @@ def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
                 size = dict(zip(("width", "height"), picture.size, strict=True))
             png = base64.b64encode(data).decode()
             how = _OF_FUSERS.get(name, "")
-            yield {"about": caption(name), "how": how, "png": png, **size}
+            yield {"about": caption(name, file.parent), "how": how, "png": png, **size}
 
 
 _PAGE = Path(__file__).parent / "page"

@@ -46,6 +46,20 @@ def quiet(stage: str, done: int, total: int) -> None:
     del stage, done, total
 
 
+def test_landmarks_without_a_partner_change_nothing_else() -> None:
+    alone, among = (
+        synthetic_pair(60, 0.5, np.random.default_rng(3), share) for share in (0.0, 0.75)
+    )
+    assert (len(alone.map_a), len(among.map_a), len(among.map_b)) == (60, 240, 240)
+    for name in ("index_a", "index_b", "distance"):
+        left, right = (getattr(each.correspondences, name) for each in (alone, among))
+        np.testing.assert_array_equal(left, right)
+    np.testing.assert_array_equal(among.map_a.position_m[:60], alone.map_a.position_m)
+    in_frame_b = se2.transform_points(se2.inverse(among.T_a_b), among.map_a.position_m[60:])
+    for own in (in_frame_b, among.map_b.position_m[60:]):
+        assert kstest(own[:, 0], "uniform", (-SIZE_M / 2, SIZE_M)).pvalue > 1e-3
+
+
 def test_good_and_bad_methods_are_told_apart(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
     trials = run_benchmark(SMALL, Store(tmp_path), lambda *now: told.append(now))
