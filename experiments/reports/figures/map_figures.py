@@ -114,8 +114,10 @@ def choose_two_maps(data: ResultTables) -> tuple[list[str], int, str]:
     which this holds, a window after the closure. Else the first two robots at the end are chosen.
 
     Raises:
-        NothingToDraw: no robot has a landmark.
+        NothingToDraw: no robot has a landmark, or the result has no history of maps.
     """
+    if not data.has("map_history"):
+        raise NothingToDraw("made before the maps of all iterations were stored: run it again")
     history = data.table("map_history")
     robots = [robot for robot in data.robots if (history["robot"] == robot).any()]
     if not robots:

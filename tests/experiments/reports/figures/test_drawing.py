@@ -170,7 +170,7 @@ def test_the_two_maps_are_drawn_in_one_scale(trio_result: Path) -> None:
     spans = [[np.ptp(a.get_xlim()), np.ptp(a.get_ylim())] for a in figure.axes]
     np.testing.assert_allclose(spans[0], spans[1])
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert [label for label in labels if re.search(r"particles at the end, spread x\d+", label)]
+    assert [label for label in labels if re.search(r"particles at k = \d+, spread x\d+", label)]
     assert all("(seen 3 times or more)" in axes.get_title() for axes in figure.axes)
 
 
@@ -262,13 +262,14 @@ def test_a_figure_is_begun_once_all_that_it_reads_is_written(tmp_path: Path) -> 
     pool: Any = _Asked()
     drawing = Drawing(pool)
     begun = []
-    for part in ("tracks", "fusers", "paths", "robots", "clouds", "robots", "scenario"):
+    parts = ("tracks", "fusers", "paths", "robots", "sightings", "clouds", "robots", "scenario")
+    for part in parts:
         drawing.written(tmp_path, part)
         begun.append(list(pool.tags))
     with_fusers = ["fig11_fusers"]
     with_robots = [*with_fusers, "fig01_tracks"]
     with_clouds = [*with_robots, "fig03_dispersion"]
-    assert begun == [[], with_fusers, with_fusers, with_robots, *[with_clouds] * 3]
+    assert begun == [[], *[with_fusers] * 2, *[with_robots] * 2, *[with_clouds] * 3]
 
 
 def test_what_is_not_written_yet_is_not_read(trio_result: Path) -> None:
