@@ -1,12 +1,17 @@
 """Pioneer P3-AT: a skid-steered robot with four driven wheels."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se3 import from_planar, quaternions
-from sim.world import BODY, GROUND, WHEEL, World
+
+if TYPE_CHECKING:  # users of the dimensions need no world
+    from sim.world import World
 
 URDF = Path(__file__).with_name("p3at.urdf")
 WHEEL_RADIUS_M = 0.111
@@ -42,6 +47,8 @@ class P3at:
     def __init__(
         self, world: World, T_world_robot: Float, tire_friction: float = TIRE_FRICTION
     ) -> None:
+        from sim.world import BODY, GROUND, WHEEL
+
         self._p, self._client = world.bullet, world.client
         # without the flag PyBullet replaces the URDF's inertias by those of the collision shapes
         self.body = self._p.loadURDF(

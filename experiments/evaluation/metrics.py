@@ -36,6 +36,7 @@ from experiments.evaluation.criteria import (
     rms,
     summarise_alignments,
 )
+from experiments.evaluation.loop_closures import loop_closures
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import FUSER_METRICS, AnyScenario, Bound
 from experiments.scenario.suite import scenarios_of
@@ -44,7 +45,7 @@ from mapfusion.errors import InputError
 # The four methods of the paper, algorithm 1 in both readings, as the default list names them.
 PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
 USED_TABLES = ("robots", "errors", "fusion", "map_fits", "fused_motions", "team", "team_pairs")
-USED_TABLES += ("smoother", "fusers")
+USED_TABLES += ("smoother", "fusers", "sightings")
 MERGED_ROBOTS = "team.merged_robots"
 WITHOUT_TRUTH = (MERGED_ROBOTS,)  # metrics that need no truth
 
@@ -82,6 +83,28 @@ def _path_rmse_m(tables: Tables, which: str) -> float:
 def path_over_odometry(tables: Tables) -> float:
     """Return the path RMSE of FastSLAM over that of odometry (ratio of the medians)."""
     return METRICS["path_rmse_m"](tables) / METRICS["odometry_rmse_m"](tables)
+
+
+@metric()
+def effective_sample_size(tables: Tables) -> float:
+    """Return the effective sample size of the filter, median over frames, robots and seeds."""
+    return tables["robots"]["effective_sample_size"].median()
+
+
+@metric()
+def spread_after_closure(tables: Tables) -> float:
+    """Return the spread of the particles after a loop closure over that before it.
+
+    Of each seed, the closure with the largest fall counts, as in figure 3; the value is the largest
+    over seeds.
+    """
+    falls = []
+    for seed, sightings in tables["sightings"].groupby("seed"):
+        robots = tables["robots"]
+        closures = loop_closures(sightings, robots[robots["seed"] == seed])
+        ratios = [each.after_m / each.before_m for each in closures if each.before_m > 0]
+        falls += [min(ratios)] if ratios else []
+    return max(falls, default=np.nan)
 
 
 _SMOOTHER = ("path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share")
@@ -194,6 +217,13 @@ def estimated_translation_m(tables: Tables, aligner: str) -> float:
     """Return the median translation error before refinement, for answerable pairs."""
     maps = summarise_alignments(criteria.answerable(_of(tables["errors"], aligner)))
     return maps["translation_error_m"].median()
+
+
+@metric()
+def largest_translation_m(tables: Tables, aligner: str) -> float:
+    """Return the largest translation error before refinement, for mergeable pairs."""
+    rows = criteria.mergeable(_of(tables["errors"], aligner))
+    return criteria.absolute_errors(rows, ["translation_error_m"])["translation_error_m"].max()
 
 
 @metric()

@@ -26,6 +26,7 @@ from experiments.evaluation.fused_landmarks import (
     map_history_rows,
     true_pair_rows,
 )
+from experiments.evaluation.loop_closures import sighting_rows
 from experiments.evaluation.map_errors import (
     EvaluatedFusion,
     SmoothedRobot,
@@ -43,6 +44,7 @@ from experiments.evaluation.truth import EvaluatedRobot
 from experiments.pipeline.stage import library_versions
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
+from experiments.pipeline.stages.slam import stored_maps
 from experiments.pipeline.stages.smooth import map_files, read_smoothed_path
 from experiments.pipeline.store import (
     Store,
@@ -71,7 +73,7 @@ from sim.renderer import renderer_name
 
 TableMaker = Callable[[], Any]  # returns the rows of a table
 _SLOW = ("fused_map", "fusers", "fuser_coverage")  # tables of figures that take long to compute
-_IN_NO_FIGURE = ("map_history", "fused_history", "path_statistics", "timings")
+_IN_NO_FIGURE = ("fused_history", "path_statistics", "timings")
 
 
 def all_tables(
@@ -136,6 +138,14 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
         last = max(own or smoothing, key=lambda fusion: fusion.iteration, default=None)
         return team_rows(team, paths(), None if last is None else last.fusion.T_first_map)
 
+    def sightings() -> pd.DataFrame:
+        parts = []
+        for robot in run.pipeline.robots:
+            log, last = run.logs[robot.name], stored_maps(run.robot_folders(robot), viewing=False)
+            source = last.associations.at(len(log) - 1, len(log.observations))
+            parts.append(sighting_rows(log, source).assign(robot=robot.name))
+        return pd.concat(parts, ignore_index=True)
+
     def clouds() -> pd.DataFrame:
         parts = []
         for robot in run.pipeline.robots:
@@ -175,6 +185,7 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
         "landmarks": landmarks,
         "paths": paths,
         "robots": paths,
+        "sightings": sightings,
         "clouds": clouds,
         "smoothed_paths": lambda: smoothed_path_rows(smoothed()),
         "fused": lambda: fused_landmarks.fused_rows(team),

@@ -31,7 +31,7 @@ _NAMES = {
         robot_a robot_b source stage status verdict""",
     tables.INT: """component count degrees_of_freedom frame iteration landmark landmark_a landmark_b
         n n_common n_confirmed n_contradicted n_correspondences n_inliers n_landmarks n_parents
-        n_robots n_steps n_team n_true particle repetition""",
+        n_new n_observed n_returned n_robots n_steps n_team n_tracked n_true particle repetition""",
     tables.BOOL: "accepted resampled true_pair",
 }
 # Columns of a floor plan, for figures: single precision takes half the space.
@@ -64,6 +64,11 @@ _COLUMNS = {
     # than `slam.min_count` times.
     "robots": """robot iteration path_error_m path_error_rad odometry_error_m odometry_error_rad
         effective_sample_size resampled n_landmarks spread_m""",
+    # One row per (robot, iteration): observations by the final associations of the best particle.
+    # n_tracked: those of a track that was seen before. n_new: those that created a landmark.
+    # n_returned: those of a landmark that was out of view for a while; see
+    # evaluation/loop_closures.py.
+    "sightings": "robot iteration n_observed n_tracked n_new n_returned",
     # Paths in the frame of the robot's map. final: path of the best particle at the end. online:
     # estimate at each frame. odometry: odometry alone.
     "paths": """robot iteration final_x_m final_y_m final_theta_rad

@@ -29,7 +29,6 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import POSE_FIELDS, write_whole
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import joint_path, read_map
 from mapfusion.viewing import viewing_paths
 
@@ -196,138 +195,132 @@ def write_rerun(data: ResultTables, path: Path) -> None:
     """Write the recording; raises InputError if the viewer's package is not installed."""
     if find_spec("rerun") is None:
         raise InputError(f"--format rerun: {not_installed('rerun-sdk', 'rerun')}")
-    name = data.folder.resolve().name
 
     def write(temporary: Path) -> None:
-        recording = _Recording(name, temporary)
+        recording = _Recording(data, temporary)
         for robot in data.robots:
-            _add_robot(recording, data, robot)
+            recording.add_robot(robot)
         for pair in data.pairs:
-            _add_pair(recording, data, pair)
-        # The fused map at the end, coloured by the robots that each landmark comes from, and walls
-        fused: pd.DataFrame = data.fused_map()
-        recording.at(int(data.table("paths")["iteration"].max()))
-        position = fused[["x_m", "y_m", "z_m"]].to_numpy(np.float64)
-        several = fused["n_parents"].to_numpy() > 1
-        recording.points("fused/several", position[several], FUSED_COLOUR, _POINT_M)
-        for robot in data.robots:
-            own = ~several & (fused["robot_a"] == robot).to_numpy()
-            recording.points(f"fused/{robot}", position[own], data.colours[robot], _POINT_M)
-        walls = [_in_plan(*wall[:, :2].T) for wall in data.walls_in_frame_of(data.fused_frame)]
-        if walls:
-            recording.lines("fused/walls", walls, FUSED_COLOUR)
+            recording.add_pair(pair)
+        recording.add_fused_map()
         recording.close()
 
     write_whole(path, write)
 
 
 class _Recording:
-    """Rerun recording in a file."""
+    """Rerun recording of a result in a file."""
 
-    def __init__(self, name: str, path: Path) -> None:
+    def __init__(self, data: ResultTables, path: Path) -> None:
         rerun: Any = import_module("rerun")
-        self._rerun = rerun
+        self._data, self._rerun = data, rerun
         # A fixed identifier instead of a random one: the viewer shows a result only once.
+        name = data.folder.resolve().name
         self._stream: Any = rerun.RecordingStream(f"mapfusion {name}", recording_id=name)
         self._stream.save(path)
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
-
-    def at(self, iteration: int) -> None:
-        """Set the frame of all later entries."""
-        self._stream.set_time(_TIMELINE, sequence=iteration)
-
-    def points(self, where: str, position_m: Float, colour: str, radius_m: float) -> None:
-        """Log points, shape (N, 3)."""
-        own = self._rerun.Points3D(position_m, radii=radius_m, colors=[_rgb(colour)])
-        self._stream.log(where, own)
-
-    def lines(self, where: str, strips_m: list[Float], colour: str) -> None:
-        """Log lines, each of shape (n, 3)."""
-        own = self._rerun.LineStrips3D(strips_m, radii=_LINE_M, colors=[_rgb(colour)])
-        self._stream.log(where, own)
-
-    def image(self, where: str, png: bytes) -> None:
-        """Log a picture."""
-        own = self._rerun.EncodedImage(contents=png, media_type="image/png")
-        self._stream.log(where, own)
-
-    def features(self, where: str, uv_px: Float, labels: list[str], colour: str) -> None:
-        """Log points of a picture, shape (N, 2)."""
-        own = self._rerun.Points2D(
-            uv_px,
-            radii=_FEATURE_PX,
-            colors=[_rgb(colour)],
-            labels=labels,
-            show_labels=False,
-        )
-        self._stream.log(where, own)
 
     def close(self) -> None:
         """Write everything to the file."""
         self._stream.flush()
         self._stream.disconnect()
 
+    def add_robot(self, robot: str) -> None:
+        """Log key frames with features; path, particles and map in the robot's own frame."""
+        data, where, colour = self._data, f"robots/{robot}", self._data.colours[robot]
+        tracks = data.rows("tracks")
+        tracks = tracks[tracks["robot"] == robot]
+        for file in sorted((data.folder / "keyframes").glob(f"{robot}_[0-9]*.png")):
+            iteration = int(file.stem.removeprefix(f"{robot}_"))
+            now = tracks[tracks["iteration"] == iteration]
+            self._begin(iteration)
+            image = self._rerun.EncodedImage(contents=read_png(file), media_type="image/png")
+            self._stream.log(f"images/{robot}", image)
+            labels = [
+                f"track {t}, {n} frames" for t, n in zip(now["track"], now["length"], strict=True)
+            ]
+            features = self._rerun.Points2D(
+                now[["u_px", "v_px"]].to_numpy(np.float64),
+                radii=_FEATURE_PX,
+                colors=[_rgb(colour)],
+                labels=labels,
+                show_labels=False,
+            )
+            self._stream.log(f"images/{robot}/features", features)
+        path = _in_plan(*data.path_of(robot).T)
+        for iteration, landmarks in self._map_history(robot).items():
+            self._begin(iteration)
+            self._add_lines(f"{where}/path", [path[: iteration + 1]], colour)
+            self._add_points(f"{where}/map", landmarks, colour)
+        clouds = data.rows("clouds")
+        for iteration, cloud in clouds[clouds["robot"] == robot].groupby("iteration"):
+            self._begin(int(iteration))  # pyright: ignore[reportArgumentType]
+            position = _in_plan(cloud["x_m"].to_numpy(), cloud["y_m"].to_numpy())
+            self._add_points(f"{where}/particles", position, colour, _PARTICLE_M)
 
-def _in_plan(x_m: Float, y_m: Float, z_m: float = 0.0) -> Float:
-    """Return points at one height, shape (N, 3)."""
-    return np.column_stack([x_m, y_m, np.full(len(x_m), z_m)])
+    def add_pair(self, pair: Pair) -> None:
+        """Log both maps as aligned for the merge, their pairs, and the fused landmarks."""
+        data, where = self._data, f"pairs/{pair[0]}-{pair[1]}"
+        maps = [self._map_history(robot) for robot in pair]
+        offered = of_pair(data.rows("correspondences"), pair)
+        fused = of_pair(data.rows("fused_history"), pair)
+        for row in _merge_estimates(data, pair).to_dict("records"):
+            k = int(row["iteration"])
+            found = alignment_of(row, int(row["n_correspondences"]))
+            if not found.ok or any(k not in own for own in maps):
+                continue
+            a, b = maps[0][k], se2.transform_points(found.T_a_b, maps[1][k])
+            own = offered[offered["iteration"] == k]
+            index_a, index_b = own[["index_a", "index_b"]].to_numpy()[found.inlier].T
+            self._begin(k)
+            for robot, points in zip(pair, (a, b), strict=True):
+                self._add_points(f"{where}/{robot}", points, data.colours[robot])
+            strips = list(np.stack([a[index_a], b[index_b]], axis=1))
+            self._add_lines(f"{where}/correspondences", strips, FUSED_COLOUR)
+            now = fused[fused["iteration"] == k]
+            position = _in_plan(now["x_m"].to_numpy(), now["y_m"].to_numpy())
+            self._add_points(f"{where}/fused", position, FUSED_COLOUR)
+
+    def add_fused_map(self) -> None:
+        """Log the last fused map, coloured by the robots of each landmark, and the walls."""
+        data = self._data
+        fused: pd.DataFrame = data.fused_map()
+        self._begin(int(data.table("paths")["iteration"].max()))
+        position = fused[["x_m", "y_m", "z_m"]].to_numpy(np.float64)
+        several = fused["n_parents"].to_numpy() > 1
+        self._add_points("fused/several", position[several], FUSED_COLOUR)
+        for robot in data.robots:
+            own = ~several & (fused["robot_a"] == robot).to_numpy()
+            self._add_points(f"fused/{robot}", position[own], data.colours[robot])
+        walls = [_in_plan(*wall[:, :2].T) for wall in data.walls_in_frame_of(data.fused_frame)]
+        if walls:
+            self._add_lines("fused/walls", walls, FUSED_COLOUR)
+
+    def _map_history(self, robot: str) -> dict[int, Float]:
+        """Return the landmarks in plan, shape (N, 3), by evaluated iteration."""
+        rows = self._data.rows("map_history")
+        rows = rows[rows["robot"] == robot].sort_values(["iteration", "landmark"])
+        groups = rows.groupby("iteration")
+        return {int(k): _in_plan(own["x_m"], own["y_m"]) for k, own in groups}  # pyright: ignore[reportArgumentType]
+
+    def _begin(self, iteration: int) -> None:
+        """Set the iteration of all later entries."""
+        self._stream.set_time(_TIMELINE, sequence=iteration)
+
+    def _add_points(
+        self, where: str, position_m: Float, colour: str, radius_m: float = _POINT_M
+    ) -> None:
+        """Log points, shape (N, 3)."""
+        points = self._rerun.Points3D(position_m, radii=radius_m, colors=[_rgb(colour)])
+        self._stream.log(where, points)
+
+    def _add_lines(self, where: str, strips_m: list[Float], colour: str) -> None:
+        """Log lines, each of shape (n, 3)."""
+        lines = self._rerun.LineStrips3D(strips_m, radii=_LINE_M, colors=[_rgb(colour)])
+        self._stream.log(where, lines)
 
 
-def _add_robot(recording: _Recording, data: ResultTables, robot: str) -> None:
-    """Log key frames with features; path, particles and map in the robot's own frame."""
-    where, colour = f"robots/{robot}", data.colours[robot]
-    tracks = data.rows("tracks")
-    tracks = tracks[tracks["robot"] == robot]
-    for file in sorted((data.folder / "keyframes").glob(f"{robot}_[0-9]*.png")):
-        iteration = int(file.stem.removeprefix(f"{robot}_"))
-        now = tracks[tracks["iteration"] == iteration]
-        recording.at(iteration)
-        recording.image(f"images/{robot}", read_png(file))
-        labels = [
-            f"track {t}, {n} frames" for t, n in zip(now["track"], now["length"], strict=True)
-        ]
-        uv_px = now[["u_px", "v_px"]].to_numpy(np.float64)
-        recording.features(f"images/{robot}/features", uv_px, labels, colour)
-    path = _in_plan(*data.path_of(robot).T)
-    for iteration, landmarks in _history(data, robot).items():
-        recording.at(iteration)
-        recording.lines(f"{where}/path", [path[: iteration + 1]], colour)
-        recording.points(f"{where}/map", landmarks, colour, _POINT_M)
-    clouds = data.rows("clouds")
-    for iteration, cloud in clouds[clouds["robot"] == robot].groupby("iteration"):
-        recording.at(int(iteration))  # pyright: ignore[reportArgumentType]
-        position = _in_plan(cloud["x_m"].to_numpy(), cloud["y_m"].to_numpy())
-        recording.points(f"{where}/particles", position, colour, _PARTICLE_M)
-
-
-def _history(data: ResultTables, robot: str) -> dict[int, Float]:
-    """Return the landmarks in plan, shape (N, 3), by evaluated iteration."""
-    rows = data.rows("map_history")
-    rows = rows[rows["robot"] == robot].sort_values(["iteration", "landmark"])
-    groups = rows.groupby("iteration")
-    return {int(k): _in_plan(own["x_m"], own["y_m"]) for k, own in groups}  # pyright: ignore[reportArgumentType]
-
-
-def _add_pair(recording: _Recording, data: ResultTables, pair: Pair) -> None:
-    """Log both maps as aligned for the merge, their pairs, and the fused landmarks."""
-    maps = [_history(data, robot) for robot in pair]
-    offered = of_pair(data.rows("correspondences"), pair)
-    fused = of_pair(data.rows("fused_history"), pair)
-    where = f"pairs/{pair[0]}-{pair[1]}"
-    for row in _merge_estimates(data, pair).to_dict("records"):
-        k = int(row["iteration"])
-        found = alignment_of(row, int(row["n_correspondences"]))
-        if not found.ok or any(k not in own for own in maps):
-            continue
-        a, b = maps[0][k], transform_points(found.T_a_b, maps[1][k])
-        own = offered[offered["iteration"] == k]
-        index_a, index_b = own[["index_a", "index_b"]].to_numpy()[found.inlier].T
-        recording.at(k)
-        for robot, points in zip(pair, (a, b), strict=True):
-            recording.points(f"{where}/{robot}", points, data.colours[robot], _POINT_M)
-        strips = list(np.stack([a[index_a], b[index_b]], axis=1))
-        recording.lines(f"{where}/correspondences", strips, FUSED_COLOUR)
-        now = fused[fused["iteration"] == k]
-        position = _in_plan(now["x_m"].to_numpy(), now["y_m"].to_numpy())
-        recording.points(f"{where}/fused", position, FUSED_COLOUR, _POINT_M)
+def _in_plan(x_m: Float, y_m: Float) -> Float:
+    """Return points on the ground, shape (N, 3)."""
+    return np.column_stack([x_m, y_m, np.zeros(len(x_m))])

@@ -49,6 +49,7 @@ from sim.trajectory import AttitudeNoise
 
 # Metrics of a whole run.
 RUN_METRICS = ("path_rmse_m", "odometry_rmse_m", "path_over_odometry")
+RUN_METRICS += ("effective_sample_size", "spread_after_closure")
 RUN_METRICS += tuple(
     f"smoother.{name}"
     for name in (
@@ -83,6 +84,7 @@ ALIGNER_METRICS = (
     "refined_over_oracle",
     "estimated_over_oracle",
     "estimated_translation_m",
+    "largest_translation_m",
     "lead_over_others",
     "scatter_m",
     "false_merges",

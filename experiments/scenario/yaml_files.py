@@ -10,7 +10,6 @@ from ruamel.yaml.composer import Composer, MaxDepthExceededError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
 
 from mapfusion.errors import InputError
-from mapfusion.files import DIGEST
 
 SHIPPED = Path(__file__).with_name("shipped")  # the repository's scenarios/, also when installed
 OWN = Path("scenarios")  # shipped files name their logs relative to this folder
@@ -65,7 +64,10 @@ def read_mapping(
     if not isinstance(value, dict):
         found = "nothing" if value is None else f"a {type(value).__name__}"
         raise InputError(f"{path}: holds {found}, expected a mapping of {keys}")
-    value.pop(DIGEST, None)  # the digest of a result's scenario.json, which may have been edited
+    if text.lstrip().startswith("{"):
+        from mapfusion.files import DIGEST
+
+        value.pop(DIGEST, None)  # of a result's scenario.json, which may have been edited
     return value
 
 

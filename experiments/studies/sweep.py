@@ -106,7 +106,7 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
 
 _LONGEST_NAME = 80
 _TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
-_TABLES += ("smoother", "team", "team_pairs", "fusers")
+_TABLES += ("sightings", "smoother", "team", "team_pairs", "fusers")
 
 
 class Sweep(NamedTuple):

@@ -192,6 +192,18 @@ class ResultTables:
         """Return positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
         return positions_and_covariances(self.of_robot("landmarks", robot, "landmark"))
 
+    def plan_at(self, robot: str, iteration: int) -> tuple[Float, Float]:
+        """Return plan positions (N, 2) and covariances (N, 2, 2) of a map at an iteration.
+
+        A robot whose log ended earlier has its last map.
+        """
+        rows = self.of_robot("map_history", robot, "landmark")
+        known = rows.loc[rows["iteration"] <= iteration, "iteration"]
+        rows = rows[rows["iteration"] == known.max()]
+        xx, xy, yy = (rows[f"cov_{name}_m2"].to_numpy(np.float64) for name in ("xx", "xy", "yy"))
+        covariance = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+        return rows[["x_m", "y_m"]].to_numpy(np.float64), covariance
+
     @property
     def sightings(self) -> str:
         """Description of the number of observations that a landmark needs to enter a map."""

@@ -15,6 +15,7 @@ from experiments.reports.figures import style
 from experiments.reports.figures.result_tables import NothingToDraw
 from experiments.reports.figures.style import BLACK, GRAY
 from experiments.studies.independence_trial import STRATEGIES
+from experiments.studies.paper_claims import crossings
 from experiments.studies.refusal_cases import FEW, POSTER_RADII_M
 from experiments.studies.refusal_rates import (
     VERDICTS,
@@ -37,6 +38,9 @@ _RATIO_TICKS = (1, 2, 5, 10, 20, 50, 100)
 _RATIO_RANGE = (0.9, 11.0)  # smallest range of the axis
 _MARGIN = 1.15  # around the values drawn
 _ROWS = ("success (%)", "error over the oracle's", "time of one call (ms)")
+
+# Error against the share of false pairs
+_LEAST_ERROR_M = 1e-3
 
 # Independence
 _HEIGHT_IN = 8.6
@@ -120,6 +124,41 @@ def draw_benchmark(summary: pd.DataFrame) -> Figure:
     absent = set(summary["method"][summary["status"] == Status.ABSENT])
     labelled = {f"{m} (absent)" if m in absent else m: styles[m] for m in methods}
     style.aligner_legend(figure, labelled, columns=5)
+    return figure
+
+
+def draw_crossing(rows: pd.DataFrame) -> Figure:
+    """Draw the median error against the share of false pairs, a panel per share of unpaired ones.
+
+    Shares are spaced by their rank: the first crossing lies at a few percent. Dotted lines are the
+    shares at which the order of SVD and ICP changes.
+    """
+    unpaired = rows["unpaired_share"].unique()
+    methods = rows["method"].unique().tolist()
+    styles = style.aligner_styles(methods)
+    shares = np.sort(rows["outlier_share"].unique())
+    at = crossings(rows, "svd", "icp")
+    figure = Figure(figsize=(style.PAGE_WIDTH_IN, 3.2))
+    panels = figure.subplots(1, len(unpaired), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, of in zip(panels, unpaired, strict=True):
+        own = rows[rows["unpaired_share"] == of]
+        for method in methods:
+            line = own[own["method"] == method].sort_values("outlier_share")
+            place = np.searchsorted(shares, line["outlier_share"])
+            axes.plot(place, line["error_m"].clip(lower=_LEAST_ERROR_M), **styles[method])
+        for share in at[of]:
+            place = float(np.interp(share, shares, np.arange(len(shares))))
+            axes.axvline(place, color=BLACK, linestyle=":", linewidth=0.8)
+            text = {"xytext": (2, -9), "textcoords": "offset points", "fontsize": 7}
+            axes.annotate(
+                f"{share:.1%}", xy=(place, 1.0), xycoords=("data", "axes fraction"), **text
+            )
+        axes.set(yscale="log", xlabel="false pairs (%)")
+        axes.set_title(f"{of:.0%} of the landmarks without a partner")
+        axes.set_xticks(np.arange(len(shares)), [f"{100 * share:g}" for share in shares])
+        style.write_plainly(axes.yaxis)
+    panels[0].set_ylabel("median translation error (m)")
+    style.aligner_legend(figure, {name: styles[name] for name in methods}, 4)
     return figure
 
 

@@ -64,6 +64,7 @@ _KNOWN_ALIGNERS: dict[str, tuple[Any, ...]] = {
 _KNOWN_FUSERS: dict[str, tuple[Any, ...]] = {
     "kalman": (ORANGE, (0, (1, 1)), "D"),
     "kalman-drift": (VERMILLION, (0, (6, 1, 1, 1)), "s"),
+    "kalman_as_printed": (WINE, (0, (3, 1, 1, 1, 1, 1)), "X"),
     "covariance_intersection": (GREEN, (0, (5, 1)), "^"),
     "joint": (BLUE, "-", "o"),
     REFERENCE: (BLACK, (0, (4, 2)), "x"),

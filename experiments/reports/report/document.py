@@ -51,11 +51,19 @@ from experiments.reports.report.charts import (
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
-from experiments.reports.terminal.run_screen import team_lines
+from experiments.reports.study_files import claims_table
+from experiments.reports.terminal.run_screen import images_by, team_lines
 from experiments.scenario.settings import Bound
-from experiments.studies.comparison import natural_key
+from experiments.studies.comparison import (
+    BETTER,
+    WORSE,
+    compare_values,
+    natural_key,
+    values_by_setting,
+)
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
+from experiments.studies.paper_claims import SCENARIOS, compare_with_paper
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
 from mapfusion.errors import InputError, install_command
@@ -202,7 +210,17 @@ def contents_of(path: Path) -> dict[str, Any]:
         charts = {"errors": None, "success": None, "times": time_figure(times, styles)}
         absent = [name for name, label in data.labels.items() if label != name]
         own |= {"charts": own["charts"] | charts, "absent": absent, "outcomes": ()}
-        return own | common | {"no_truth": True, "ranking": None, "styles": styles}
+        claims: list[dict[Any, Any]] = []
+        return (
+            own
+            | common
+            | {
+                "no_truth": True,
+                "ranking": None,
+                "styles": styles,
+                "claims": claims,
+            }
+        )
     assert reduced is not None
     maps = reduced.maps
     if data is None:
@@ -214,6 +232,7 @@ def contents_of(path: Path) -> dict[str, Any]:
             "description": ", ".join(maps["scenario"].unique()),
             "spread_text": "runs; each run is the median of its repetitions",
             "charts": {"map": None},
+            "compared": list(_compared_settings(path, runs)),
         }
         groups = list(_by_configuration(reduced.medians))
     else:
@@ -239,8 +258,16 @@ def contents_of(path: Path) -> dict[str, Any]:
             "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
             "settings": setting_columns(maps),
             "styles": styles,
+            "claims": _claims(runs),
         }
     )
+
+
+def _claims(runs: Runs) -> list[dict[Any, Any]]:
+    """Return the table of the paper's claims for runs of the paper's experiment; else nothing."""
+    if not set(SCENARIOS) & set(runs.described["scenario"]):
+        return []
+    return claims_table(compare_with_paper([runs])).to_dict("records")
 
 
 def _page_styles(aligners: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -261,10 +288,44 @@ def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]
         yield ", ".join([scenario, *settings]), rows
 
 
+# Comparisons of values in the report of a sweep: each reads all tables once.
+_MOST_COMPARED = 8
+
+
+def _compared_settings(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
+    """Yield for each setting that a sweep varied what a value changes against the first one."""
+    pairs = [
+        (setting, first, other)
+        for setting, (first, *others) in values_by_setting(runs).items()
+        for other in others
+    ]
+    for setting, first, other in pairs[:_MOST_COMPARED]:
+        try:
+            found = compare_values(path, setting, first, other)
+        except InputError:  # no run with the one value matches a run with the other
+            continue
+        judged = found.table[~found.table["timed"]]
+        changed = judged[judged["verdict"].isin([BETTER, WORSE])].sort_values("p_holm")
+        counts = changed["verdict"].value_counts()
+        yield {
+            "setting": setting,
+            "first": first,
+            "other": other,
+            "n_runs": found.n_runs,
+            "unit": found.unit,
+            "n_better": int(counts.get(BETTER, 0)),
+            "n_worse": int(counts.get(WORSE, 0)),
+            "n_measures": len(judged),
+            "weak": found.n_runs < FEW_RUNS,
+            "changed": changed.to_dict("records"),
+        }
+
+
 def _of_result(data: ResultTables) -> dict[str, Any]:
     """Return the title and the sections of a result; a section without its tables is empty."""
     outcomes: list[Outcome] = []  # of this run alone
-    needed = set(metrics.USED_TABLES) - {"smoother", "fusers"}  # older results lack these two
+    # older results lack some tables
+    needed = set(metrics.USED_TABLES) - {"smoother", "fusers", "sightings"}
     if all(map(data.has, needed)):
         used = {name: data.rows(name).assign(seed=0) for name in metrics.USED_TABLES}
         for metric, bound in data.scenario.get("expect", {}).items():
@@ -279,6 +340,7 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
     return {
         "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
         "description": data.scenario.get("description", ""),
+        "compared": (),
         "spread_text": "repetitions on the same maps",
         "charts": {"map": map_figure(data, _page_styles(data.aligners))},
         "outcomes": outcomes,
@@ -307,7 +369,7 @@ def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
                 size = dict(zip(("width", "height"), picture.size, strict=True))
             png = base64.b64encode(data).decode()
             how = _OF_FUSERS.get(name, "")
-            yield {"about": caption(name), "how": how, "png": png, **size}
+            yield {"about": caption(name, file.parent), "how": how, "png": png, **size}
 
 
 _PAGE = Path(__file__).parent / "page"
@@ -357,6 +419,10 @@ def templates() -> jinja2.Environment:
     )
     environment.globals |= {"text": formatting, "criteria": criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
-    environment.globals |= {"gross_m": GROSS_M, "install_command": install_command}
+    environment.globals |= {
+        "gross_m": GROSS_M,
+        "images_by": images_by,
+        "install_command": install_command,
+    }
     environment.tests["nan"] = math.isnan
     return environment

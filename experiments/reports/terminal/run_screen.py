@@ -31,7 +31,7 @@ from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.result import renderer
 from experiments.evaluation.run_plan import RunPlan
 from experiments.evaluation.single_steps import MergeResult, final_status
-from experiments.evaluation.tables import SHOWN
+from experiments.evaluation.tables import SHOWN, read_provenance
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
 from experiments.reports.formatting import listed, metres, percent, radians, two_digits
@@ -49,6 +49,7 @@ from mapfusion.align.alignment import NOT_RUN, Status
 from mapfusion.fusion.fusers import FusedMap
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.se2 import motion_sigma
+from sim.renderer import NAMES
 
 
 def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -> Iterator[str]:
@@ -123,7 +124,7 @@ def print_plan(plan: RunPlan, results: Path, jobs: int) -> None:
     """Print the tasks of a planned run, and an estimate of its time and memory."""
     frames = sorted(set(plan.n_frames.values()))
     n_frames = f"{frames[0]}" + (f" to {frames[-1]}" if len(frames) > 1 else "")
-    n_robots, source = len(plan.n_frames), renderer(plan.scenario)
+    n_robots, source = len(plan.n_frames), images_by(renderer(plan.scenario))
     shown = columns("", name="stage") | columns("d", finished="finished", to_do="to do")
     shown |= columns(".1f", work_s="work, s")
     basis = "typical rates of two cores; this machine may need half or twice as long"
@@ -145,6 +146,16 @@ def print_plan(plan: RunPlan, results: Path, jobs: int) -> None:
             f"  It uses {basis}. Nothing was run.",
         ]
     )
+
+
+def image_source(result: Path) -> str:
+    """Say who drew the images of a result's cameras."""
+    return images_by(str(read_provenance(result / "provenance.json").get("renderer", "unknown")))
+
+
+def images_by(name: str) -> str:
+    """Say who draws images, by the name of the renderer in a result."""
+    return name.replace(NAMES["tiny"], f"PyBullet's {NAMES['tiny']}")
 
 
 def closing_lines(result: Path) -> tuple[str, str]:

@@ -8,7 +8,18 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import typer
 
+from experiments.cli.completion import (
+    complete_format,
+    complete_scenario_or_tag,
+    complete_setting,
+)
+from experiments.cli.main import app
+from experiments.reports import result_export
+from experiments.scenario.suite import entries
+from experiments.scenario.yaml_files import SHIPPED
+from mapfusion.datasets.formats import EXPORTERS
 from mapfusion.errors import DISTRIBUTION
 from tests.helpers.tiny_scenario import assert_refused, command
 
@@ -65,9 +76,37 @@ def test_the_citation_is_of_this_version() -> None:
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
 
 
-def test_the_shell_completes_commands() -> None:
-    told = asked(COMP_WORDS="mapfusion sce", COMP_CWORD="1", _MAPFUSION_COMPLETE="complete_bash")
-    assert told.split() == ["scenarios"]
+def completed(line: str) -> list[str]:
+    """What the shell offers at the end of a line."""
+    words = len(line.split(" ")) - 1
+    shell = {"COMP_WORDS": line, "COMP_CWORD": f"{words}", "_MAPFUSION_COMPLETE": "complete_bash"}
+    return asked(**shell).split()
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("mapfusion sce", ["scenarios"]),
+        ("mapfusion run qu", ["quick"]),
+        ("mapfusion run ful", ["full"]),
+        ("mapfusion align a b --aligner cli", ["clique"]),
+    ],
+)
+def test_the_shell_completes_commands_and_names(line: str, offered: list[str]) -> None:
+    assert completed(line) == offered
+
+
+def test_completed_names_are_those_that_commands_take() -> None:
+    context = typer.Context(typer.main.get_command(app), info_name="export")
+    assert complete_format(context, "") == [*result_export._FILES, result_export._RERUN]
+    context.info_name = "record"
+    assert complete_format(context, "ros") == [name for name in EXPORTERS if name.startswith("ros")]
+    keys = complete_setting("slam.filter.n_")
+    assert keys == ["slam.filter.n_particles="]
+    tags = {tag for entry in entries() for tag in entry["tags"]}
+    assert set(complete_scenario_or_tag("")) == tags | {
+        path.stem for path in SHIPPED.glob("*.yaml")
+    }
 
 
 def test_help_needs_no_library_that_computes() -> None:

@@ -14,6 +14,7 @@ import pytest
 from experiments.evaluation import metrics
 from experiments.evaluation import tables as result_tables
 from experiments.evaluation.criteria import is_false_merge
+from experiments.evaluation.loop_closures import WINDOW_FRAMES
 from experiments.evaluation.metrics import (
     ALIGNER_METRICS,
     METRICS,
@@ -77,10 +78,33 @@ def team_tables() -> dict[str, pd.DataFrame]:
     }
 
 
+# Two closures of seed 0, of which the second halves the spread, and one of seed 1.
+SPREADS = {0: (0.8, 0.6, 0.4, 0.2), 1: (0.4, 0.36)}
+
+
+def closing_robots() -> pd.DataFrame:
+    """Spread of the particles of a robot C, constant between its loop closures."""
+    parts = []
+    for seed, levels in SPREADS.items():
+        spread_m = np.repeat(levels, WINDOW_FRAMES)
+        rows = {"seed": seed, "robot": "C", "spread_m": spread_m}
+        parts.append(pd.DataFrame(rows | {"iteration": np.arange(len(spread_m))}))
+    return pd.concat(parts)
+
+
+def closing_sightings(seed: int) -> pd.DataFrame:
+    """New ground and known ground of that robot in turn."""
+    n = len(SPREADS[seed]) * WINDOW_FRAMES
+    is_known = np.arange(n) // WINDOW_FRAMES % 2 == 1
+    rows = {"seed": seed, "robot": "C", "iteration": np.arange(n)}
+    return pd.DataFrame(rows | {"n_new": 2 * ~is_known, "n_returned": 2 * is_known})
+
+
 @pytest.fixture
 def tables() -> dict[str, pd.DataFrame]:
     robots = [
         {"seed": seed, "robot": robot, "path_error_m": path, "odometry_error_m": odometry}
+        | {"effective_sample_size": 10.0 * path}
         for seed, robot, errors in (
             (0, "A", [(3, 6), (4, 8)]),  # RMS sqrt(12.5), sqrt(50)
             (0, "B", [(1, 10), (1, 10)]),  # 1, 10
@@ -121,7 +145,8 @@ def tables() -> dict[str, pd.DataFrame]:
     fits += [(0, "fused", 7.0), (1, "fused", 9.0), (2, "fused", 20.0)]
     smoother = {name: [1.0 * k, 8.0 * k, 3.0 * k, np.nan] for k, name in enumerate(SMOOTHER, 1)}
     return {
-        "robots": pd.DataFrame(robots),
+        "robots": pd.concat([pd.DataFrame(robots), closing_robots()]),
+        "sightings": pd.concat([closing_sightings(seed) for seed in (0, 1)]),
         "errors": pd.DataFrame(errors),
         "fusion": pd.DataFrame(fusion, columns=pd.Index(columns)).assign(robot_a="A", robot_b="B"),
         "map_fits": pd.DataFrame(fits, columns=pd.Index(["seed", "map", "rmse_m"])),
@@ -154,6 +179,8 @@ KNOWN = {
     "path_rmse_m": 2.0,
     "odometry_rmse_m": math.sqrt(50),
     "path_over_odometry": 2 / math.sqrt(50),
+    "effective_sample_size": 20.0,  # 10, 10, 20, 30, 40
+    "spread_after_closure": 0.36 / 0.4,  # of 0.75, 0.5; and 0.9
     "oracle_translation_m": 0.4,
     "oracle_rotation_rad": 0.03,
     "true_pairs_at_end": 50.0,
@@ -173,6 +200,8 @@ KNOWN = {
     "ransac.refined_over_oracle": 0.5 / 0.4,  # no estimate is infinitely far off
     "ransac.estimated_over_oracle": 0.7 / 0.4,
     "ransac.estimated_translation_m": 0.7,  # three maps, one of them thrice
+    "ransac.largest_translation_m": 0.9,
+    "svd.largest_translation_m": 12.1,
     "ransac.lead_over_others": 2.0,
     "svd.lead_over_others": 0.7 / 2.5,
     "ransac.scatter_m": 0.24,

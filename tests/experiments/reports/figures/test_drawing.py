@@ -15,13 +15,14 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from experiments.evaluation import tables
+from experiments.evaluation.loop_closures import LoopClosure
 from experiments.pipeline.workers import workers
 from experiments.reports.figures import drawing
 from experiments.reports.figures.drawing import FIGURES, Drawing, draw_all, draw_figure, save_figure
 from experiments.reports.figures.error_figures import draw_coverage, draw_fusers
 from experiments.reports.figures.map_figures import draw_two_maps
 from experiments.reports.figures.result_tables import ResultTables
-from experiments.reports.figures.slam_figures import choose_moments, spread_over_time
+from experiments.reports.figures.slam_figures import Moments, choose_moments, spread_over_time
 from experiments.reports.figures.style import aligner_styles, house_style
 from mapfusion.errors import InputError
 
@@ -50,7 +51,7 @@ def test_all_figures_are_drawn(trio_copy: Path) -> None:
         else:
             assert file.stat().st_size < MAX_SVG_BYTES
     assert sorted(file.name for file in (trio_copy / "figures").iterdir()) == sorted(
-        [*(file.name for file in files), "drawn.json"]
+        [*(file.name for file in files), *(f"{name}.txt" for name in FIGURES), "drawn.json"]
     )
 
 
@@ -315,15 +316,21 @@ def spreads(robot: str, values: list[float]) -> pd.DataFrame:
     return pd.DataFrame({"robot": robot, "iteration": iteration, "spread_m": values})
 
 
-def test_moments_are_the_deepest_fall_of_the_spread() -> None:
-    spread = pd.concat(
-        [spreads("R1", [0, 0.1, 0.2, 0.1, 0.3]), spreads("R2", [0, 0.3, 0.2, 0.01, 0.9, 0.8])]
-    )
-    assert choose_moments(spread) == ("R2", 10, 30)
+def test_moments_lie_before_and_after_the_closure_with_the_largest_fall() -> None:
+    closures = [
+        LoopClosure("R1", 50, 40, before_m=0.2, after_m=0.1),
+        LoopClosure("R2", 60, 40, before_m=0.3, after_m=0.1),
+    ]
+    own = [0.9, 0.1, 0.5, 0.3, 0.2, 0.4, 0.1, 0.01, 0.2, 0.3, 0.05, 0.9]
+    spread = pd.concat([spreads("R1", [0.2] * 12), spreads("R2", own)])
+    moments = choose_moments(closures, spread)
+    assert moments is not None
+    # windows: 10 to 59 with values 0.1 0.5 0.3 0.2 0.4, and 60 to 109 with 0.1 0.01 0.2 0.3 0.05
+    assert moments == Moments(closures[1], 30, 60)
 
 
-def test_particles_that_only_spread_have_no_such_moments() -> None:
-    assert choose_moments(spreads("R1", [0, 0.1, 0.2, 0.3])) is None
+def test_without_a_loop_closure_there_are_no_moments() -> None:
+    assert choose_moments([], spreads("R1", [0, 0.1, 0.3, 0.01])) is None
 
 
 def test_spread_is_the_root_mean_square_distance_from_the_mean() -> None:
