@@ -107,7 +107,6 @@ def write_benchmark(
     write_text(folder / "summary.csv", summary.to_csv(index=False))
     write_text(folder / "summary.md", benchmark_markdown(design, summary))
     provenance = {
-        "schema_version": SCHEMA_VERSION,
         "seed": design.seed,
         "trials": design.trials,
         "budget_s": design.budget_s,
@@ -116,13 +115,21 @@ def write_benchmark(
             entry.model_dump(mode="json") | {"origin": find_method(entry.method).origin()}
             for entry in design.aligners
         ],
+    }
+    _write_provenance(folder, provenance)
+    save_figure(folder, "benchmark", study_figures.draw_benchmark, summary)
+
+
+def _write_provenance(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write the content with the versions of Python and of libraries, the machine and the time."""
+    environment = {
         "python": platform.python_version(),
         "machine": platform.machine(),
         "libraries": library_versions(),
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    provenance = {"schema_version": SCHEMA_VERSION, **content, **environment}
     write_json(folder / "provenance.json", provenance)
-    save_figure(folder, "benchmark", study_figures.draw_benchmark, summary)
 
 
 def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
@@ -199,15 +206,7 @@ def write_independence(
     write_rows(folder / "costs.parquet", COSTS, found.costs)
     write_text(folder / "summary.csv", summary.to_csv(index=False))
     write_text(folder / "summary.md", independence_markdown(scenarios, summary))
-    provenance = {
-        "schema_version": SCHEMA_VERSION,
-        "scenarios": [scenario.resolved() for scenario in scenarios],
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "libraries": library_versions(),
-        "written": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-    write_json(folder / "provenance.json", provenance)
+    _write_provenance(folder, {"scenarios": [scenario.resolved() for scenario in scenarios]})
     try:
         save_figure(folder, FIGURE, study_figures.draw_independence, found.teams, found.costs)
     except NothingToDraw as reason:
