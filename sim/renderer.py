@@ -13,6 +13,7 @@ BulletRenderer = Literal["tiny", "egl"]
 Renderer = Literal["tiny", "egl", "raycast"]
 NAMES = {"tiny": "TinyRenderer", "raycast": "our ray caster"}
 PLUGIN, PLUGIN_SYMBOL = "eglRenderer", "_eglRendererPlugin"
+NEWEST_WHEEL = (3, 11)  # last version of Python with wheels of PyBullet
 PROBE_S = 60  # the first image takes a second, on a slow disk a few seconds
 NEEDED = (
     "render.renderer: egl does not work here ({reason}); it needs PyBullet's plug-in and the "
@@ -25,7 +26,10 @@ _PROBE = "from sim.renderer import probe; probe()"
 def require_pybullet() -> None:
     """Raise InputError if PyBullet is not installed; nothing is imported."""
     if importlib.util.find_spec("pybullet") is None:
-        raise InputError(f"a simulated world needs PyBullet: {not_installed('pybullet', 'sim')}")
+        how = not_installed("pybullet", "sim")
+        if sys.version_info[:2] > NEWEST_WHEEL:
+            how += " (pip compiles it for this Python, see `mapfusion docs installation`)"
+        raise InputError(f"a simulated world needs PyBullet: {how}")
 
 
 @functools.cache

@@ -50,7 +50,7 @@ def refusal(
     from experiments.scenario.seeds import parse_seeds
     from experiments.studies import refusal_rates, refusal_trial
     from experiments.studies.refusal_cases import worlds_of
-    from experiments.studies.refusal_rates import judged_answers, reliability
+    from experiments.studies.refusal_rates import answers_with_probability, reliability
     from experiments.studies.refusal_trial import PairsDrawn
 
     require_folder(output, worlds)
@@ -61,7 +61,7 @@ def refusal(
     study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
     kinds = refusal_rates.by_kind(refusals)
     study_screen.print_kinds(kinds)
-    answers = judged_answers(refusals)
+    answers = answers_with_probability(refusals)
     held = reliability(answers, np.random.default_rng(0)) if len(answers) else None
     if held is not None:
         study_screen.print_reliability(held)
@@ -208,6 +208,9 @@ def benchmark(
         list[float] | None,
         typer.Option(help="Shares of false pairs; may be repeated.", min=0, max=1),
     ] = None,
+    unpaired: Annotated[
+        float, typer.Option(help="Share of landmarks without a partner.", min=0, max=0.99)
+    ] = 0.0,
     seed: options.Seed = None,
     scenario: options.SettingsOf = None,
     budget_s: Annotated[
@@ -234,13 +237,61 @@ def benchmark(
         tuple(outliers or benchmark.OUTLIER_SHARES),
     )
     chosen_seed = settings_of(scenario, (), seed).seed
-    design = benchmark.BenchmarkDesign(entries, trials, chosen_seed, budget_s, counts, shares)
+    design = benchmark.BenchmarkDesign(
+        entries, trials, chosen_seed, budget_s, counts, shares, unpaired
+    )
     folder = output or results / "benchmark"
     with layout.progress() as show:
         rows = benchmark.run_benchmark(design, Store(results / "store"), show)
     summary = benchmark.summarise(rows)
     write_benchmark(folder, design, rows, summary)
     study_screen.print_benchmark(folder, summary)
+
+
+@studies.command()
+def paper(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="PATH...", help="Results or sweeps of paper and paper_as_printed, ten seeds."
+        ),
+    ],
+    *,
+    trials: Annotated[
+        int, typer.Option(help="Trials of each method at each share of false pairs.", min=1)
+    ] = 100,
+    output: options.OutputFolder = None,
+    results: options.Results = options.RESULTS,
+) -> None:
+    """Compare the claims of the paper with runs: `mapfusion study paper results/paper*`.
+
+    Writes a page with one row per claim: measure, value with interval over the runs, and verdict.
+    Makes trials with known shares of false pairs too; finished trials are reused.
+    """
+    from experiments.cli.options import require_folder
+    from experiments.pipeline.store import Store
+    from experiments.reports.study_files import write_claims
+    from experiments.reports.terminal import layout, study_screen
+    from experiments.studies import paper_claims
+    from experiments.studies.benchmark import run_benchmark
+    from experiments.studies.run_tables import find_runs
+    from mapfusion.errors import InputError
+
+    require_folder(output, paths)
+    values = paper_claims.compare_with_paper([find_runs(path) for path in paths])
+    if values.empty:
+        wanted = " or ".join(paper_claims.SCENARIOS)
+        raise InputError(f"{', '.join(map(str, paths))}: no run of the scenario {wanted}")
+    folder = output or results / "study-paper"
+    require_folder(folder)
+    with layout.progress() as show:
+        trials_of = {
+            design.unpaired_share: run_benchmark(design, Store(results / "store"), show)
+            for design in paper_claims.crossing_designs(trials)
+        }
+    study_screen.print_claims(values)
+    crossing = paper_claims.crossing_rows(trials_of)
+    layout.print_paths(folder, write_claims(folder, values, crossing))
 
 
 @studies.command()
@@ -299,7 +350,7 @@ def calibrate(
 ) -> None:
     """Calibrate and correct odometry of logs: `mapfusion study calibrate raw/robot* -o logs`."""
     from experiments.cli.options import require_folder
-    from experiments.evaluation.odometry_calibration import calibrate_logs
+    from experiments.evaluation.single_steps import calibrate_logs
     from experiments.reports import export
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import fused_landmarks, tables
-from experiments.evaluation.alignment_errors import EvaluatedRobot
+from experiments.evaluation.alignment_errors import ALIGNED
 from experiments.evaluation.evaluated_run import TABLES_PART, EvaluatedRun, finding_rows
 from experiments.evaluation.fused_landmarks import (
     FusedTeam,
@@ -26,15 +26,25 @@ from experiments.evaluation.fused_landmarks import (
     map_history_rows,
     true_pair_rows,
 )
-from experiments.evaluation.fused_map_errors import EvaluatedFusion, coverage_rows
-from experiments.evaluation.pair_evaluation import ALIGNED
-from experiments.evaluation.path_errors import path_statistics_rows, robot_paths
-from experiments.evaluation.result_files import RESULT_SCHEMA_VERSION, require_tables
-from experiments.evaluation.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
-from experiments.evaluation.team_errors import team_pair_rows, team_rows
-from experiments.pipeline.code_version import library_versions
+from experiments.evaluation.loop_closures import sighting_rows
+from experiments.evaluation.map_errors import (
+    EvaluatedFusion,
+    SmoothedRobot,
+    coverage_rows,
+    smoothed_path_rows,
+)
+from experiments.evaluation.path_errors import (
+    path_statistics_rows,
+    robot_paths,
+    team_pair_rows,
+    team_rows,
+)
+from experiments.evaluation.tables import RESULT_SCHEMA_VERSION, require_tables
+from experiments.evaluation.truth import EvaluatedRobot
+from experiments.pipeline.stage import library_versions
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
+from experiments.pipeline.stages.slam import stored_maps
 from experiments.pipeline.stages.smooth import map_files, read_smoothed_path
 from experiments.pipeline.store import (
     Store,
@@ -63,7 +73,7 @@ from sim.renderer import renderer_name
 
 TableMaker = Callable[[], Any]  # returns the rows of a table
 _SLOW = ("fused_map", "fusers", "fuser_coverage")  # tables of figures that take long to compute
-_IN_NO_FIGURE = ("map_history", "fused_history", "path_statistics", "timings")
+_IN_NO_FIGURE = ("fused_history", "path_statistics", "timings")
 
 
 def all_tables(
@@ -128,6 +138,14 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
         last = max(own or smoothing, key=lambda fusion: fusion.iteration, default=None)
         return team_rows(team, paths(), None if last is None else last.fusion.T_first_map)
 
+    def sightings() -> pd.DataFrame:
+        parts = []
+        for robot in run.pipeline.robots:
+            log, last = run.logs[robot.name], stored_maps(run.robot_folders(robot), viewing=False)
+            source = last.associations.at(len(log) - 1, len(log.observations))
+            parts.append(sighting_rows(log, source).assign(robot=robot.name))
+        return pd.concat(parts, ignore_index=True)
+
     def clouds() -> pd.DataFrame:
         parts = []
         for robot in run.pipeline.robots:
@@ -167,6 +185,7 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
         "landmarks": landmarks,
         "paths": paths,
         "robots": paths,
+        "sightings": sightings,
         "clouds": clouds,
         "smoothed_paths": lambda: smoothed_path_rows(smoothed()),
         "fused": lambda: fused_landmarks.fused_rows(team),
@@ -186,7 +205,7 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
     return makers | {
         "frame_times": frame_times,
         "findings": lambda: finding_rows(run),
-        "smoother": lambda: smoother_rows(smoothed()),
+        "smoother": lambda: [each.row() for each in smoothed()],
         "team_edges": lambda: fused_landmarks.team_edge_rows(team),
         "timings": timings,
     }
@@ -244,7 +263,7 @@ def run_scenario(
         scenario: the scenario.
         results: folder of results and of the store.
         jobs: number of processes.
-        on_progress: is told of finished tasks.
+        on_progress: called with the number of finished tasks.
         fresh: discard stored stages first.
         output: folder of the result; `results/NAME-SEED` by default.
         on_written: is called as by `write_result`.

@@ -17,7 +17,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.evaluation import tables
-from experiments.evaluation.checks import CheckedScenario
+from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.pipeline.tables import COVARIANCE, MOTION
 from experiments.reports.formatting import plain
@@ -71,64 +71,6 @@ def rounded(table: pd.DataFrame) -> pd.DataFrame:
 
 def _numbers(table: pd.DataFrame) -> set[str]:
     return set(table.select_dtypes("number").columns)
-
-
-PAGE = Path(__file__).parents[1] / "docs" / "formats.md"
-TABLES_BEGIN = "<!-- From here on made by `python -m experiments.reports.export` -->"
-_OPEN = {
-    "A map: one file, `NAME.parquet` or `NAME.csv`": landmark_map.LANDMARKS,
-    "A map's joint covariance: `NAME.joint.parquet` beside it, one row a landmark": (
-        landmark_map.joint_schema(RANK)
-    ),
-    "A map's viewing evidence: `NAME.viewing.parquet` beside it, one row a landmark": (
-        viewing.VIEWING
-    ),
-    "A map's viewing evidence: `NAME.frames.parquet` beside it, one row a frame": (
-        viewing.VIEWED_FRAMES
-    ),
-    "A log: `frames`, one row an iteration, also of those that saw nothing": robot_log.FRAMES,
-    "A log: `observations`, one row a sighting": robot_log.OBSERVATIONS,
-    f"A log's odometry covariance: `{robot_log.FILE}`, optional, one row an iteration": (
-        robot_log.ODOMETRY_COVARIANCE
-    ),
-    f"A log's attitude: `{attitude.FILE}`, optional, one row an iteration": attitude.ATTITUDE,
-    "A log's truth: `truth_poses`, one row an iteration": robot_log.TRUTH_POSES,
-    "A log's truth: `truth_points`, one row an observation, in their order": robot_log.TRUTH_POINTS,
-}
-
-
-def page(text: str) -> str:
-    """Return the page with the tables of the schemas; text before the tables is kept."""
-    lines = [text.partition(TABLES_BEGIN)[0] + TABLES_BEGIN]
-    for title, schema in _OPEN.items():
-        lines.append(f"\n## {title}\n")
-        lines += ["| column | type | unit | if absent | meaning |", "|---" * 5 + "|"]
-        for field in schema:
-            default = default_of(field)
-            if field.name in HEIGHT:
-                absent = "planar, if all four are"
-            elif default is None:
-                absent = "required"
-            else:
-                absent = "none" if np.isnan(default) else f"{default:g}"
-            lines.append(_column_row(field.name, field.type, absent, description_of(field)))
-    lines.append("\n## A result: `RESULT/tables/*.parquet`\n")
-    lines.append(
-        "`experiments/evaluation/tables.py` describes the rows. All columns are present.\n"
-    )
-    lines += ["| table | column | type | unit |", "|---" * 4 + "|"]
-    for name, schema in tables.ALL.items():
-        lines += [f"| {name} {_column_row(field.name, field.type)}" for field in schema]
-    return "\n".join([*lines, ""])
-
-
-def _column_row(name: str, kind: pa.DataType, *more: str) -> str:
-    shown = f"{kind.list_size} × {kind.value_type}" if pa.types.is_fixed_size_list(kind) else kind
-    return "| " + " | ".join([f"`{name}`", str(shown), unit_of(name), *more]) + " |"
-
-
-if __name__ == "__main__":
-    write_text(PAGE, page(PAGE.read_text(encoding="utf-8")))
 
 
 JSON_SCHEMA_VERSION = 1
@@ -307,3 +249,61 @@ def _add_totals(node: ET.Element) -> None:
     for plural, tag in (("failures", "failure"), ("errors", "error"), ("skipped", "skipped")):
         node.set(plural, str(sum(case.find(tag) is not None for case in cases)))
     node.set("time", f"{sum(float(case.get('time', 0)) for case in cases):.3f}")
+
+
+PAGE = Path(__file__).parents[1] / "docs" / "formats.md"
+TABLES_BEGIN = "<!-- From here on made by `python -m experiments.reports.export` -->"
+_OPEN = {
+    "A map: one file, `NAME.parquet` or `NAME.csv`": landmark_map.LANDMARKS,
+    "A map's joint covariance: `NAME.joint.parquet` beside it, one row a landmark": (
+        landmark_map.joint_schema(RANK)
+    ),
+    "A map's viewing evidence: `NAME.viewing.parquet` beside it, one row a landmark": (
+        viewing.VIEWING
+    ),
+    "A map's viewing evidence: `NAME.frames.parquet` beside it, one row a frame": (
+        viewing.VIEWED_FRAMES
+    ),
+    "A log: `frames`, one row an iteration, also of those that saw nothing": robot_log.FRAMES,
+    "A log: `observations`, one row a sighting": robot_log.OBSERVATIONS,
+    f"A log's odometry covariance: `{robot_log.FILE}`, optional, one row an iteration": (
+        robot_log.ODOMETRY_COVARIANCE
+    ),
+    f"A log's attitude: `{attitude.FILE}`, optional, one row an iteration": attitude.ATTITUDE,
+    "A log's truth: `truth_poses`, one row an iteration": robot_log.TRUTH_POSES,
+    "A log's truth: `truth_points`, one row an observation, in their order": robot_log.TRUTH_POINTS,
+}
+
+
+def page(text: str) -> str:
+    """Return the page with the tables of the schemas; text before the tables is kept."""
+    lines = [text.partition(TABLES_BEGIN)[0] + TABLES_BEGIN]
+    for title, schema in _OPEN.items():
+        lines.append(f"\n## {title}\n")
+        lines += ["| column | type | unit | if absent | meaning |", "|---" * 5 + "|"]
+        for field in schema:
+            default = default_of(field)
+            if field.name in HEIGHT:
+                absent = "planar, if all four are"
+            elif default is None:
+                absent = "required"
+            else:
+                absent = "none" if np.isnan(default) else f"{default:g}"
+            lines.append(_column_row(field.name, field.type, absent, description_of(field)))
+    lines.append("\n## A result: `RESULT/tables/*.parquet`\n")
+    lines.append(
+        "`experiments/evaluation/tables.py` describes the rows. All columns are present.\n"
+    )
+    lines += ["| table | column | type | unit |", "|---" * 4 + "|"]
+    for name, schema in tables.ALL.items():
+        lines += [f"| {name} {_column_row(field.name, field.type)}" for field in schema]
+    return "\n".join([*lines, ""])
+
+
+def _column_row(name: str, kind: pa.DataType, *more: str) -> str:
+    shown = f"{kind.list_size} × {kind.value_type}" if pa.types.is_fixed_size_list(kind) else kind
+    return "| " + " | ".join([f"`{name}`", str(shown), unit_of(name), *more]) + " |"
+
+
+if __name__ == "__main__":
+    write_text(PAGE, page(PAGE.read_text(encoding="utf-8")))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 
 from experiments.evaluation import tables
-from experiments.evaluation.result_files import require_as_written
+from experiments.evaluation.tables import require_as_written
 from experiments.reports.terminal.layout import Column, print_lines, print_table
 from mapfusion import attitude, landmark_map, robot_log
 from mapfusion.errors import InputError
@@ -117,8 +117,8 @@ def _folder_contents(path: Path) -> Contents:
         log = robot_log.read_log(path)
         facts: dict[str, Any] = {"robot": log.robot, "planar": log.planar}
     else:
-        told = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
-        facts = {name: value for each in told for name, value in each.facts.items()}
+        descriptions = [_json(path / name) for name in _DESCRIPTIONS if (path / name).is_file()]
+        facts = {name: value for each in descriptions for name, value in each.facts.items()}
     if kind == _RESULT:
         require_as_written(path)
     # Files and rows by table, or by folder and table in a result

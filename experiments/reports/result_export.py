@@ -1,8 +1,7 @@
 """Export of a result: trajectories, pose graphs, point clouds, recordings for Rerun.
 
 Everything comes from the result folder. `mapfusion docs export` describes files, keys, frames and
-the recording's entities. The timeline `frame` is the iteration. The package of the Rerun viewer
-(500 MB) is optional and imported only here.
+the entities of recordings. The package of the Rerun viewer (500 MB) is optional.
 """
 
 import re
@@ -15,9 +14,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments.evaluation.criteria import is_used_by_team
 from experiments.evaluation.result import require_result
-from experiments.evaluation.team_errors import is_used_by_team
-from experiments.pipeline.tables import alignment_of
+from experiments.pipeline.stages.align import alignment_of
 from experiments.reports.export import write_text
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.reports.figures.style import FUSED_COLOUR
@@ -30,167 +29,8 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import POSE_FIELDS, write_whole
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import joint_path, read_map
 from mapfusion.viewing import viewing_paths
-
-_POINT_M, _LINE_M, _PARTICLE_M = 0.02, 0.004, 0.01  # radii
-_FEATURE_PX = 2.0
-_TIMELINE = "frame"
-
-
-def write_rerun(data: ResultTables, path: Path) -> None:
-    """Write the recording; raises InputError if the viewer's package is not installed."""
-    if find_spec("rerun") is None:
-        raise InputError(f"--format rerun: {not_installed('rerun-sdk', 'rerun')}")
-    name = data.folder.resolve().name
-
-    def write(temporary: Path) -> None:
-        recording = _Recording(name, temporary)
-        for robot in data.robots:
-            _add_robot(recording, data, robot)
-        for pair in data.pairs:
-            _add_pair(recording, data, pair)
-        # The fused map at the end, coloured by the robots that each landmark comes from, and walls
-        fused: pd.DataFrame = data.fused_map()
-        recording.at(int(data.table("paths")["iteration"].max()))
-        position = fused[["x_m", "y_m", "z_m"]].to_numpy(np.float64)
-        several = fused["n_parents"].to_numpy() > 1
-        recording.points("fused/several", position[several], FUSED_COLOUR, _POINT_M)
-        for robot in data.robots:
-            own = ~several & (fused["robot_a"] == robot).to_numpy()
-            recording.points(f"fused/{robot}", position[own], data.colours[robot], _POINT_M)
-        walls = [_in_plan(*wall[:, :2].T) for wall in data.walls_in_frame_of(data.fused_frame)]
-        if walls:
-            recording.lines("fused/walls", walls, FUSED_COLOUR)
-        recording.close()
-
-    write_whole(path, write)
-
-
-class _Recording:
-    """Rerun recording in a file."""
-
-    def __init__(self, name: str, path: Path) -> None:
-        rerun: Any = import_module("rerun")
-        self._rerun = rerun
-        # A fixed identifier instead of a random one: the viewer shows a result only once.
-        self._stream: Any = rerun.RecordingStream(f"mapfusion {name}", recording_id=name)
-        self._stream.save(path)
-        self._stream.set_log_time_enabled(False)
-        self._stream.set_log_tick_enabled(False)
-
-    def at(self, iteration: int) -> None:
-        """Set the frame of all later entries."""
-        self._stream.set_time(_TIMELINE, sequence=iteration)
-
-    def points(self, where: str, position_m: Float, colour: str, radius_m: float) -> None:
-        """Log points, shape (N, 3)."""
-        own = self._rerun.Points3D(
-            position_m, radii=radius_m, colors=[_rerun_recording_rgb(colour)]
-        )
-        self._stream.log(where, own)
-
-    def lines(self, where: str, strips_m: list[Float], colour: str) -> None:
-        """Log lines, each of shape (n, 3)."""
-        own = self._rerun.LineStrips3D(
-            strips_m, radii=_LINE_M, colors=[_rerun_recording_rgb(colour)]
-        )
-        self._stream.log(where, own)
-
-    def image(self, where: str, png: bytes) -> None:
-        """Log a picture."""
-        own = self._rerun.EncodedImage(contents=png, media_type="image/png")
-        self._stream.log(where, own)
-
-    def features(self, where: str, uv_px: Float, labels: list[str], colour: str) -> None:
-        """Log points of a picture, shape (N, 2)."""
-        own = self._rerun.Points2D(
-            uv_px,
-            radii=_FEATURE_PX,
-            colors=[_rerun_recording_rgb(colour)],
-            labels=labels,
-            show_labels=False,
-        )
-        self._stream.log(where, own)
-
-    def close(self) -> None:
-        """Write everything to the file."""
-        self._stream.flush()
-        self._stream.disconnect()
-
-
-def _rerun_recording_rgb(colour: str) -> tuple[int, ...]:
-    """Convert #RRGGBB to three values from 0 to 255."""
-    return tuple(bytes.fromhex(colour.removeprefix("#")))
-
-
-def _in_plan(x_m: Float, y_m: Float, z_m: float = 0.0) -> Float:
-    """Return points at one height, shape (N, 3)."""
-    return np.column_stack([x_m, y_m, np.full(len(x_m), z_m)])
-
-
-def _add_robot(recording: _Recording, data: ResultTables, robot: str) -> None:
-    """Log key frames with features; path, particles and map in the robot's own frame."""
-    where, colour = f"robots/{robot}", data.colours[robot]
-    tracks = data.rows("tracks")
-    tracks = tracks[tracks["robot"] == robot]
-    for file in sorted((data.folder / "keyframes").glob(f"{robot}_[0-9]*.png")):
-        iteration = int(file.stem.removeprefix(f"{robot}_"))
-        now = tracks[tracks["iteration"] == iteration]
-        recording.at(iteration)
-        recording.image(f"images/{robot}", read_png(file))
-        labels = [
-            f"track {t}, {n} frames" for t, n in zip(now["track"], now["length"], strict=True)
-        ]
-        uv_px = now[["u_px", "v_px"]].to_numpy(np.float64)
-        recording.features(f"images/{robot}/features", uv_px, labels, colour)
-    path = _in_plan(*data.path_of(robot).T)
-    for iteration, landmarks in _history(data, robot).items():
-        recording.at(iteration)
-        recording.lines(f"{where}/path", [path[: iteration + 1]], colour)
-        recording.points(f"{where}/map", landmarks, colour, _POINT_M)
-    clouds = data.rows("clouds")
-    for iteration, cloud in clouds[clouds["robot"] == robot].groupby("iteration"):
-        recording.at(int(iteration))  # pyright: ignore[reportArgumentType]
-        position = _in_plan(cloud["x_m"].to_numpy(), cloud["y_m"].to_numpy())
-        recording.points(f"{where}/particles", position, colour, _PARTICLE_M)
-
-
-def _history(data: ResultTables, robot: str) -> dict[int, Float]:
-    """Return the landmarks in plan, shape (N, 3), by evaluated iteration."""
-    rows = data.rows("map_history")
-    rows = rows[rows["robot"] == robot].sort_values(["iteration", "landmark"])
-    groups = rows.groupby("iteration")
-    return {int(k): _in_plan(own["x_m"], own["y_m"]) for k, own in groups}  # pyright: ignore[reportArgumentType]
-
-
-def _add_pair(recording: _Recording, data: ResultTables, pair: Pair) -> None:
-    """Log both maps as aligned for the merge, their pairs, and the fused landmarks."""
-    rows = of_pair(data.rows("estimates"), pair)
-    used = rows["aligner"] == data.scenario.get("merge", {}).get("aligner")
-    rows = rows[used & (rows["repetition"] == 0)].sort_values("iteration")
-    maps = [_history(data, robot) for robot in pair]
-    offered = of_pair(data.rows("correspondences"), pair)
-    fused = of_pair(data.rows("fused_history"), pair)
-    where = f"pairs/{pair[0]}-{pair[1]}"
-    for row in rows.to_dict("records"):
-        k = int(row["iteration"])
-        found = alignment_of(row, int(row["n_correspondences"]))
-        if not found.ok or any(k not in own for own in maps):
-            continue
-        a, b = maps[0][k], transform_points(found.T_a_b, maps[1][k])
-        own = offered[offered["iteration"] == k]
-        index_a, index_b = own[["index_a", "index_b"]].to_numpy()[found.inlier].T
-        recording.at(k)
-        for robot, points in zip(pair, (a, b), strict=True):
-            recording.points(f"{where}/{robot}", points, data.colours[robot], _POINT_M)
-        strips = list(np.stack([a[index_a], b[index_b]], axis=1))
-        recording.lines(f"{where}/correspondences", strips, FUSED_COLOUR)
-        now = fused[fused["iteration"] == k]
-        position = _in_plan(now["x_m"].to_numpy(), now["y_m"].to_numpy())
-        recording.points(f"{where}/fused", position, FUSED_COLOUR, _POINT_M)
-
 
 # Smallest standard deviation of an odometry edge. A solver needs a positive one, but the motion
 # noise of a robot at rest is zero. A tenth of the resolution of encoders over a frame.
@@ -199,6 +39,9 @@ _SOURCES = ("final", "online", "odometry", "truth")
 _MOTION = ["tx_m", "ty_m", "theta_rad"]
 _FUSED = "fused"
 _RERUN = "rerun"
+_POINT_M, _LINE_M, _PARTICLE_M = 0.02, 0.004, 0.01  # radii
+_FEATURE_PX = 2.0
+_TIMELINE = "frame"  # of recordings: the iteration
 
 
 def export_result(result: Path, kind: str, folder: Path | None = None) -> list[Path]:
@@ -299,16 +142,19 @@ def _g2o_files(data: ResultTables) -> Iterator[tuple[str, str]]:
         seen = zip(points.tolist(), position[:, :2], covariance[:, :2, :2], strict=True)
         for point, p, S in seen:
             graph.add_sighting(first[robot], point, p, S)
-    edges, estimates = data.rows("team_edges"), data.rows("estimates")
-    used = estimates["aligner"] == data.scenario.get("merge", {}).get("aligner")
-    used &= estimates["repetition"] == 0
+    edges = data.rows("team_edges")
     for a, b in edges.loc[is_used_by_team(edges), ["robot_a", "robot_b"]].itertuples(index=False):
-        of_pair = used & (estimates["robot_a"] == a) & (estimates["robot_b"] == b)
-        rows = estimates[of_pair].sort_values("iteration")
-        row: dict[Any, Any] = rows.iloc[-1].to_dict()
+        row: dict[Any, Any] = _merge_estimates(data, (a, b)).iloc[-1].to_dict()
         found = alignment_of(row, int(row["n_correspondences"]))
         graph.add_motion(first[a], first[b], found.T_a_b, found.covariance)
     yield "team.g2o", graph.text()
+
+
+def _merge_estimates(data: ResultTables, pair: Pair) -> pd.DataFrame:
+    """Return a pair's estimates by the aligner of the merge, by iteration."""
+    rows = of_pair(data.rows("estimates"), pair)
+    used = rows["aligner"] == data.scenario.get("merge", {}).get("aligner")
+    return rows[used & (rows["repetition"] == 0)].sort_values("iteration")
 
 
 def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:
@@ -332,9 +178,9 @@ def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:
         yield f"{name}.ply", ply_text(landmarks, colours)
 
 
-def _rgb(colour: str) -> np.ndarray:
+def _rgb(colour: str) -> tuple[int, ...]:
     """Convert #RRGGBB to three values from 0 to 255."""
-    return np.array([int(colour[place : place + 2], 16) for place in (1, 3, 5)])
+    return tuple(bytes.fromhex(colour.removeprefix("#")))
 
 
 _FILES: dict[str, Callable[[ResultTables], Iterator[tuple[str, str]]]] = {
@@ -343,3 +189,138 @@ _FILES: dict[str, Callable[[ResultTables], Iterator[tuple[str, str]]]] = {
     "g2o": _g2o_files,
     "ply": _ply_files,
 }
+
+
+def write_rerun(data: ResultTables, path: Path) -> None:
+    """Write the recording; raises InputError if the viewer's package is not installed."""
+    if find_spec("rerun") is None:
+        raise InputError(f"--format rerun: {not_installed('rerun-sdk', 'rerun')}")
+
+    def write(temporary: Path) -> None:
+        recording = _Recording(data, temporary)
+        for robot in data.robots:
+            recording.add_robot(robot)
+        for pair in data.pairs:
+            recording.add_pair(pair)
+        recording.add_fused_map()
+        recording.close()
+
+    write_whole(path, write)
+
+
+class _Recording:
+    """Rerun recording of a result in a file."""
+
+    def __init__(self, data: ResultTables, path: Path) -> None:
+        rerun: Any = import_module("rerun")
+        self._data, self._rerun = data, rerun
+        # A fixed identifier instead of a random one: the viewer shows a result only once.
+        name = data.folder.resolve().name
+        self._stream: Any = rerun.RecordingStream(f"mapfusion {name}", recording_id=name)
+        self._stream.save(path)
+        self._stream.set_log_time_enabled(False)
+        self._stream.set_log_tick_enabled(False)
+
+    def close(self) -> None:
+        """Write everything to the file."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def add_robot(self, robot: str) -> None:
+        """Log key frames with features; path, particles and map in the robot's own frame."""
+        data, where, colour = self._data, f"robots/{robot}", self._data.colours[robot]
+        tracks = data.rows("tracks")
+        tracks = tracks[tracks["robot"] == robot]
+        for file in sorted((data.folder / "keyframes").glob(f"{robot}_[0-9]*.png")):
+            iteration = int(file.stem.removeprefix(f"{robot}_"))
+            now = tracks[tracks["iteration"] == iteration]
+            self._begin(iteration)
+            image = self._rerun.EncodedImage(contents=read_png(file), media_type="image/png")
+            self._stream.log(f"images/{robot}", image)
+            labels = [
+                f"track {t}, {n} frames" for t, n in zip(now["track"], now["length"], strict=True)
+            ]
+            features = self._rerun.Points2D(
+                now[["u_px", "v_px"]].to_numpy(np.float64),
+                radii=_FEATURE_PX,
+                colors=[_rgb(colour)],
+                labels=labels,
+                show_labels=False,
+            )
+            self._stream.log(f"images/{robot}/features", features)
+        path = _in_plan(*data.path_of(robot).T)
+        for iteration, landmarks in self._map_history(robot).items():
+            self._begin(iteration)
+            self._add_lines(f"{where}/path", [path[: iteration + 1]], colour)
+            self._add_points(f"{where}/map", landmarks, colour)
+        clouds = data.rows("clouds")
+        for iteration, cloud in clouds[clouds["robot"] == robot].groupby("iteration"):
+            self._begin(int(iteration))  # pyright: ignore[reportArgumentType]
+            position = _in_plan(cloud["x_m"].to_numpy(), cloud["y_m"].to_numpy())
+            self._add_points(f"{where}/particles", position, colour, _PARTICLE_M)
+
+    def add_pair(self, pair: Pair) -> None:
+        """Log both maps as aligned for the merge, their pairs, and the fused landmarks."""
+        data, where = self._data, f"pairs/{pair[0]}-{pair[1]}"
+        maps = [self._map_history(robot) for robot in pair]
+        offered = of_pair(data.rows("correspondences"), pair)
+        fused = of_pair(data.rows("fused_history"), pair)
+        for row in _merge_estimates(data, pair).to_dict("records"):
+            k = int(row["iteration"])
+            found = alignment_of(row, int(row["n_correspondences"]))
+            if not found.ok or any(k not in own for own in maps):
+                continue
+            a, b = maps[0][k], se2.transform_points(found.T_a_b, maps[1][k])
+            own = offered[offered["iteration"] == k]
+            index_a, index_b = own[["index_a", "index_b"]].to_numpy()[found.inlier].T
+            self._begin(k)
+            for robot, points in zip(pair, (a, b), strict=True):
+                self._add_points(f"{where}/{robot}", points, data.colours[robot])
+            strips = list(np.stack([a[index_a], b[index_b]], axis=1))
+            self._add_lines(f"{where}/correspondences", strips, FUSED_COLOUR)
+            now = fused[fused["iteration"] == k]
+            position = _in_plan(now["x_m"].to_numpy(), now["y_m"].to_numpy())
+            self._add_points(f"{where}/fused", position, FUSED_COLOUR)
+
+    def add_fused_map(self) -> None:
+        """Log the last fused map, coloured by the robots of each landmark, and the walls."""
+        data = self._data
+        fused: pd.DataFrame = data.fused_map()
+        self._begin(int(data.table("paths")["iteration"].max()))
+        position = fused[["x_m", "y_m", "z_m"]].to_numpy(np.float64)
+        several = fused["n_parents"].to_numpy() > 1
+        self._add_points("fused/several", position[several], FUSED_COLOUR)
+        for robot in data.robots:
+            own = ~several & (fused["robot_a"] == robot).to_numpy()
+            self._add_points(f"fused/{robot}", position[own], data.colours[robot])
+        walls = [_in_plan(*wall[:, :2].T) for wall in data.walls_in_frame_of(data.fused_frame)]
+        if walls:
+            self._add_lines("fused/walls", walls, FUSED_COLOUR)
+
+    def _map_history(self, robot: str) -> dict[int, Float]:
+        """Return the landmarks in plan, shape (N, 3), by evaluated iteration."""
+        rows = self._data.rows("map_history")
+        rows = rows[rows["robot"] == robot].sort_values(["iteration", "landmark"])
+        groups = rows.groupby("iteration")
+        return {int(k): _in_plan(own["x_m"], own["y_m"]) for k, own in groups}  # pyright: ignore[reportArgumentType]
+
+    def _begin(self, iteration: int) -> None:
+        """Set the iteration of all later entries."""
+        self._stream.set_time(_TIMELINE, sequence=iteration)
+
+    def _add_points(
+        self, where: str, position_m: Float, colour: str, radius_m: float = _POINT_M
+    ) -> None:
+        """Log points, shape (N, 3)."""
+        points = self._rerun.Points3D(position_m, radii=radius_m, colors=[_rgb(colour)])
+        self._stream.log(where, points)
+
+    def _add_lines(self, where: str, strips_m: list[Float], colour: str) -> None:
+        """Log lines, each of shape (n, 3)."""
+        lines = self._rerun.LineStrips3D(strips_m, radii=_LINE_M, colors=[_rgb(colour)])
+        self._stream.log(where, lines)
+
+
+def _in_plan(x_m: Float, y_m: Float) -> Float:
+    """Return points on the ground, shape (N, 3)."""
+    return np.column_stack([x_m, y_m, np.zeros(len(x_m))])

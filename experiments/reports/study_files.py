@@ -3,7 +3,7 @@
 import math
 import platform
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import pandas as pd
 
 from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.evaluation.tables import table_path
-from experiments.pipeline.code_version import library_versions
+from experiments.pipeline.stage import library_versions
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, write_rows
 from experiments.plugins.discovery import find_method
 from experiments.reports.export import publish_json, to_markdown, write_tables, write_text
@@ -29,6 +29,7 @@ from experiments.studies.independence_trial import (
     Independence,
     at_the_end,
 )
+from experiments.studies.paper_claims import CROSSING, READINGS, VALUES, crossings
 from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,
@@ -110,6 +111,7 @@ def write_benchmark(
         "seed": design.seed,
         "trials": design.trials,
         "budget_s": design.budget_s,
+        "unpaired_share": design.unpaired_share,
         "aligners": [
             entry.model_dump(mode="json") | {"origin": find_method(entry.method).origin()}
             for entry in design.aligners
@@ -125,11 +127,13 @@ def write_benchmark(
 
 def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
     """Return the whole table in Markdown, one section for each number of pairs."""
+    share = design.unpaired_share
+    alone = f"{share:.0%} of each map's landmarks without a partner; " if share else ""
     parts = [
         f"# Aligners on made-up maps\n\n"
         f"Planar maps of landmarks uniform in {SIZE_M:g} x {SIZE_M:g} m, residuals of true pairs "
-        f"{SIGMA_M:g} m per axis, false pairs uniform; {design.trials} trials a cell, seed "
-        f"{design.seed}, the same maps for all methods.\n\n"
+        f"{SIGMA_M:g} m per axis, false pairs uniform; {alone}"
+        f"{design.trials} trials a cell, seed {design.seed}, the same maps for all methods.\n\n"
         f"Each cell: successes in % (accepted and within {RIGHT_WITHIN_M:g} m and "
         f"{RIGHT_WITHIN_RAD:g} rad as estimated) with Wilson's 95 % interval; the median "
         "translation error of the successes over the oracle's (least squares on the true pairs) on "
@@ -313,3 +317,95 @@ def draw_refusals(
         draw = study_figures.draw_refusal_reliability
         files += save_figure(place, "refusal_reliability", draw, held)
     return files
+
+
+_SECTIONS = {"4": "Map building", "5": "Map alignment", "6": "Map merging", "7": "Conclusion"}
+CROSSING_FIGURE = "crossing"
+
+
+def write_claims(folder: Path, values: pd.DataFrame, crossing: pd.DataFrame) -> list[Path]:
+    """Write `claims` and `crossing` (Parquet and CSV), the figure and the page `paper.md`."""
+    for name, schema_of, rows in (("claims", VALUES, values), ("crossing", CROSSING, crossing)):
+        write_rows(folder / f"{name}.parquet", schema_of, rows)
+        write_text(folder / f"{name}.csv", rows.to_csv(index=False))
+    page = folder / "paper.md"
+    write_text(page, claims_page(values, crossing))
+    return [page, *save_figure(folder, CROSSING_FIGURE, study_figures.draw_crossing, crossing)]
+
+
+def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
+    """Return the page "The paper beside this software" in Markdown."""
+    parts = [
+        "# The paper beside this software\n",
+        "Written by `mapfusion study paper`; do not edit. `paper_as_printed` runs the methods of "
+        '"Map Fusion in an Independent Multi-robot Approach" as printed, `paper` runs the same '
+        "experiment with the defaults of this software.\n",
+        f"Each value is the median over runs, one seed each, with its 95 % interval (bootstrap "
+        "over runs). A claim is confirmed if the whole interval lies in the range that confirms "
+        "it, refuted if all of it lies outside, and partly confirmed otherwise. The range is in "
+        "`claims.csv` beside this page. T_a_b is the motion from the frame of map b to that of "
+        f"map a; errors are those of T_a_b before the common least squares. "
+        f"{_drawn_by(values)}\n",
+        "## Readings of the paper\n",
+        *(f"- {line}" for line in READINGS),
+        "",
+    ]
+    for number, title in _SECTIONS.items():
+        rows = values[values["where"].str.startswith(number)]
+        parts += [f"## Section {number}: {title}\n", to_markdown(claims_table(rows))]
+    parts += [
+        "## SVD and ICP against the share of false pairs\n",
+        f"![Error against the share of false pairs]({CROSSING_FIGURE}.png)\n",
+        *(f"{line}\n" for line in crossing_lines(crossing)),
+    ]
+    return "\n".join(parts)
+
+
+def _drawn_by(values: pd.DataFrame) -> str:
+    """Say who drew the pictures of how many runs."""
+    runs = values.groupby(["scenario", "renderer"], sort=False)["n_runs"].max().reset_index()
+    each = (f"`{row.scenario}`: {row.n_runs} by {row.renderer}" for row in runs.itertuples())
+    return f"Runs and their renderers: {'; '.join(each)}."
+
+
+def claims_table(values: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of VALUES as a table with one row per claim and texts in all cells."""
+    rows = []
+    for _, own in values.groupby("name", sort=False):
+        first = own.iloc[0]
+        row = {"claim": f"{first['claim']} ({first['where']})", "measure": first["measure"]}
+        for of in own.to_dict("records"):
+            row[f"{of['scenario']}, {of['renderer']}"] = claim_text(of)
+        rows.append(row | {"why": first["why"]})
+    return pd.DataFrame(rows)
+
+
+def claim_text(row: Mapping[str, Any]) -> str:
+    """Write verdict, value and interval of a row of VALUES."""
+    if math.isnan(row["value"]):
+        return str(row["verdict"])
+    value, low, high = (_number_text(row[name]) for name in ("value", "value_low", "value_high"))
+    unit = f" {row['unit']}" if row["unit"] else ""
+    interval = f" ({low} to {high})" if not math.isnan(row["value_low"]) else " (one run)"
+    return f"**{row['verdict']}**: {value}{unit}{interval}"
+
+
+def _number_text(value: float) -> str:
+    return "no answer" if math.isinf(value) else f"{value:.3g}"
+
+
+def crossing_lines(crossing: pd.DataFrame) -> list[str]:
+    """Say where the order of SVD and ICP changes, a line for each share of unpaired landmarks."""
+    lines = []
+    for unpaired, shares in crossings(crossing, "svd", "icp").items():
+        errors = crossing[crossing["unpaired_share"] == unpaired]
+        fewest = errors[errors["outlier_share"] == errors["outlier_share"].min()]
+        error = fewest.set_index("method")["error_m"]
+        order = "SVD is better" if error["svd"] < error["icp"] else "ICP is at least as good"
+        at = ", ".join(f"{share:.1%}" for share in shares)
+        where = f"the order changes at {at} of false pairs" if shares else "the order never changes"
+        lines.append(
+            f"With {unpaired:.0%} of the landmarks unpaired and no false pair, {order} "
+            f"({error['svd']:.3f} m beside {error['icp']:.3f} m); {where}."
+        )
+    return lines

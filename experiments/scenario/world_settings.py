@@ -9,7 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from experiments.scenario.seeds import generator
 from mapfusion.fastslam.filter import FastSlamParameters
-from mapfusion.fusion.fusers import FUSERS, REFERENCE, target_of
+from mapfusion.fusion.fusers import COMPARED, target_of
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import Range
 from mapfusion.robot_log import STRAY_M
@@ -248,9 +248,6 @@ class Smooth(Section):
     max_memory_gb: Annotated[float, Range(0, 10_000, "GB")] = 1.0
 
 
-_FUSERS = tuple(name for name in FUSERS if name != REFERENCE)
-
-
 def _known_fusers(names: list[str]) -> list[str]:
     """Refuse unknown and repeated fusers."""
     for name in names:
@@ -263,12 +260,11 @@ class Fuse(Section):
 
     Attributes:
         fusers: names of the fusers; all get the same maps and alignments. The default is all fusers
-            except `batch`, which smooths all logs together and takes long.
+            except `batch`, which smooths all logs together and takes long, and
+            `kalman_as_printed`, which has the wrong sign of the paper's eq. 13.
         every: interval between fused frames, a multiple of `evaluate.every`; the last frame is
             always fused. None: the last frame and four evaluated frames evenly spread before it.
     """
 
-    fusers: Annotated[list[Name], AfterValidator(_known_fusers)] = [
-        each for each in FUSERS if each != REFERENCE
-    ]
+    fusers: Annotated[list[Name], AfterValidator(_known_fusers)] = list(COMPARED)
     every: Annotated[int, Range(1, MAX_COUNT, "frames")] | None = None

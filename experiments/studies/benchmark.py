@@ -26,7 +26,7 @@ from experiments.plugins.discovery import callable_aligner, find_method, known_m
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.scenario.suite import chosen_aligners, settings_of
-from experiments.studies.intervals import wilson
+from experiments.studies.intervals import log_ratio, wilson
 from mapfusion.align.alignment import NOT_RUN, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid
@@ -44,7 +44,7 @@ _OBSERVATIONS = 5  # count of each landmark; no aligner uses it
 
 @dataclass(frozen=True)
 class SyntheticPair:
-    """Two planar maps of N landmarks each and N correspondences between them, in random order.
+    """Two planar maps and N correspondences between them, in random order.
 
     Attributes:
         T_a_b: (3,) true motion.
@@ -69,12 +69,21 @@ def true_pairs_of(n_pairs: int, outlier_share: float) -> int:
     return round((1 - outlier_share) * n_pairs)
 
 
-def synthetic_pair(n_pairs: int, outlier_share: float, rng: np.random.Generator) -> SyntheticPair:
+def synthetic_pair(
+    n_pairs: int, outlier_share: float, rng: np.random.Generator, unpaired_share: float = 0.0
+) -> SyntheticPair:
     """Draw a world, two maps of it, the motion between them and the correspondences.
 
     Landmarks are uniform in a square about the origin of frame b. So the translation error is the
     displacement of the centre of the world. Both landmarks of a false pair are uniform and
     independent. Each map has half of the residual's variance, and its covariances say so.
+
+    Args:
+        n_pairs: number of correspondences.
+        outlier_share: share of these that are false.
+        rng: random generator.
+        unpaired_share: share of each map's landmarks without a correspondence; they are uniform
+            and independent, too.
     """
     half_m = SIZE_M / 2
     T_a_b = np.array([*rng.uniform(-half_m, half_m, 2), rng.uniform(-math.pi, math.pi)])
@@ -87,7 +96,12 @@ def synthetic_pair(n_pairs: int, outlier_share: float, rng: np.random.Generator)
     p_b = p_b + rng.normal(0, own_m, p_b.shape)
     index_a, index_b, order = (rng.permutation(n_pairs) for _ in range(3))
     distance = rng.uniform(0, 0.3, n_pairs)  # of accepted matches; they carry no information
-    map_a, map_b = _map(p_a, index_a, own_m, "a"), _map(p_b, index_b, own_m, "b")
+    n_alone = round(n_pairs * unpaired_share / (1 - unpaired_share))
+    alone_a, alone_b = rng.uniform(-half_m, half_m, (2, n_alone, 2))
+    last = np.arange(n_pairs, n_pairs + n_alone)
+    p_a, p_b = np.vstack([p_a, se2.transform_points(T_a_b, alone_a)]), np.vstack([p_b, alone_b])
+    map_a = _map(p_a, np.concatenate([index_a, last]), own_m, "a")
+    map_b = _map(p_b, np.concatenate([index_b, last]), own_m, "b")
     pairs = Correspondences(index_a[order], index_b[order], distance)
     return SyntheticPair(map_a, map_b, pairs, T_a_b, is_true[order])
 
@@ -142,6 +156,7 @@ class CellSettings:
     origin: dict[str, str]
     n_pairs: int
     outlier_share: float
+    unpaired_share: float
     trials: int
     seed: int
     budget_s: float
@@ -160,7 +175,8 @@ def run_cell(settings: CellSettings, job: Job) -> None:
     rows: list[dict[str, Any]] = []
     for trial in range(settings.trials):
         maps = ("benchmark", n_pairs, f"{share:g}", trial)
-        pair = synthetic_pair(n_pairs, share, generator(settings.seed, *maps))
+        drawn = generator(settings.seed, *maps)
+        pair = synthetic_pair(n_pairs, share, drawn, settings.unpaired_share)
         for _ in range(2 if trial == 0 else 1):  # the first call compiles and fills caches
             rng = generator(settings.seed, *maps, settings.name)
             answers = registration.register(pair.map_a, pair.map_b, pair.correspondences, rng)
@@ -221,6 +237,7 @@ class BenchmarkDesign:
         budget_s: time after which a cell ends with the trials it has.
         pair_counts: numbers of pairs.
         outlier_shares: shares of false pairs.
+        unpaired_share: share of each map's landmarks without a correspondence, below 1.
     """
 
     aligners: tuple[AlignerEntry, ...]
@@ -229,6 +246,7 @@ class BenchmarkDesign:
     budget_s: float = 600.0
     pair_counts: tuple[int, ...] = PAIR_COUNTS
     outlier_shares: tuple[float, ...] = OUTLIER_SHARES
+    unpaired_share: float = 0.0
 
 
 def entries_of(
@@ -258,6 +276,7 @@ def run_benchmark(design: BenchmarkDesign, store: Store, on_progress: OnProgress
             origin=method.origin(),
             n_pairs=n_pairs,
             outlier_share=share,
+            unpaired_share=design.unpaired_share,
             trials=design.trials,
             seed=design.seed,
             budget_s=design.budget_s,
@@ -310,3 +329,37 @@ def summarise(trials: pd.DataFrame) -> pd.DataFrame:
     cells = pd.DataFrame(columns).reset_index()
     cells["n_true"] = list(map(true_pairs_of, cells["n_pairs"], cells["outlier_share"]))
     return cells[SUMMARY.names]
+
+
+def median_errors(trials: pd.DataFrame) -> pd.DataFrame:
+    """Return the median translation error of all trials by share of false pairs and method.
+
+    A trial without an accepted estimate has an infinite error. The successes alone, as in SUMMARY,
+    would hide how often a method fails.
+    """
+    error = trials["error_m"].where(trials["status"] == Status.ACCEPTED, math.inf)
+    given = trials.assign(error_m=error)
+    return given.pivot_table("error_m", "outlier_share", "method", aggfunc="median")
+
+
+def crossing_shares(errors: pd.DataFrame, first: str, second: str) -> list[float]:
+    """Return the shares of false pairs at which the order of two methods' errors changes.
+
+    Args:
+        errors: value of `median_errors`.
+        first: name of a method.
+        second: name of the other method.
+
+    Returns:
+        Shares between two neighbouring rows, interpolated linearly in the logarithm of the ratio;
+        the middle if an error is 0 or infinite.
+    """
+    share = errors.index.to_numpy(np.float64)
+    change = log_ratio(errors[first].to_numpy(), errors[second].to_numpy())
+    found = []
+    for k in np.flatnonzero(change[:-1] * change[1:] < 0):
+        left, right = change[k : k + 2]
+        known = np.isfinite(left) and np.isfinite(right)
+        along = left / (left - right) if known else 0.5
+        found.append(float(share[k] + along * (share[k + 1] - share[k])))
+    return found

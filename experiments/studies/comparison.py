@@ -29,14 +29,14 @@ from experiments.evaluation.criteria import (
     RICH_PAIRS,
     RUN_KEYS,
     is_false_merge,
+    is_used_by_team,
     methods_in,
+    path_rms,
     right_refined,
     setting_columns,
 )
-from experiments.evaluation.fused_map_errors import last_fused
-from experiments.evaluation.path_errors import path_rms
-from experiments.evaluation.result_files import read_scenario
-from experiments.evaluation.team_errors import is_used_by_team
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.tables import read_scenario
 from experiments.studies import intervals
 from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.studies.run_tables import RunPath, Runs, find_runs, match_names
@@ -218,8 +218,8 @@ def compare_values(path: Path, setting: str, first: str, second: str) -> Version
         if value not in known[setting]:
             there = ", ".join(known[setting])
             raise InputError(f"{path}: no finished run has {setting}={value}; there are: {there}")
-    sides = [(path, replace(runs, only=((setting, value),))) for value in (first, second)]
-    return _compared(*sides, [setting])
+    side_a, side_b = ((path, replace(runs, only=((setting, v),))) for v in (first, second))
+    return _compared(side_a, side_b, [setting])
 
 
 def values_by_setting(runs: Runs) -> dict[str, list[str]]:
@@ -243,8 +243,18 @@ def _compared(
 ) -> VersionComparison:
     """Compare two groups of runs, each with the path that messages name."""
     (path_a, a), (path_b, b) = side_a, side_b
-    notes = _apart_from(a, b, apart_from)
-    runs_a, runs_b = _names(*side_a, apart_from), _names(*side_b, apart_from)
+    notes = _excluded_settings(a, b, apart_from)
+    name_sets = []
+    for path, runs in (side_a, side_b):
+        names = match_names(runs.described, apart_from)
+        several = names[names.duplicated()]
+        if apart_from and len(several):
+            raise InputError(
+                f"{path}: {several.iloc[0]} is there more than once, with other values of "
+                f"{' and '.join(apart_from)}; each side may have one"
+            )
+        name_sets.append(set(names))
+    runs_a, runs_b = name_sets
     common = runs_a & runs_b
     if not common:
         raise InputError(
@@ -298,20 +308,7 @@ def _compared(
     return VersionComparison(table.drop(columns=_NOT_SHOWN), unit, len(common), tuple(notes))
 
 
-def _names(path: Path, runs: Runs, apart_from: Sequence[str]) -> set[str]:
-    """Return the names that the runs of one version are matched by."""
-    names = match_names(runs.described, apart_from)
-    several = names[names.duplicated()]
-    if apart_from and len(several):
-        settings = " and ".join(apart_from)
-        raise InputError(
-            f"{path}: {several.iloc[0]} is there more than once, with other values of {settings}; "
-            "each side may have one"
-        )
-    return set(names)
-
-
-def _apart_from(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
+def _excluded_settings(a: Runs, b: Runs, settings: Sequence[str]) -> list[str]:
     """Return notes on the settings that runs are not matched by."""
     notes = []
     varied = [runs.described[setting_columns(runs.described)] for runs in (a, b)]
@@ -366,7 +363,10 @@ def _differing_settings(a: Runs, b: Runs) -> list[str]:
 def _all_values(
     a: Runs, b: Runs, apart_from: Sequence[str]
 ) -> Iterator[tuple[Quantity, str, pd.DataFrame]]:
-    """Yield quantities of common tables, the method, and columns run_id, a, b and change."""
+    """Yield quantities of common tables, the method, and columns run_id, a, b and change.
+
+    Rows without a finite change are left out; success rates cover them.
+    """
     for table in READ:
         if not (a.has(table) and b.has(table)):
             continue
@@ -393,21 +393,22 @@ def _all_values(
             own = rows[rows["aligner"] == method] if method else rows
             of = method if method in ("", ORACLE) else EACH_METHOD
             for quantity in QUANTITIES:
-                if (quantity.table, quantity.of) == (table, of):
-                    values = _changes(quantity, own)
-                    if len(values):
-                        yield quantity, method, values
-
-
-def _changes(quantity: Quantity, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return values and changes of rows with a finite change; success rates cover the others."""
-    rows = rows.query(quantity.where) if quantity.where else rows
-    a, b = (rows[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab")
-    if quantity.scale == "ln":  # distance from consistency, in either direction
-        change = np.abs(intervals.log_ratio(b, np.ones(1))) - np.abs(
-            intervals.log_ratio(a, np.ones(1))
-        )
-    else:
-        change = b - a if quantity.scale == "share" else intervals.log_ratio(b, a)
-    frame = pd.DataFrame({"run_id": rows["run_id"], "a": a, "b": b, "change": change})
-    return frame[np.isfinite(a) & np.isfinite(change)]
+                if (quantity.table, quantity.of) != (table, of):
+                    continue
+                chosen = own.query(quantity.where) if quantity.where else own
+                x, y = (
+                    chosen[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab"
+                )
+                if quantity.scale == "share":
+                    change = y - x
+                elif quantity.scale == "ratio":
+                    change = intervals.log_ratio(y, x)
+                else:  # change of the distance from consistency, in either direction
+                    from_1_a, from_1_b = (
+                        np.abs(intervals.log_ratio(v, np.ones(1))) for v in (x, y)
+                    )
+                    change = from_1_b - from_1_a
+                known = np.isfinite(x) & np.isfinite(change)
+                if known.any():
+                    values = {"run_id": chosen["run_id"], "a": x, "b": y, "change": change}
+                    yield quantity, method, pd.DataFrame(values)[known]

@@ -16,18 +16,14 @@ from typing import Any
 import pandas as pd
 
 from experiments.evaluation.alignment_errors import first_shared_iteration
-from experiments.evaluation.checks import why_no_truth
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.map_consistency import rmse
-from experiments.evaluation.path_errors import STATISTICS
-from experiments.evaluation.smoothed_robots import SmoothedRobot
+from experiments.evaluation.map_errors import EvaluatedFusion, GivenMap, SmoothedRobot
+from experiments.evaluation.path_errors import STATISTICS, PlacedPath, team_ate_m
 from experiments.evaluation.tables import UNKNOWN
-from experiments.evaluation.team_errors import PlacedPath, team_ate_m
 from experiments.pipeline.stage import Stage
-from experiments.pipeline.stages.aligner import AlignerSettings
+from experiments.pipeline.stages.align import AlignerSettings, MatchSettings
 from experiments.pipeline.stages.fuse import FuseSettings, read_fusions
-from experiments.pipeline.stages.match import MatchSettings
 from experiments.pipeline.stages.slam import SlamSettings
 from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.store import Store, retry_damaged
@@ -35,27 +31,7 @@ from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows
 from experiments.pipeline.tasks import OnProgress, run_tasks, tasks_of
 from experiments.pipeline.workers import workers
 from experiments.scenario.settings import AnyScenario, Recording, Scenario
-from experiments.studies.measured_work import (
-    ALIGNMENT,
-    COSTS_FILE,
-    FILTER,
-    FILTER_MAP,
-    FUSION,
-    LOG,
-    ROBOT_WRITES,
-    SENT,
-    SENT_FILE,
-    SMOOTHED_MAP,
-    SMOOTHING,
-    TEAM_WRITES,
-    WORK_COSTS,
-    PairCostSettings,
-    RobotCostSettings,
-    measure_pair,
-    measure_robot,
-    measure_team,
-    read_paths,
-)
+from experiments.studies import measured_work
 from mapfusion.errors import InputError
 from mapfusion.files import schema
 from mapfusion.fusion.fusers import REFERENCE, USUAL, make_fuser
@@ -127,10 +103,10 @@ class Strategy:
 
 
 STRATEGIES = (
-    Strategy("filters", "filters alone, fused once", "kalman-drift", FILTER_MAP),
-    Strategy("once", "smoothed alone, fused once", USUAL, SMOOTHED_MAP),
-    Strategy("anew", "smoothed alone, fused anew", USUAL, SMOOTHED_MAP, often=True),
-    Strategy("together", "all logs in one smoother", REFERENCE, LOG),
+    Strategy("filters", "filters alone, fused once", "kalman-drift", measured_work.FILTER_MAP),
+    Strategy("once", "smoothed alone, fused once", USUAL, measured_work.SMOOTHED_MAP),
+    Strategy("anew", "smoothed alone, fused anew", USUAL, measured_work.SMOOTHED_MAP, often=True),
+    Strategy("together", "all logs in one smoother", REFERENCE, measured_work.LOG),
 )
 FUSERS = tuple(dict.fromkeys(strategy.fuser for strategy in STRATEGIES))
 
@@ -194,9 +170,9 @@ class RecordedTeam:
             found[robot.name] = Stage(
                 "robot_costs",
                 "measure the robots' work",
-                RobotCostSettings(filtered, smoothed),
-                measure_robot,
-                ROBOT_WRITES,
+                measured_work.RobotCostSettings(filtered, smoothed),
+                measured_work.measure_robot,
+                measured_work.ROBOT_WRITES,
                 {"log": robot.log, "slam": robot.slam, "smooth": robot.smooth},
             )
         return found
@@ -222,9 +198,9 @@ class RecordedTeam:
                 Stage(
                     "pair_costs",
                     _TEAM_LABEL,
-                    PairCostSettings(matched.match, own, self.iterations),
-                    measure_pair,
-                    (COSTS_FILE,),
+                    measured_work.PairCostSettings(matched.match, own, self.iterations),
+                    measured_work.measure_pair,
+                    (measured_work.COSTS_FILE,),
                     before,
                     loads=aligned.loads,
                 )
@@ -239,8 +215,8 @@ class RecordedTeam:
                 "team_costs",
                 _TEAM_LABEL,
                 self._fuse_settings(name),
-                measure_team,
-                TEAM_WRITES,
+                measured_work.measure_team,
+                measured_work.TEAM_WRITES,
                 stage.before,
                 loads=stage.loads,
             )
@@ -272,11 +248,11 @@ def team_of(run: EvaluatedRun, n_robots: int) -> RecordedTeam:
         "merge": merge.model_copy(update={"fuser": USUAL}),
         "expect": {},
     }
-    kept = {name: value for name, value in scenario if name in Scenario.model_fields}
+    inherited = {name: value for name, value in scenario if name in Scenario.model_fields}
     logs = [str(run.store.path(robot.log)) for robot in robots]
-    recorded = Recording(**kept | changed, logs=logs)
-    if reason := why_no_truth(recorded):
-        raise InputError(f"scenario {scenario.name}: {reason}; errors cannot be told")
+    recorded = Recording(**inherited | changed, logs=logs)
+    if reason := recorded.why_no_truth():
+        raise InputError(f"scenario {scenario.name}: {reason}; its errors are unknown")
     return RecordedTeam(EvaluatedRun.of(recorded, run.store))
 
 
@@ -289,7 +265,7 @@ def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     """
 
     def costs_of(stage: Stage) -> pd.DataFrame:
-        return read_rows(team.folder(stage) / COSTS_FILE, WORK_COSTS)
+        return read_rows(team.folder(stage) / measured_work.COSTS_FILE, measured_work.WORK_COSTS)
 
     robots = [costs_of(stage) for stage in team.by_robot.values()]
     pairs = [costs_of(stage) for stage in team.by_pair]
@@ -300,11 +276,13 @@ def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
             smoothed_at = asked if strategy.smooths else []
             own = []  # rows of the filter, and of the smoothing that was asked for, by robot
             for costs in robots:
-                filtered = _of(costs, FILTER, _own_iterations(costs["iteration"], [k]))
+                filtered = _of(
+                    costs, measured_work.FILTER, _own_iterations(costs["iteration"], [k])
+                )
                 at = _own_iterations(costs["iteration"], smoothed_at)
-                own.append((filtered, _of(costs, SMOOTHING, at)))
-            aligned = pd.concat([_of(costs, ALIGNMENT, asked) for costs in pairs])
-            fused = _of(fusers[strategy.fuser], FUSION, asked)
+                own.append((filtered, _of(costs, measured_work.SMOOTHING, at)))
+            aligned = pd.concat([_of(costs, measured_work.ALIGNMENT, asked) for costs in pairs])
+            fused = _of(fusers[strategy.fuser], measured_work.FUSION, asked)
             filtered, smoothed = (pd.concat(parts) for parts in zip(*own, strict=True))
             busiest = max(float(each["cpu_s"].sum()) for each in map(pd.concat, own))
             yield {
@@ -322,7 +300,10 @@ def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
 
 def sent_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     """Yield the sizes of the robots' messages for each strategy at each iteration."""
-    sent = [read_rows(team.folder(stage) / SENT_FILE, SENT) for stage in team.by_robot.values()]
+    sent = [
+        read_rows(team.folder(stage) / measured_work.SENT_FILE, measured_work.SENT)
+        for stage in team.by_robot.values()
+    ]
     for strategy in STRATEGIES:
         for k in team.iterations:
             asked = strategy.asked(team.iterations, k)
@@ -352,14 +333,14 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     robots = run.load_robots()
     filter_paths = dict[str, Mapping[int, Float]]()
     for stage in team.by_robot.values():
-        filter_paths |= read_paths(team.folder(stage))
+        filter_paths |= measured_work.read_paths(team.folder(stage))
     smoothed = run.load_smoothed(robots)
     first = first_shared_iteration(robots, run.scenario.evaluate.true_pair_radius_m)
     about = {"first_shared": UNKNOWN if first is None else first}
-    judged: dict[tuple[str, int], dict[str, Any]] = {}
+    errors_of: dict[tuple[str, int], dict[str, Any]] = {}
     for fuser, stage in team.by_fuser.items():
         folder = team.folder(stage)
-        anew = read_paths(folder)
+        anew = measured_work.read_paths(folder)
         for k, fusion in read_fusions(folder, names).items():
             beside = smoothed if make_fuser(fuser).smoothed else [None] * len(robots)
             given = [GivenMap.at(*both, k) for both in zip(robots, beside, strict=True)]
@@ -385,11 +366,11 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
                     "gross_share": fit.gross_share,
                     "path_rmse_m": STATISTICS["rmse"](team_ate_m(paths)),
                 }
-            judged[fuser, k] = row
+            errors_of[fuser, k] = row
     for strategy in STRATEGIES:
         for k in team.iterations:
             row = {"strategy": strategy.name, "iteration": k} | about
-            yield row | judged[strategy.fuser, k]
+            yield row | errors_of[strategy.fuser, k]
 
 
 def _given_path(

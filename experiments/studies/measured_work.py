@@ -9,10 +9,10 @@ import gc
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,9 +20,8 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import fuse, smooth
-from experiments.pipeline.stages.aligner import AlignerSettings
+from experiments.pipeline.stages.align import AlignerSettings, latest_at, maps_of_both
 from experiments.pipeline.stages.fuse import FuseSettings
-from experiments.pipeline.stages.match import latest_at, maps_of_both
 from experiments.pipeline.stages.slam import SlamSettings
 from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows
@@ -142,7 +141,23 @@ def measure_robot(settings: RobotCostSettings, job: Job) -> None:
     for k in iterations:
         costs.append(cost_row(k, SMOOTHING, _smooth_at(settings.smooth, job, log, k)))
     paths = [path_rows(each.iteration, log.robot, each.path) for each in filtered]
-    sent = [row for each in filtered for row in _sent(each, log, job.inputs["smooth"])]
+    sent, smoothed = [], job.inputs["smooth"]
+    for each in filtered:  # the sizes of the files that would be sent
+        k = each.iteration
+        with tempfile.TemporaryDirectory() as place:
+            own_map, own_log = Path(place) / "map", Path(place) / "log"
+            write_map(own_map / "map.parquet", each.landmarks)
+            write_log(own_log, smooth.log_until(log, k))
+            # A robot whose log is not smoothed at this iteration sends the filter's map instead.
+            has_map = k in smooth.read_smoothed_path(smoothed)
+            messages = {
+                FILTER_MAP: own_map.iterdir(),
+                SMOOTHED_MAP: smooth.map_files(smoothed, k) if has_map else own_map.iterdir(),
+                LOG: own_log.iterdir(),
+            }
+            for what, files in messages.items():
+                n_bytes = sum(file.stat().st_size for file in files)
+                sent.append({"iteration": k, "what": what, "n_bytes": n_bytes})
     write_rows(job.output / COSTS_FILE, WORK_COSTS, pd.DataFrame(costs))
     write_rows(job.output / SENT_FILE, SENT, pd.DataFrame(sent))
     write_rows(job.output / PATHS_FILE, PATHS, pd.concat(paths))
@@ -181,27 +196,6 @@ def _smooth_at(settings: SmoothSettings, job: Job, log: RobotLog, iteration: int
     meter = Meter()
     smooth.smooth_log(settings, *given, read_attitude(job.inputs["log"]))
     return meter.read()
-
-
-def _sent(filtered: _Filtered, log: RobotLog, smoothed: Path) -> Iterator[dict[str, Any]]:
-    """Yield rows of `SENT` at an iteration: the sizes of the files that would be sent.
-
-    A robot whose log is not smoothed at this iteration sends the filter's map instead.
-    """
-    k = filtered.iteration
-    with tempfile.TemporaryDirectory() as place:
-        own_map, own_log = Path(place) / "map", Path(place) / "log"
-        write_map(own_map / "map.parquet", filtered.landmarks)
-        write_log(own_log, smooth.log_until(log, k))
-        has_map = k in smooth.read_smoothed_path(smoothed)
-        files = {
-            FILTER_MAP: own_map.iterdir(),
-            SMOOTHED_MAP: smooth.map_files(smoothed, k) if has_map else own_map.iterdir(),
-            LOG: own_log.iterdir(),
-        }
-        for what, own in files.items():
-            n_bytes = sum(file.stat().st_size for file in own)
-            yield {"iteration": k, "what": what, "n_bytes": n_bytes}
 
 
 def path_rows(iteration: int, robot: str, path: Float) -> pd.DataFrame:

@@ -185,11 +185,11 @@ def compare_methods(maps: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
     rows = []
     for first, second in combinations(methods_in(rich(maps)), 2):
         known = frame[[first, second]].notna().all(axis=1).to_numpy()
-        both, judged = frame[known], clusters._replace(codes=clusters.codes[known])
+        both, paired = frame[known], clusters._replace(codes=clusters.codes[known])
         change = log_ratio(both[first].to_numpy(), both[second].to_numpy())
-        ratio = intervals.median_interval(change, judged, rng)
+        ratio = intervals.median_interval(change, paired, rng)
         won = (change < 0) + 0.5 * (change == 0)
-        wins = intervals.weighted_mean_interval(won, np.ones(len(won)), judged, rng)
+        wins = intervals.weighted_mean_interval(won, np.ones(len(won)), paired, rng)
         row: dict[str, Any] = {"first": first, "second": second}
         row |= {"n_runs": both["run_id"].nunique(), "n_maps": len(both), "unit": clusters.unit}
         row |= Interval(*np.exp(ratio)).columns("ratio") | wins.columns("first_wins")
@@ -397,10 +397,10 @@ def _equal_to_first(standings: list[Standing], maps: pd.DataFrame, column: str) 
     values, is_share = paired_values(maps, column), column == "refined_success"
     p_values, near = [], []
     for standing in standings[1:]:
-        judged = values[[standings[0].aligner, standing.aligner]].dropna()  # by both
-        n, (first, own) = len(judged), judged.to_numpy(np.float64).T
+        paired = values[[standings[0].aligner, standing.aligner]].dropna()  # by both
+        n, (first, own) = len(paired), paired.to_numpy(np.float64).T
         changes = own - first if is_share else intervals.log_ratio(own, first)
-        run_id = judged.index.get_level_values("run_id")
+        run_id = paired.index.get_level_values("run_id")
         n_runs = maps["run_id"].nunique()
         of_runs = intervals.change_of_each_run(changes, run_id, n_runs, is_share)
         p_values.append(intervals.mean_change(of_runs).p)

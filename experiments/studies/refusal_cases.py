@@ -15,23 +15,25 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.checks import load_checked
 from experiments.evaluation.criteria import MERGEABLE_PAIRS
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.pair_evaluation import load_robot
+from experiments.evaluation.metrics import load_checked
 from experiments.evaluation.result import require_result
-from experiments.evaluation.truth import common_landmarks, true_pairs
+from experiments.evaluation.truth import EvaluatedRobot, common_landmarks, load_robot, true_pairs
 from experiments.pipeline.stages.slam import RobotFolders, evaluated_iterations, stored_maps
 from experiments.pipeline.store import Store
+from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import parse_seeds
-from experiments.scenario.settings import AnyScenario, Simulation
+from experiments.scenario.settings import AlignerEntry, AnyScenario, Simulation
 from experiments.scenario.suite import scenarios_of
+from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences, MatchParameters, match
+from mapfusion.align.refinement import Refinement
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.verification.registration import Registration
 
 APART, COMMON = "apart", "common"
 FEW, REPEATED = "few", "repeated"
@@ -62,6 +64,14 @@ class Case:
     T_true: Float
     poster_radius_m: float = np.nan
 
+    def refined_estimate(
+        self, entry: AlignerEntry, refinement: Refinement, rng: np.random.Generator
+    ) -> Alignment:
+        """Return the refined estimate of one aligner, without a verdict."""
+        aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+        registration = Registration(aligner, refinement, verifier=None)
+        return registration.register(self.map_a, self.map_b, self.pairs, rng).refined
+
 
 def apart(map_a: LandmarkMap, map_b: LandmarkMap, matching: MatchParameters) -> Case:
     """Return the case of maps of two worlds."""
@@ -89,8 +99,8 @@ def few(case: Case, rng: np.random.Generator) -> Case | None:
     position = case.map_a.position_m[case.pairs.index_a[true]]
     distance = np.linalg.norm(position - position[rng.integers(len(true))], axis=1)
     nearest = true[np.argsort(distance, kind="stable")[:MERGEABLE_PAIRS]]
-    kept = np.sort(np.concatenate([np.flatnonzero(~case.is_true), nearest]))
-    return replace(case, ground=FEW, pairs=case.pairs[kept], is_true=case.is_true[kept])
+    chosen = np.sort(np.concatenate([np.flatnonzero(~case.is_true), nearest]))
+    return replace(case, ground=FEW, pairs=case.pairs[chosen], is_true=case.is_true[chosen])
 
 
 def repeated(
@@ -163,7 +173,7 @@ class MappedWorld:
 
     def maps(self, robot: str) -> Mapping[int, LandmarkMap]:
         """Return the maps of one robot by iteration, without the truth."""
-        return stored_maps(self.folders[robot])
+        return stored_maps(self.folders[robot], viewing=True)
 
     def robots(self) -> list[EvaluatedRobot]:
         """Return the maps of all robots with the truth."""
@@ -212,11 +222,11 @@ def _world(label: str, name: str, scenario: AnyScenario, store: Store) -> Mapped
     """Return the world of a scenario, whose maps must be in the store."""
     if not isinstance(scenario, Simulation):
         raise InputError(f"{label}: made from recorded logs; only simulated worlds surely differ")
-    judged = EvaluatedRun.of(scenario, store)
-    for robot in judged.pipeline.simulated:
+    run = EvaluatedRun.of(scenario, store)
+    for robot in run.pipeline.simulated:
         if not all(store.folder(stage).finished for stage in (robot.log, robot.slam)):
             what = f"the maps of {robot.name} are not in {store.root} (made by another version?)"
             raise InputError(f"{label}: {what}; run its scenario again")
-    faces = judged.pipeline.simulated[0].features.before["faces"]
-    folders = {robot.name: judged.robot_folders(robot) for robot in judged.pipeline.robots}
+    faces = run.pipeline.simulated[0].features.before["faces"]
+    folders = {robot.name: run.robot_folders(robot) for robot in run.pipeline.robots}
     return MappedWorld(label, name, scenario, faces.key, folders)

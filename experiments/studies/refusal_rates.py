@@ -93,8 +93,8 @@ def share_up_to(score: pd.Series, thresholds: Float) -> Float:
     return np.searchsorted(values, thresholds, side="right") / max(len(score), 1)
 
 
-KEPT, AMBIGUOUS, TOO_UNCERTAIN, REFUSED = "accepted", "ambiguous", "too_uncertain", "refused"
-VERDICTS = (KEPT, AMBIGUOUS, TOO_UNCERTAIN, REFUSED)
+ACCEPTED, AMBIGUOUS, TOO_UNCERTAIN, REFUSED = "accepted", "ambiguous", "too_uncertain", "refused"
+VERDICTS = (ACCEPTED, AMBIGUOUS, TOO_UNCERTAIN, REFUSED)
 _MAPS = ["world_a", "robot_a", "world_b", "robot_b", "iteration"]
 _RUN = ["kind", "world_a", "robot_a", "robot_b"]  # and aligner: one series of maps
 
@@ -111,7 +111,7 @@ def unchanged_pairs(refusals: pd.DataFrame) -> pd.DataFrame:
 
 
 def right_answers(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return right answers with MERGEABLE_PAIRS or more true pairs, from rows of `as_they_came`."""
+    """Return rows of `unchanged_pairs` that are right, with MERGEABLE_PAIRS or more true pairs."""
     return rows[rows["right"] & (rows["n_true"] >= MERGEABLE_PAIRS)]
 
 
@@ -128,17 +128,12 @@ def by_kind(refusals: pd.DataFrame) -> list[dict[str, Any]]:
     for kind, all_methods in unchanged_pairs(refusals).groupby("kind"):
         for name, own in all_methods.groupby("aligner", sort=False):
             in_one_world = own[own["world_a"] == own["world_b"]]
-            apart, ground = without_common_ground(own), own[has_common_ground(own)]
-            right, beating = right_answers(own), own[own["beats_chance"]]
-            rates = {
-                "false_runs": Rate.of(in_one_world.groupby("world_a")["false"].any()),
-                "false_pairs": Rate.of(apart["false"]),
-                "false_by_chance": Rate.of(apart["beats_chance"]),
-                "wrong_pairs": Rate.of(ground["false"]),
-                "on_ground": Rate.of(ground["accepted"]),
+            beating = own[own["beats_chance"]]
+            rates = _false_merges(own) | {
+                "on_ground": Rate.of(own[has_common_ground(own)]["accepted"]),
                 "ambiguous": Rate.of(beating["verdict"] == AMBIGUOUS),
             }
-            rates |= {f"right_{each}": Rate.of(right["verdict"] == each) for each in VERDICTS}
+            rates |= _verdicts_on_right_answers(own)
             first = _first(in_one_world, "accepted", "")
             first |= _first(in_one_world, "beats_chance", "_by_chance")
             rows.append({"kind": str(kind), "aligner": name} | rates | first)
@@ -150,18 +145,29 @@ def of_any_method(refusals: pd.DataFrame) -> list[dict[str, Any]]:
 
     For false merges, a pair of maps or a run counts once for all aligners.
     """
-    rows = []
-    for kind, own in unchanged_pairs(refusals).groupby("kind"):
-        in_one_world, right = own[own["world_a"] == own["world_b"]], right_answers(own)
-        found = {
-            "false_runs": in_one_world.groupby("world_a")["false"].any(),
-            "false_pairs": _by_any(without_common_ground(own), "false"),
-            "false_by_chance": _by_any(without_common_ground(own), "beats_chance"),
-            "wrong_pairs": _by_any(own[has_common_ground(own)], "false"),
-        }
-        found |= {f"right_{verdict}": right["verdict"] == verdict for verdict in VERDICTS}
-        rows.append({"kind": str(kind)} | {name: Rate.of(hits) for name, hits in found.items()})
-    return rows
+    return [
+        {"kind": str(kind)} | _false_merges(own) | _verdicts_on_right_answers(own)
+        for kind, own in unchanged_pairs(refusals).groupby("kind")
+    ]
+
+
+def _false_merges(own: pd.DataFrame) -> dict[str, Rate]:
+    """Return the rates of false merges; a run or pair of maps counts once for all aligners."""
+    in_one_world = own[own["world_a"] == own["world_b"]]
+    apart = without_common_ground(own).groupby(_MAPS)
+    hits = {
+        "false_runs": in_one_world.groupby("world_a")["false"].any(),
+        "false_pairs": apart["false"].any(),
+        "false_by_chance": apart["beats_chance"].any(),
+        "wrong_pairs": own[has_common_ground(own)].groupby(_MAPS)["false"].any(),
+    }
+    return {name: Rate.of(each) for name, each in hits.items()}
+
+
+def _verdicts_on_right_answers(own: pd.DataFrame) -> dict[str, Rate]:
+    """Return the share of each verdict among right answers."""
+    verdicts = right_answers(own)["verdict"]
+    return {f"right_{verdict}": Rate.of(verdicts == verdict) for verdict in VERDICTS}
 
 
 def first_right_answers(refusals: pd.DataFrame) -> list[dict[str, Any]]:
@@ -179,11 +185,6 @@ def first_right_answers(refusals: pd.DataFrame) -> list[dict[str, Any]]:
         | _first(own, "beats_chance", "_by_chance")
         for name, own in in_reach.groupby("aligner", sort=False)
     ]
-
-
-def _by_any(rows: pd.DataFrame, column: str) -> pd.Series:
-    """Return True for each pair of maps for which a column is True for any aligner."""
-    return rows.groupby(_MAPS)[column].any()
 
 
 def _first(rows: pd.DataFrame, believed: str, suffix: str) -> dict[str, float]:
@@ -240,7 +241,7 @@ class Reliability(NamedTuple):
     n_wrong: int
 
 
-def judged_answers(refusals: pd.DataFrame) -> pd.DataFrame:
+def answers_with_probability(refusals: pd.DataFrame) -> pd.DataFrame:
     """Return the answers that beat chance and have a probability, with `right` and `run`."""
     rows = unchanged_pairs(refusals)
     rows = rows[rows["beats_chance"] & rows["probability"].notna()]
@@ -248,7 +249,7 @@ def judged_answers(refusals: pd.DataFrame) -> pd.DataFrame:
 
 
 def reliability(answers: pd.DataFrame, rng: np.random.Generator) -> Reliability:
-    """Compare the probabilities of `judged_answers` (at least one) with the truth."""
+    """Compare the probabilities of `answers_with_probability` (at least one) with the truth."""
     codes, runs = pd.factorize(answers["run"])
     stated = answers["probability"].to_numpy(float)
     right = answers["right"].to_numpy(float)

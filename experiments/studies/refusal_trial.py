@@ -14,11 +14,10 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.tables import table_path
-from experiments.pipeline.stages.match import latest_at
+from experiments.pipeline.stages.align import latest_at
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.tasks import OnProgress
 from experiments.pipeline.workers import workers
-from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import Simulation
 from experiments.studies import refusal_cases
@@ -34,7 +33,6 @@ from mapfusion.verification.false_alarms import (
     fewest_false_alarms,
     independent_pairs,
 )
-from mapfusion.verification.registration import Registration
 
 N_PAIRS_OF_MAPS = 5000
 N_CORRESPONDENCES = 40
@@ -150,7 +148,7 @@ class Crossing(NamedTuple):
 
 
 class PairsDrawn(NamedTuple):
-    """Numbers of pairs of maps to judge.
+    """Numbers of pairs of maps to evaluate.
 
     Attributes:
         n_apart: pairs from worlds of different seeds, for each kind of world, and as many from
@@ -301,14 +299,14 @@ def _answers(
     names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
     bound = np.log10(settings.acceptance.false_alarms)
     pairs = Pairs(case.map_a, case.map_b, case.pairs)
-    judged = settings.judge.on(pairs)  # evidence is computed once, for answers that beat chance
+    verifier = settings.verifier.on(
+        pairs
+    )  # evidence is computed once, for answers that beat chance
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)
-        aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-        registration = Registration(aligner, settings.refinement, verifier=None)
-        refined = registration.register(case.map_a, case.map_b, case.pairs, rng).refined
-        verdict = judged.verify(refined)
+        refined = case.refined_estimate(entry, settings.refinement, rng)
+        verdict = verifier.verify(refined)
         error = refined.T_a_b - case.T_true
         found = {
             "aligner": entry.name,

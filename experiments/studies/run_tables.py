@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from experiments.evaluation import tables
 from experiments.evaluation.criteria import RUN_KEYS, setting_columns
-from experiments.evaluation.result_files import read_scenario, require_tables
+from experiments.evaluation.tables import read_provenance, read_scenario, require_tables
 from experiments.studies.sweep_tables import SCHEMA_VERSION
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, require_version, row_groups, text_attributes
@@ -134,13 +134,26 @@ class Runs:
             rows.assign(sweep=str(sweep))
             for sweep in self.sweeps
             for path in _whole_files(sweep / "runs")
-            for rows in _read(RunPath(path, {}), "runs", _STATUS, ())
+            for rows in _read(RunPath(path, {}), "runs", _STATUS, ("renderer",))
         ]
-        none = pd.DataFrame(columns=["sweep", *RUN_KEYS, *_STATUS])
+        none = pd.DataFrame(columns=["sweep", *RUN_KEYS, *_STATUS, "renderer"])
         rows = pd.concat(parts, ignore_index=True) if parts else none
         for setting, value in self.only:
             rows = rows[rows[setting] == value] if setting in rows else rows.iloc[:0]
         return rows
+
+    @cached_property
+    def renderers(self) -> dict[str, str]:
+        """Name of the renderer of each run; "unknown" for runs that do not tell it."""
+        of_sweeps = self._run_rows[self._run_rows["renderer"].notna()]
+        found = dict.fromkeys(self.described["run_id"], "unknown")
+        found |= dict(zip(of_sweeps["run_id"], of_sweeps["renderer"], strict=True))
+        for result in self.results:
+            about = result.path / "provenance.json"
+            if about.is_file():
+                name = read_provenance(about).get("renderer", "unknown")
+                found[result.run["run_id"]] = str(name)
+        return found
 
     @property
     def failed(self) -> pd.DataFrame:

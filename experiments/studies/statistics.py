@@ -18,15 +18,15 @@ from experiments.evaluation.criteria import (
     absolute_errors,
     has_common_ground,
     is_false_merge,
+    is_used_by_team,
     right_refined,
     setting_columns,
     summarise_alignments,
     with_common_ground_at_any_time,
 )
 from experiments.evaluation.fused_landmarks import mean_nees_band
-from experiments.evaluation.fused_map_errors import last_fused
+from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.path_errors import STATISTICS
-from experiments.evaluation.team_errors import is_used_by_team
 from experiments.scenario.seeds import generator
 from experiments.studies import intervals
 from experiments.studies.method_comparison import (
@@ -161,19 +161,24 @@ def path_summary(path_statistics: pd.DataFrame, rng: np.random.Generator) -> pd.
     """
     rows = []
     for keys, own in path_statistics.groupby(_PATH_KEYS, sort=False, dropna=False):
-        runs = intervals.clusters_of(own)
-        row = dict(zip(_PATH_KEYS, keys, strict=True)) | {"n_runs": runs.n, "n_paths": len(own)}
-        row |= dict(own[list(STATISTICS)].median())
-        _, low, high = intervals.median_interval(own["rmse"].to_numpy(), runs, rng)
-        rows.append(row | {"rmse_low": low, "rmse_high": high})
+        row = dict(zip(_PATH_KEYS, keys, strict=True))
+        row |= {"n_runs": intervals.clusters_of(own).n, "n_paths": len(own)}
+        rows.append(row | _path_medians(own, rng))
     return pd.DataFrame(rows)
+
+
+def _path_medians(own: pd.DataFrame, rng: np.random.Generator) -> dict[str, float]:
+    """Return the median of each of evo's statistics, and the interval of the median rmse."""
+    runs = intervals.clusters_of(own)
+    _, low, high = intervals.median_interval(own["rmse"].to_numpy(), runs, rng)
+    return dict(own[list(STATISTICS)].median()) | {"rmse_low": low, "rmse_high": high}
 
 
 def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """Return the mean NEES per degree of freedom, before and after merging.
 
     Returns:
-        One row per kind of landmark (see `judge.tables`): landmarks, n_runs, n_landmarks,
+        One row per kind of landmark (see `evaluation.tables`): landmarks, n_runs, n_landmarks,
         nees_per_dof with its interval over runs, band_low and band_high (95 % band of the mean of
         n_landmarks independent landmarks), share_in_gate (0.95 if consistent) with its interval.
         Landmarks of one map drift together, so a mean outside the band does not prove that a
@@ -259,10 +264,8 @@ def team_paths(team: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     rows = []
     for source, own in team[team["component"] == 1].groupby("source", sort=False):
         row: dict[str, Any] = {"source": source, "n_runs": len(own)}
-        row |= dict(own[["n_robots", "n_team"]].sum()) | dict(own[list(STATISTICS)].median())
-        runs = intervals.clusters_of(own)
-        _, low, high = intervals.median_interval(own["rmse"].to_numpy(), runs, rng)
-        rows.append(row | {"rmse_low": low, "rmse_high": high})
+        row |= dict(own[["n_robots", "n_team"]].sum())
+        rows.append(row | _path_medians(own, rng))
     return pd.DataFrame(rows)
 
 
@@ -318,12 +321,7 @@ _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "team": (None, "team", team_paths, "team"),
     "team_pairs": (None, "team_pairs", team_alignments, "team_pairs"),
     "landmark_nees": (None, "nees", nees_of_maps, "nees"),
-    "smoother": (
-        SMOOTHER_COLUMNS,
-        "smoother",
-        smoother_summary,
-        "smoother",
-    ),
+    "smoother": (SMOOTHER_COLUMNS, "smoother", smoother_summary, "smoother"),
     "fusers": (FUSER_COLUMNS, "fusers", fuser_summary, "fusers"),
     "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
 }

@@ -23,7 +23,7 @@ from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import all_tables, measure_aligners, renderer
 from experiments.pipeline import cluster
 from experiments.pipeline.cluster import dask_client
-from experiments.pipeline.stages.memory import require_memory
+from experiments.pipeline.stages.pipeline import require_memory
 from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded
@@ -106,7 +106,7 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
 
 _LONGEST_NAME = 80
 _TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
-_TABLES += ("smoother", "team", "team_pairs", "fusers")
+_TABLES += ("sightings", "smoother", "team", "team_pairs", "fusers")
 
 
 class Sweep(NamedTuple):
@@ -175,32 +175,33 @@ def plan_run(
     Raises:
         InputError: the run is impossible.
     """
-    judged = EvaluatedRun.of(run.load(), store)
+    evaluated = EvaluatedRun.of(run.load(), store)
     if jobs is not None:
-        require_memory(judged.pipeline, jobs)
-    pipeline, stages = judged.pipeline, [f"{each.name}/{each.key}" for each in judged.stages()]
+        require_memory(evaluated.pipeline, jobs)
+    pipeline = evaluated.pipeline
+    stages = [f"{each.name}/{each.key}" for each in evaluated.stages()]
     read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam, robot.smooth)]
-    read += [*(pair.estimates for pair in pipeline.pairs), *judged.evaluations]
+    read += [*(pair.estimates for pair in pipeline.pairs), *evaluated.evaluations]
     read += pipeline.fusers.values()
     needs = tuple(name for stage in read for name in task_names(stage))
-    name, arguments = f"run/{run.run_id}", (run, judged, stages, tables.dataset)
+    name, arguments = f"run/{run.run_id}", (run, evaluated, stages, tables.dataset)
     last = Task(name, "write the tables", rows_of, arguments, (), needs)
-    tasks = judged.tasks | {name: last}
+    tasks = evaluated.tasks | {name: last}
     left = [] if tables.holds(run, stages) else unfinished(tasks, [name])
     return PlannedRun(run, stages, tasks, left)
 
 
 def rows_of(
-    run: SweepRun, judged: EvaluatedRun, stages: Sequence[str], dataset: SweepDataset
+    run: SweepRun, evaluated: EvaluatedRun, stages: Sequence[str], dataset: SweepDataset
 ) -> dict[str, pa.Table]:
     """Return a run's rows of all tables (work of the last task)."""
-    made = all_tables(judged, judged.team, _TABLES)
+    made = all_tables(evaluated, evaluated.team, _TABLES)
     times = [
         {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
-        for folder in judged.folders()
+        for folder in evaluated.folders()
         for name, seconds in folder.figures().items()
     ]
-    return dataset.finished(run, renderer(judged.scenario), stages, {**made, RUN_TIMES: times})
+    return dataset.finished(run, renderer(evaluated.scenario), stages, {**made, RUN_TIMES: times})
 
 
 @dataclass
@@ -499,6 +500,13 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
     Measurements are serial; nothing else may run on the machine. The store keeps the times of each
     run; the table is written file by file.
     """
+
+    def measured(run: SweepRun) -> pd.DataFrame:
+        evaluated = EvaluatedRun.of(run.load(), sweep.store)
+        evaluated.execute(1, lambda *_: None)  # makes damaged stages again; all others exist
+        measure_aligners(evaluated)
+        return evaluated.pair_table(ALIGNER_TIMINGS)
+
     single_threaded()
     label, done = "time the aligners", 0
     runs = [run for run in sweep.runs if run.run_id not in failed]
@@ -511,15 +519,8 @@ def measure_times(sweep: Sweep, failed: Collection[str], on_progress: OnProgress
                 on_progress(label, done, len(runs))
                 done += 1
                 if run.run_id not in timed:
-                    measured = retry_damaged(sweep.store, partial(_measured, sweep, run))
-                    rows[run.run_id] = sweep.dataset.rows(ALIGNER_TIMINGS, run, measured)
+                    timings = retry_damaged(sweep.store, partial(measured, run))
+                    rows[run.run_id] = sweep.dataset.rows(ALIGNER_TIMINGS, run, timings)
             if rows:
                 tables.replace(ALIGNER_TIMINGS, number, rows)
     on_progress(label, len(runs), len(runs))
-
-
-def _measured(sweep: Sweep, run: SweepRun) -> pd.DataFrame:
-    judged = EvaluatedRun.of(run.load(), sweep.store)
-    judged.execute(1, lambda *_: None)  # makes damaged stages again; all others exist
-    measure_aligners(judged)
-    return judged.pair_table(ALIGNER_TIMINGS)

@@ -30,9 +30,9 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ValidationError
 
 from experiments.evaluation import tables
-from experiments.evaluation.checks import load_checked
 from experiments.evaluation.criteria import absolute_errors, answerable
-from experiments.pipeline.code_version import library_versions, source_hash
+from experiments.evaluation.metrics import load_checked
+from experiments.pipeline.stage import library_versions, source_hash
 from experiments.pipeline.tables import FLOAT, TEXT, fields
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import DamagedFileError, InputError, StoreRepairWarning
@@ -374,8 +374,8 @@ def medians_over_runs(dataset: SweepDataset, runs: Sequence[SweepRun]) -> pd.Dat
         errors = read_parquet(file, "table errors", columns).to_pandas()
         errors = answerable(errors[errors["run_id"].isin(wanted)])
         given = {name: errors[of].notna() for name, of in zip(GIVEN, ERRORS, strict=True)}
-        judged = errors.assign(**given, **absolute_errors(errors, ERRORS))
-        groups = judged.groupby(["run_id", *leading, "aligner"], sort=False)
+        rows = errors.assign(**given, **absolute_errors(errors, ERRORS))
+        groups = rows.groupby(["run_id", *leading, "aligner"], sort=False)
         parts.append(groups[ERRORS].median().join(groups[GIVEN].mean()).reset_index())
     every = pd.concat(parts)
     every["setting"] = every[leading].agg(" ".join, axis=1) if len(every) else ""

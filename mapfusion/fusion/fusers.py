@@ -64,7 +64,8 @@ class FusedMap:
         duplicate_share: share of the landmarks that pass the gate and descriptor test with another
             landmark.
         left_out: name of each map that was not fused, with the reason.
-        fallback: reason for the use of a simpler fuser than the requested one; empty if none.
+        fallback: reason for the use of a simpler fuser than the requested one, or a defect of the
+            fused covariances; empty if none.
         paths: path of each member in the fused frame, shape (T_k, 3); empty if the fuser does not
             estimate paths.
     """
@@ -233,12 +234,17 @@ GROUP = "mapfusion.fusers"
 FUSERS = {
     "kalman": "mapfusion.fusion.kalman:Kalman",
     "kalman-drift": "mapfusion.fusion.kalman:KalmanDrift",
+    "kalman_as_printed": "mapfusion.fusion.kalman:KalmanAsPrinted",
     "covariance_intersection": "mapfusion.fusion.covariance_intersection:CovarianceIntersection",
     "joint": "mapfusion.fusion.joint:JointFuser",
     "batch": "mapfusion.fusion.batch:Batch",
 }
 # Reference that smooths all logs jointly, which is much slower than the other fusers.
 REFERENCE = "batch"
+# The paper's fuser with the wrong sign of eq. 13.
+AS_PRINTED = "kalman_as_printed"
+# Fusers of scenarios that name none.
+COMPARED = tuple(name for name in FUSERS if name not in (REFERENCE, AS_PRINTED))
 USUAL = "joint"  # default fuser
 
 

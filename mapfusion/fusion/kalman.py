@@ -1,10 +1,11 @@
-"""Kalman fusion of pairs of landmarks (eq. 12-16), with and without the drift of the maps.
+"""Kalman fusion of pairs of landmarks (eq. 12-16): corrected, with drift, and as printed.
 
 Maps are fused one after the other. Landmarks are paired by the inliers of the alignments first, and
 the remaining ones by gate and descriptor. Landmarks without a partner are kept.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -117,6 +118,19 @@ def kalman_update(
     return position, (covariance + np.swapaxes(covariance, 1, 2)) / 2
 
 
+def kalman_update_as_printed(
+    position_i: Float, covariance_i: Float, position_j: Float, covariance_j: Float
+) -> tuple[Float, Float]:
+    """Fuse pairs of landmarks with the printed sign of eq. 13, L_F = L_i + K (L_i - L_j).
+
+    The fused landmark moves away from L_j, by as much as the correct one moves towards it. Eq. 14
+    does not depend on the sign, so the covariance states a precision that the position lacks.
+    Arguments and results are those of `kalman_update`.
+    """
+    position, covariance = kalman_update(position_i, covariance_i, position_j, covariance_j)
+    return 2 * position_i - position, covariance
+
+
 class Kalman:
     """Kalman fusion with the covariances of the filter, as in the paper."""
 
@@ -135,3 +149,25 @@ class KalmanDrift:
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the maps of a component."""
         return fuse_sequentially(component, parameters, kalman_update, use_drift=True)
+
+
+class KalmanAsPrinted:
+    """Kalman fusion with eq. 13 as printed, to show the effect of its sign."""
+
+    smoothed = False
+
+    def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
+        """Fuse the maps of a component; `fallback` reports covariances that are not positive."""
+        fused = fuse_sequentially(component, parameters, kalman_update_as_printed, use_drift=False)
+        return replace(fused, fallback=_indefinite_covariances(fused))
+
+
+def _indefinite_covariances(fused: FusedMap) -> str:
+    """Return how many fused covariances are not positive definite; empty if all are."""
+    dimensions = 2 if fused.landmarks.planar else 3
+    several = np.count_nonzero(fused.parents != ABSENT, axis=1) > 1
+    covariance = fused.landmarks.covariance_m2[several, :dimensions, :dimensions]
+    n_wrong = int(np.count_nonzero(np.linalg.eigvalsh(covariance)[:, 0] <= 0))
+    if not n_wrong:
+        return ""
+    return f"{n_wrong} of {len(covariance)} fused covariances are not positive definite"

@@ -1,6 +1,6 @@
 """Coefficients of `probability.py`.
 
-As `python -m experiments.studies.refusal.fit_probability` fits them.
+As `python -m experiments.studies.verdict_fitting probability` fits them.
 
 Of 6154 alignments, 4392 of them right, of seeds 0 to 4 of alias_copy, alias_copy_apart,
 alias_light, alias_mirror, alias_posters, alias_posters_apart, alias_rooms, alias_rooms_apart,

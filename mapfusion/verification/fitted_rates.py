@@ -1,6 +1,6 @@
 """Rates of `likelihood.py`: two parameters of what must be seen, and two of what may be.
 
-Written by `python -m experiments.studies.refusal.fit_rates`.
+Written by `python -m experiments.studies.verdict_fitting rates`.
 
 Of 1908 regions under right motions and 2659 under wrong ones, of seeds 0 to 4 of
 full, alias_light, alias_light_apart. Of the right ones 0.4% are as under a wrong one.

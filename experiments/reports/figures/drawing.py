@@ -11,13 +11,13 @@ import io
 import pkgutil
 import time
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache, cached_property
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from experiments.evaluation.tables import table_path
-from experiments.pipeline.code_version import imported_sources, library_versions, source_hash
+from experiments.pipeline.stage import imported_sources, library_versions, source_hash
 from experiments.pipeline.workers import Workers, workers
 from mapfusion.files import read_json, write_json, write_whole
 
@@ -33,7 +33,8 @@ class _Figure(NamedTuple):
     Attributes:
         module: module of this package with the function.
         function: draws the figure from `ResultTables`.
-        caption: caption in reports.
+        caption: first sentence of the caption; the label of the figure may add sentences that
+            depend on the data.
         reads: names of the tables that the function reads, and `scenario` if it reads this.
     """
 
@@ -56,30 +57,34 @@ _REGISTRY = {
         "map_figures",
         "draw_two_maps",
         "Figure 2: the local maps of two robots before alignment, each in its own frame.",
-        ("clouds", "landmarks", "paths", "robots", "scenario", "smoothed_paths"),
+        ("clouds", "map_history", "paths", "robots", "scenario", "sightings", "smoothed_paths"),
     ),
     "fig03_dispersion": _Figure(
         "slam_figures",
         "draw_dispersion",
-        "Figure 3: dispersion of the particles along the paths, and its fall at known ground.",
-        ("clouds", "paths", "robots"),
+        "Figure 3: dispersion of the particles along the paths.",
+        ("clouds", "paths", "robots", "sightings"),
     ),
     "fig04_translation_error": _Figure(
         "error_figures",
         "draw_translation_error",
-        "Figure 4: error of the alignments' translation against the iteration.",
+        "Figure 4: error of the alignments' translation against the iteration. Of lines that "
+        "coincide, the narrow ones are drawn above the wide ones. A line ends where the method has "
+        "no answer.",
         _ANSWERS,
     ),
     "fig05_rotation_error": _Figure(
         "error_figures",
         "draw_rotation_error",
-        "Figure 5: signed error of the alignments' rotation against the iteration.",
+        "Figure 5: signed error of the alignments' rotation against the iteration, drawn as in "
+        "figure 4.",
         _ANSWERS,
     ),
     "fig06_aligner_time": _Figure(
         "error_figures",
         "draw_aligner_time",
-        "Figure 6: time of the aligners against the number of overlapping points.",
+        "Figure 6: time of the aligners against the number of overlapping points. Points and bars "
+        "of one pair of maps are set apart.",
         ("aligner_timings", *_ANSWERS),
     ),
     "fig07_correspondences": _Figure(
@@ -120,7 +125,7 @@ _REGISTRY = {
     ),
 }
 FIGURES = tuple(_REGISTRY)
-_RECORD = "drawn.json"
+_RECORD, _TEXT = "drawn.json", ".txt"
 # The resolution of an SVG is of the parts drawn as pixels, which make up most of the file.
 _DPI = {"png": 200, "svg": 150}
 # No date: the same tables give the same bytes. PNG files are compressed faster, and less.
@@ -151,21 +156,13 @@ class _Record:
     def __init__(self, result: Path) -> None:
         self._result = result
         self._file = result / "figures" / _RECORD
-        self._now: dict[str, dict[str, Any]] = {}  # new entries
-
-    @cached_property
-    def _known(self) -> dict[str, Any]:
-        """The record of the last drawing; empty if there is no readable one."""
         try:
-            return dict(read_json(self._file, "record of drawn figures")["figures"])
+            self._known = dict(read_json(self._file, "record of drawn figures")["figures"])
         except (OSError, KeyError, TypeError, ValueError):
-            return {}
-
-    @cached_property
-    def _common_inputs(self) -> str:
-        """Digest of the inputs of all figures."""
-        frames = sorted((self._result / "keyframes").glob("*.png"))
-        return _digest([self._result / "world.json", *frames])
+            self._known = {}  # there is no readable record of the last drawing
+        self._now: dict[str, dict[str, Any]] = {}  # new entries
+        frames = sorted((result / "keyframes").glob("*.png"))
+        self._common_inputs = _digest([result / "world.json", *frames])  # of all figures
 
     def unchanged(self, name: str) -> Drawn | None:
         """Return the last drawing of a figure if its inputs and pictures have not changed."""
@@ -174,15 +171,15 @@ class _Record:
         scenario = [self._result / "scenario.json"] if "scenario" in reads else []
         inputs = _digest([*tables, *scenario]) + self._common_inputs
         self._now[name] = {"code": _code(name), "inputs": inputs}
-        known, pictures = self._known.get(name), _pictures(self._result, name)
+        known, files = self._known.get(name), _files(self._result, name)
         if not isinstance(known, dict) or known.get("code") != _code(name):
             return None
-        if known.get("inputs") != inputs or known.get("pictures") != _digest(pictures):
+        if known.get("inputs") != inputs or known.get("pictures") != _digest(files):
             return None
         skipped, elapsed_s = known.get("skipped"), known.get("elapsed_s")
         if not isinstance(skipped, str) or not isinstance(elapsed_s, float):
             return None
-        shown = [file for file in pictures if file.is_file()]
+        shown = [file for file in files if file.suffix != _TEXT and file.is_file()]
         return Drawn(shown, [skipped] if skipped else [], {name: elapsed_s})
 
     def write(self, outcomes: Mapping[str, Drawn]) -> None:
@@ -190,7 +187,7 @@ class _Record:
         figures = {
             name: self._now[name]
             | {
-                "pictures": _digest(_pictures(self._result, name)),
+                "pictures": _digest(_files(self._result, name)),
                 "skipped": "".join(drawn.skipped),
                 "elapsed_s": drawn.elapsed_s[name],
             }
@@ -220,8 +217,10 @@ def _versions() -> list[str]:
     return [*library_versions().values(), *drawing]
 
 
-def _pictures(result: Path, name: str) -> list[Path]:
-    return [result / "figures" / f"{name}.{kind}" for kind in _DPI]
+def _files(result: Path, name: str) -> list[Path]:
+    """Return the pictures of a figure and its caption."""
+    suffixes = [*(f".{kind}" for kind in _DPI), _TEXT]
+    return [result / "figures" / f"{name}{suffix}" for suffix in suffixes]
 
 
 class Drawing:
@@ -301,7 +300,7 @@ def draw_all(
 def remove_figures(result: Path) -> None:
     """Remove the figures of an earlier run from a result folder."""
     for name in FIGURES:
-        for picture in _pictures(result, name):
+        for picture in _files(result, name):
             picture.unlink(missing_ok=True)
     (result / "figures" / _RECORD).unlink(missing_ok=True)
 
@@ -318,21 +317,36 @@ def draw_figure(data: ResultTables, name: str, folder: Path | None = None) -> Dr
     try:
         entry = _REGISTRY[name]
         draw = pkgutil.resolve_name(f"{__package__}.{entry.module}:{entry.function}")
-        files = save_figure(folder, name, draw, data)
+        files = save_figure(folder, name, draw, data, caption=entry.caption)
     except NothingToDraw as reason:
-        for kind in _DPI:
-            (folder / f"{name}.{kind}").unlink(missing_ok=True)
+        for suffix in (*(f".{kind}" for kind in _DPI), _TEXT):
+            (folder / f"{name}{suffix}").unlink(missing_ok=True)
         skipped = [f"{name}: {reason}"]
     return Drawn(files, skipped, {name: time.perf_counter() - started_s})
 
 
-def caption(name: str) -> str:
-    """Return the caption of one of `FIGURES`."""
-    return _REGISTRY[name].caption
+def caption(name: str, folder: Path) -> str:
+    """Return the caption of one of `FIGURES`: the text beside its picture, if there is one."""
+    file = folder / f"{name}{_TEXT}"
+    own = file.read_text(encoding="utf-8", errors="replace").strip() if file.is_file() else ""
+    return own or _REGISTRY[name].caption
 
 
-def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any) -> list[Path]:
-    """Write the figure `draw(*data)` in the common style and all formats; return the files."""
+def save_figure(
+    folder: Path, name: str, draw: Callable[..., Figure], *data: Any, caption: str = ""
+) -> list[Path]:
+    """Write the figure `draw(*data)` in the common style and all formats.
+
+    Args:
+        folder: folder of the files.
+        name: name of the files.
+        draw: returns the figure. The label of the figure is appended to the caption.
+        data: arguments of `draw`.
+        caption: text that is written beside the pictures; none if empty.
+
+    Returns:
+        The pictures.
+    """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
@@ -341,6 +355,9 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
     files = [folder / f"{name}.{kind}" for kind in _DPI]
     with house_style():
         figure = draw(*data)
+        if caption:
+            text = f"{caption} {figure.get_label()}".strip() + "\n"
+            write_whole(folder / f"{name}{_TEXT}", lambda path: path.write_bytes(text.encode()))
         # Lay out the figure once for all formats, at the resolution of the first one.
         engine = figure.get_layout_engine()
         if engine is not None:
@@ -352,12 +369,8 @@ def save_figure(folder: Path, name: str, draw: Callable[..., Figure], *data: Any
         with matplotlib.rc_context({"figure.constrained_layout.use": False}):
             figure.set_layout_engine(None)
             for file, kind in zip(files, _DPI, strict=True):
-                picture = _picture(figure, kind)
+                stream = io.BytesIO()
+                figure.savefig(stream, format=kind, dpi=_DPI[kind], **_SAVED[kind])
+                picture = stream.getvalue()
                 write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
     return files
-
-
-def _picture(figure: Figure, kind: str) -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, format=kind, dpi=_DPI[kind], **_SAVED[kind])
-    return stream.getvalue()

@@ -1,5 +1,6 @@
 """Figures of measured errors and times: aligners (4 to 6) and fusers (11 and 12)."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from matplotlib.ticker import (
 )
 
 from experiments.evaluation.criteria import ANSWERABLE_PAIRS, ORACLE
-from experiments.evaluation.fused_map_errors import FILTERED, FUSED, SMOOTHED
+from experiments.evaluation.map_errors import FILTERED, FUSED, SMOOTHED
 from experiments.evaluation.tables import UNKNOWN
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, of_pair
 from experiments.reports.figures.style import (
@@ -41,16 +42,20 @@ _SCARCE_STYLE = {"color": PALE_GRAY, "alpha": 0.5, "linewidth": 0}
 # Bands and long lines are drawn as pixels: with one point per iteration, their outlines alone would
 # make an SVG of megabytes.
 _MAX_VECTOR_POINTS = 200
+_HEADROOM = 1.3  # ratio of the end of an axis to the largest value
 _FLOOR_M = 1e-4  # a tenth of a millimetre: smaller errors do not matter to a robot
 # The axis is linear up to here and logarithmic beyond: good alignments err by a few thousandths of
 # a radian, bad ones by tenths or more, and both must be legible.
-_LINEAR_RAD = 0.01
+_LINEAR_RAD = 0.001
+# Lines that coincide stay visible: each is drawn above the one before, and narrower.
+_WIDEST, _NARROWEST = 3.2, 0.9  # points
 _ROTATION_NOTE = f"""FastSLAM iteration k
 error = estimate - truth, counter-clockwise positive (the paper's sign is the opposite); \
 axis linear within ±{_LINEAR_RAD} rad"""
 
 # Figure 6. A line joins the points of one run while they are few, else medians of groups of points.
 _MAX_JOINED = 16
+_BARS_APART = 0.02  # width of the bars of all aligners beside each other, as a share of the axis
 _TIME_AXES = {
     "n_common": "overlapping points (true common landmarks)",
     "n_correspondences": "correspondences given to the aligner",
@@ -84,7 +89,10 @@ def draw_translation_error(data: ResultTables) -> Figure:
     axes = figure.axes[0]
     axes.set_yscale("log", nonpositive="clip")
     write_plainly(axes.yaxis)
-    axes.set_ylim(max(drawn.min(), _FLOOR_M) / 1.3, max(drawn.max(), 2 * _FLOOR_M) * 1.3)
+    # The axis begins at a power of ten, whose tick has a number.
+    lowest = max(drawn.min(), _FLOOR_M) / _HEADROOM
+    highest = max(drawn.max(), 2 * _FLOOR_M) * _HEADROOM
+    axes.set_ylim(10.0 ** math.floor(math.log10(lowest)), highest)
     return figure
 
 
@@ -94,8 +102,8 @@ def draw_rotation_error(data: ResultTables) -> Figure:
     axes = figure.axes[0]
     axes.set_yscale("symlog", linthresh=_LINEAR_RAD, linscale=1.0)
     axes.yaxis.set_major_formatter(plain_numbers())
-    largest = max(np.abs(drawn).max(), _LINEAR_RAD)
-    axes.set_ylim(-1.3 * largest, 1.3 * largest)
+    largest = _HEADROOM * max(np.abs(drawn).max(), _LINEAR_RAD)
+    axes.set_ylim(-largest, largest)
     figure.supxlabel(_ROTATION_NOTE, fontsize=8)
     return figure
 
@@ -163,6 +171,7 @@ def _draw_panel(axes: Axes, data: ResultTables, bands: pd.DataFrame, column: str
     """Draw medians and bands of one quantity for all aligners."""
     shown = [f"{column}_low", column, f"{column}_high"]
     curves = dict(iter(bands.sort_values("iteration").groupby("aligner")))
+    widths = np.linspace(_WIDEST, _NARROWEST, len(data.aligners))
     for place, name in enumerate(data.aligners):
         curve = curves.get(name, bands[:0])
         iteration = curve["iteration"].to_numpy()
@@ -173,7 +182,8 @@ def _draw_panel(axes: Axes, data: ResultTables, bands: pd.DataFrame, column: str
         line = data.styles[name] | {
             "label": name,
             "markevery": (place * step // len(data.aligners), step),
-            "zorder": 3 if name == ORACLE else 2,
+            "linewidth": widths[place],
+            "zorder": 2 + 0.01 * place,
             "rasterized": len(curve) > _MAX_VECTOR_POINTS,
         }
         axes.plot(iteration, middle, **line)
@@ -191,28 +201,35 @@ def draw_aligner_time(data: ResultTables) -> Figure:
     figure = Figure(figsize=(PAGE_WIDTH_IN, 3.4))
     panels = figure.subplots(1, 2, sharey=True)
     timed = dict(list(timings.groupby("aligner")))
+    shown = list(filter(timed.__contains__, data.aligners))
     for axes, (column, label) in zip(panels, _TIME_AXES.items(), strict=True):
-        for name in filter(timed.__contains__, data.aligners):
+        # The bars of the aligners are set apart, since they are timed on the same maps.
+        step = _BARS_APART * float(timings[column].max()) / max(len(shown), 1)
+        for place, name in enumerate(shown):
             known = timed[name][timed[name][column] != UNKNOWN]
             if len(known):
-                _add_times(axes, data, name, known, column)
+                shift = step * (place - (len(shown) - 1) / 2)
+                _add_times(axes, data, name, known, column, shift)
         if not axes.lines:
             axes.text(0.5, 0.5, "no truth: unknown", ha="center", transform=axes.transAxes)
         axes.set(xlabel=label, yscale="log")
         write_plainly(axes.yaxis)
     panels[0].set_ylabel("time of one alignment (s)")
-    shown = [(n, label) for n, label in data.labels.items() if n in timed or label != n]
-    aligner_legend(figure, {label: data.styles[name] for name, label in shown}, columns=5)
+    named = [(n, label) for n, label in data.labels.items() if n in timed or label != n]
+    aligner_legend(figure, {label: data.styles[name] for name, label in named}, columns=5)
     return figure
 
 
-def _add_times(axes: Axes, data: ResultTables, name: str, rows: pd.DataFrame, column: str) -> None:
-    """Draw the times of one aligner against a column."""
+def _add_times(
+    axes: Axes, data: ResultTables, name: str, rows: pd.DataFrame, column: str, shift: float
+) -> None:
+    """Draw the times of one aligner against a column; bars are shifted along the axis."""
     style = data.styles[name]
     joined = len(rows) if len(rows) <= _MAX_JOINED and not data.several_runs else TIME_GROUPS
     bands = time_bands(rows, column, joined)
     spread = bands if data.several_runs else rows
-    ends = (spread[column], spread["elapsed_low_s"], spread["elapsed_high_s"])
+    at = spread[column] if data.several_runs else spread[column] + shift
+    ends = (at, spread["elapsed_low_s"], spread["elapsed_high_s"])
     dots = {"color": style["color"], "marker": style["marker"], "linestyle": "none"}
     if data.several_runs:
         axes.fill_between(*ends, color=style["color"], alpha=0.16, linewidth=0)
@@ -220,7 +237,8 @@ def _add_times(axes: Axes, data: ResultTables, name: str, rows: pd.DataFrame, co
     else:
         axes.vlines(*ends, color=style["color"], linewidth=0.5, alpha=0.5, rasterized=True)
         dots |= {"markersize": 2.5, "alpha": 0.6}
-    axes.plot(rows[column], rows["elapsed_s"], rasterized=True, **dots)
+    place = rows[column] if data.several_runs else at
+    axes.plot(place, rows["elapsed_s"], rasterized=True, **dots)
     zorder = 4 if name == ORACLE else 3
     axes.plot(bands[column], bands["elapsed_s"], label=name, zorder=zorder, **style)
 

@@ -23,7 +23,7 @@ _OUTLIER_SHARE = 0.005  # on each side: a distant outlier must not shrink the ma
 _SURROUNDINGS = 1.0  # walls are shown up to this distance, as a multiple of the map's extent
 _MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
 _LABELS_WIDTH_IN, _LABELS_HEIGHT_IN = 0.55, 0.65  # labels and titles of each panel
-_LEGEND_ROW_IN, _LEGEND_FRAME_IN = 0.16, 0.2
+_LEGEND_ROW_IN, _LEGEND_FRAME_IN, _TITLE_LINE_IN = 0.16, 0.2, 0.15
 
 
 def start_plan(axes: Axes, data: ResultTables, robot: str) -> list[Float]:
@@ -151,4 +151,6 @@ def finish_plans(
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, **legend)
     rows = -(-len(handles) // columns) + ("title" in legend)
     plans_in = height_of_row(panels, PAGE_WIDTH_IN / len(panels))
+    # a title of several lines needs more than the labels' height
+    plans_in += _TITLE_LINE_IN * max(axes.get_title().count("\n") for axes in panels)
     figure.set_figheight(plans_in + (_LEGEND_ROW_IN * rows + _LEGEND_FRAME_IN))

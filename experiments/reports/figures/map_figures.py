@@ -17,7 +17,8 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
-from experiments.pipeline.tables import unpacked
+from experiments.evaluation.loop_closures import WINDOW_FRAMES, loop_closures
+from experiments.pipeline.stages.align import unpacked
 from experiments.reports.figures import floor_plan as plan
 from experiments.reports.figures.result_tables import (
     FusedPairs,
@@ -26,7 +27,7 @@ from experiments.reports.figures.result_tables import (
     ResultTables,
     of_pair,
 )
-from experiments.reports.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN
+from experiments.reports.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN, PURPLE
 from mapfusion.files import POSITION_FIELDS
 from mapfusion.geometry.numerics import Float
 
@@ -35,7 +36,7 @@ from mapfusion.geometry.numerics import Float
 _OUTLIER_SHARE, _OUTLIER_MARGIN = 0.005, 0.05
 _GAP = 0.15  # between the two maps, as a share of the width of the first map
 _MIN_HEIGHT = 0.2  # of the box, as a share of its length: rooms are low; the axis labels stay true
-_MAX_LINES = 80  # of each kind: more would hide the maps
+_MAX_LINES, _LEAST_LINES = 30, 8  # of both kinds together, and of the rarer kind
 _PADDING_IN = 0.08  # around the box with its labels
 _FITTING_STEPS = 4  # labels do not scale with the box, so its size is found by iteration
 # Drawn as pixels; the enlarged box reaches beyond the rectangle of the axes.
@@ -49,6 +50,7 @@ _MARGIN = 1.15
 # Figure 9
 _ZOOM_LANDMARKS = 5  # legible number for the size of the panel
 _ZOOM_MARGIN = 1.1  # of the side
+_LEAST_DISTANCE_M = 1e-6  # of two landmarks, for a division
 _MAX_CANDIDATES = 500  # squares to choose from; each is compared with all landmarks
 
 # Figure 10
@@ -56,27 +58,29 @@ _ROBOT_MARKERS = ("*", "^", "v", "x", "d")
 
 
 def draw_two_maps(data: ResultTables) -> Figure:
-    """Draw landmarks with ellipses, both paths and the last particles of two unaligned maps."""
-    robots = [robot for robot in data.robots if len(data.landmarks_of(robot)[0])][:2]
-    if not robots:
-        raise NothingToDraw("no robot has a landmark in its map")
+    """Draw landmarks with ellipses, both paths and the particles of two unaligned maps.
+
+    If one robot has closed a loop while another has not, the maps are those of this time.
+    """
+    robots, k, about = choose_two_maps(data)
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
+    figure.set_label(about)
     panels = figure.subplots(1, len(robots), squeeze=False)[0]
-    particles: dict[str, Float] = {}  # of the last iteration, shape (M, 2)
-    for robot in robots:
-        clouds = data.of_robot("clouds", robot)
-        last = clouds["iteration"] == clouds["iteration"].max()
-        particles[robot] = clouds.loc[last, ["x_m", "y_m"]].to_numpy()
-    extent_m = min(
-        float(np.ptp(data.landmarks_of(robot)[0][:, :2], axis=0).max()) for robot in robots
-    )
+    clouds = data.table("clouds")
+    stored = clouds.loc[clouds["iteration"] <= k, "iteration"].max()
+    now = clouds[clouds["iteration"] == stored]
+    particles: dict[str, Float] = {
+        robot: now.loc[now["robot"] == robot, ["x_m", "y_m"]].to_numpy() for robot in robots
+    }
+    maps = {robot: data.plan_at(robot, k) for robot in robots}
+    extent_m = min(float(np.ptp(maps[robot][0], axis=0).max()) for robot in robots)
     widest_m = max(
         (float(np.ptp(p, axis=0).max()) for p in particles.values() if len(p)), default=0
     )
     magnification = plan.magnification(extent_m, widest_m)
     for axes, robot in zip(panels, robots, strict=True):
-        position, covariance = data.landmarks_of(robot)
-        path, colour, own = data.path_of(robot), data.colours[robot], particles[robot]
+        position, covariance = maps[robot]
+        path, colour, own = data.path_of(robot)[: k + 1], data.colours[robot], particles[robot]
         walls = plan.start_plan(axes, data, robot)
         points = {"marker": ".", "markersize": 1.5, "color": colour, "zorder": 2}
         plan.add_points(axes, position, label="landmarks", **points)
@@ -85,22 +89,65 @@ def draw_two_maps(data: ResultTables) -> Figure:
         axes.plot(*path.T, color=GRAY, label="path of the best particle", zorder=3)
         if len(smoothed := data.smoothed_path_of(robot)):
             line = {"color": BLACK, "linewidth": 0.5, "zorder": 4}
-            axes.plot(*smoothed.T, label="path of the smoother", **line)
+            axes.plot(*smoothed[: k + 1].T, label="path of the smoother", **line)
         start = {"linestyle": "none", "marker": "o", "color": BLACK}
         axes.plot(0, 0, label="start pose, the map's frame", **start)
         mean = own.mean(axis=0) if len(own) else 0.0
         points = {"marker": ".", "markersize": 2.5, "markeredgewidth": 0, "color": BLACK}
-        label = "particles at the end"
+        label = f"particles at k = {stored}"
         label += f", spread x{magnification}" if magnification > 1 else ""
         plan.add_points(axes, mean + magnification * (own - mean), label=label, zorder=5, **points)
         plan.add_frame(axes)
         n_landmarks = plan.set_view(axes, position, path, walls)
-        axes.set_title(f"{robot}: {n_landmarks}\n({data.sightings})")
+        axes.set_title(f"{robot}, k = {k}: {n_landmarks}\n({data.sightings})")
     plan.set_one_scale(panels)
     handles, _ = panels[0].get_legend_handles_labels()
     handles.insert(1, plan.ellipse_handle(data.colours[robots[0]]))
     plan.finish_plans(figure, panels, handles, 3)
     return figure
+
+
+def choose_two_maps(data: ResultTables) -> tuple[list[str], int, str]:
+    """Return two robots, an evaluated iteration, and what the caption says about their loops.
+
+    The first robot has closed a loop and the second has not, at the first evaluated iteration for
+    which this holds, a window after the closure. Else the first two robots at the end are chosen.
+
+    Raises:
+        NothingToDraw: no robot has a landmark, or the result has no history of maps.
+    """
+    if not data.has("map_history"):
+        raise NothingToDraw("made before the maps of all iterations were stored: run it again")
+    history = data.table("map_history")
+    robots = [robot for robot in data.robots if (history["robot"] == robot).any()]
+    if not robots:
+        raise NothingToDraw("no robot has a landmark in its map")
+    last = int(history["iteration"].max())
+    if not data.has("sightings"):
+        return robots[:2], last, "The result was made before loop closures were stored."
+    closed_at: dict[str, int] = {}
+    for closure in loop_closures(data.rows("sightings"), data.table("robots")):
+        closed_at.setdefault(closure.robot, closure.iteration)
+    evaluated = np.sort(history["iteration"].unique())
+    for robot, closed in sorted(closed_at.items(), key=lambda each: each[1]):
+        later = evaluated[evaluated >= closed + WINDOW_FRAMES]
+        open_robots = [
+            name
+            for name in robots
+            if len(later) and name != robot and closed_at.get(name, last + 1) > later[0]
+        ]
+        if open_robots:
+            other = open_robots[0]
+            at = data.table("robots").set_index(["iteration", "robot"])["spread_m"]
+            k, spreads = int(later[0]), [1e3 * at[int(later[0]), name] for name in (robot, other)]
+            about = (
+                f"{robot} has closed a loop at k = {closed}, {other} has not closed one yet; their "
+                f"particles spread by {spreads[0]:.2g} and {spreads[1]:.2g} mm (RMS)."
+            )
+            return [robot, other], k, about
+    named = [f"{name} at k = {k}" for name, k in closed_at.items()]
+    told = f"First loop closures: {', '.join(named)}." if named else "No robot closes a loop."
+    return robots[:2], last, told
 
 
 def draw_correspondences(data: ResultTables) -> Figure:
@@ -146,7 +193,7 @@ def _without_outliers(position_m: Float) -> Float:
     return np.where(inside[:, None], position_m, np.nan)
 
 
-def judge_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, tuple[str, str]]:
+def classify_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, tuple[str, str]]:
     """Classify the last correspondences as right or wrong.
 
     The truth decides where it is known, else the refined inliers of the first aligner that has any.
@@ -174,18 +221,22 @@ def _add_correspondences(
 ) -> None:
     """Draw a sample of the right and of the wrong correspondences as lines."""
     rows = data.last_correspondences(pair)
-    right, names = judge_correspondences(data, pair)
+    right, names = classify_correspondences(data, pair)
     ends = np.stack([position_a[rows["index_a"]], position_b[rows["index_b"]]], axis=1)
     drawable = np.isfinite(ends).all(axis=(1, 2))
     styles: tuple[dict[str, Any], ...] = (
-        {"colors": GRAY, "linewidths": 0.3, "linestyles": (0, (4, 2))},
-        {"colors": BLACK, "linewidths": 0.6, "alpha": 0.7},
+        {"colors": PURPLE, "linewidths": 1.0, "linestyles": (0, (4, 2))},
+        {"colors": BLACK, "linewidths": 0.7},
     )
-    for chosen, name, style in zip((~right, right), names[::-1], styles, strict=True):
+    n_right, n_all = np.count_nonzero(right & drawable), max(np.count_nonzero(drawable), 1)
+    share = round(_MAX_LINES * n_right / n_all)
+    n_lines = int(np.clip(share, _LEAST_LINES, _MAX_LINES - _LEAST_LINES))
+    counts = (_MAX_LINES - n_lines, n_lines)
+    for chosen, name, style, most in zip((~right, right), names[::-1], styles, counts, strict=True):
         if not chosen.any():
             continue
         candidates = np.flatnonzero(chosen & drawable)
-        n_drawn = min(len(candidates), _MAX_LINES)
+        n_drawn = min(len(candidates), most)
         drawn = candidates[np.linspace(0, len(candidates) - 1, n_drawn).astype(int)]
         sample = f", {n_drawn} drawn" if n_drawn < chosen.sum() else ""
         label = f"{name}: {chosen.sum()}{sample}"
@@ -315,11 +366,23 @@ def draw_aligned_maps(data: ResultTables) -> Figure:
             plan.add_ellipses(axes, position[k], covariance[k], **style)
     plan.set_view(overview, fused, fused[:0])
     zoom.set(xlim=(x, x + side), ylim=(y, y + side), aspect="equal")
+    # The square is much smaller than the map: a label with a line points to it, and a circle shows
+    # where it is.
     dashed = {"fill": False, "edgecolor": BLACK, "linestyle": "--", "zorder": 6}
     overview.add_patch(Rectangle((x, y), side, side, **dashed))
+    middle = np.array([x, y]) + side / 2
+    (low_x, high_x), (low_y, high_y) = overview.get_xlim(), overview.get_ylim()
+    ring = {"markerfacecolor": "none", "color": BLACK, "markersize": 11, "zorder": 6}
+    overview.plot(*middle, "o", markeredgewidth=1.2, **ring)
+    inward = np.sign([(low_x + high_x) / 2, (low_y + high_y) / 2] - middle)
+    box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "linewidth": 0.6}
+    label: dict[str, Any] = {"xytext": tuple(28 * inward), "textcoords": "offset points"}
+    label |= {"ha": "center", "va": "center", "bbox": box, "zorder": 7}
+    line = {"arrowstyle": "-", "linewidth": 0.8, "shrinkB": 6}
+    overview.annotate("enlarged", xy=(middle[0], middle[1]), arrowprops=line, **label)
     overview.set_title(f"{len(fused)} landmarks in both maps, aligned")
     cut = f", without {part.n_cut} on its rim" if part.n_cut else ""
-    zoom.set_title(f"{part.whole.sum()} of them in the dashed square{cut}")
+    zoom.set_title(f"{part.whole.sum()} of them, enlarged: a square of {100 * side:.2g} cm{cut}")
     handles, _ = zoom.get_legend_handles_labels()
     legend = {"title": f"{plan.LEVEL_TEXT} ellipses, to scale", "title_fontsize": 7.5}
     plan.finish_plans(figure, [overview, zoom], handles, len(handles), **legend)
@@ -356,9 +419,8 @@ def choose_zoom(position_m: Float, covariance_m2: Float) -> Zoom:
     middle = (low + high) / 2
     some = np.unique(np.linspace(0, len(middle) - 1, _MAX_CANDIDATES).round().astype(int))
     count = min(_ZOOM_LANDMARKS, len(middle))
-    near = np.reshape(
-        scipy.spatial.KDTree(middle).query(middle[some], k=count)[1], (len(some), count)
-    )
+    tree = scipy.spatial.KDTree(middle)
+    near = np.reshape(tree.query(middle[some], k=count)[1], (len(some), count))
     ends = low[near].min(axis=1), high[near].max(axis=1)
     side = _ZOOM_MARGIN * (ends[1] - ends[0]).max(axis=1)
     corner = (ends[0] + ends[1] - side[:, None]) / 2
@@ -366,7 +428,12 @@ def choose_zoom(position_m: Float, covariance_m2: Float) -> Zoom:
     whole = np.all((low >= first) & (high <= last), axis=2)
     touched = np.all((high > first) & (low < last), axis=2)
     n_cut = np.count_nonzero(touched & ~whole, axis=1)
-    best = int(np.argmin(n_cut + side / np.median(side)))
+    # Ellipses that overlap are hard to tell apart: the size of an ellipse over the distance to the
+    # nearest neighbour, median over the neighbours.
+    extent = (high - low).max(axis=1)
+    apart = tree.query(middle[near], k=min(2, len(middle)))[0].reshape(*near.shape, -1)
+    overlap = np.median(extent[near] / np.maximum(apart[..., -1], _LEAST_DISTANCE_M), axis=1)
+    best = int(np.argmin(n_cut + side / np.median(side) + overlap))
     return Zoom(corner[best], float(side[best]), whole[best], int(n_cut[best]))
 
 

@@ -14,8 +14,7 @@ import pyarrow as pa
 from PIL import Image
 
 from experiments.evaluation.criteria import methods_in
-from experiments.evaluation.result_files import read_scenario, read_world
-from experiments.evaluation.tables import ALL, read, table_path
+from experiments.evaluation.tables import ALL, read, read_scenario, read_world, table_path
 from experiments.reports.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
 from mapfusion.align.alignment import Status
 from mapfusion.errors import DamagedFileError, InputError
@@ -192,6 +191,18 @@ class ResultTables:
     def landmarks_of(self, robot: str) -> tuple[Float, Float]:
         """Return positions (N, 3) and covariances (N, 3, 3) of the last map, by landmark number."""
         return positions_and_covariances(self.of_robot("landmarks", robot, "landmark"))
+
+    def plan_at(self, robot: str, iteration: int) -> tuple[Float, Float]:
+        """Return plan positions (N, 2) and covariances (N, 2, 2) of a map at an iteration.
+
+        A robot whose log ended earlier has its last map.
+        """
+        rows = self.of_robot("map_history", robot, "landmark")
+        known = rows.loc[rows["iteration"] <= iteration, "iteration"]
+        rows = rows[rows["iteration"] == known.max()]
+        xx, xy, yy = (rows[f"cov_{name}_m2"].to_numpy(np.float64) for name in ("xx", "xy", "yy"))
+        covariance = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+        return rows[["x_m", "y_m"]].to_numpy(np.float64), covariance
 
     @property
     def sightings(self) -> str:

@@ -2,8 +2,9 @@
 
 import io
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.image
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from experiments.evaluation.loop_closures import WINDOW_FRAMES, LoopClosure, loop_closures
 from experiments.reports.figures import floor_plan as plan
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, read_png
 from experiments.reports.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
@@ -24,12 +26,18 @@ _KEY_FRAME = re.compile(r"(?P<robot>.+)_(?P<iteration>\d+)\.png")
 
 _MAX_ROBOTS = 3
 _ZOOM_MARGIN = 1.25
-_RECENT_ITERATIONS = 50
 _GRID_COLUMNS = 6  # divisible into one, two or three panels of equal width
 _LOWER_ROW_IN = 2.6
 _HEADROOM = 0.5  # space for the legend above the spread, as a share of the spread
 _PLANE = ["x_m", "y_m"]
-Moments = tuple[str, int, int]  # robot, iteration of a wide and of a narrow particle set
+
+
+class Moments(NamedTuple):
+    """Stored iterations before and after a loop closure of a robot."""
+
+    closure: LoopClosure
+    before: int
+    after: int
 
 
 def draw_tracks(data: ResultTables) -> Figure:
@@ -91,7 +99,7 @@ def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
 
 
 def draw_dispersion(data: ResultTables) -> Figure:
-    """Draw the particles along up to three paths, their spread, and a wide and a narrow set."""
+    """Draw the particles along up to three paths, and their spread before and after a closure."""
     clouds = data.table("clouds")
     robots = [robot for robot in data.robots if (clouds["robot"] == robot).any()][:_MAX_ROBOTS]
     if not robots:
@@ -120,12 +128,14 @@ def draw_dispersion(data: ResultTables) -> Figure:
     timeline.set_ylim(bottom=0)
     timeline.legend(loc="upper right")
     timeline.set_title("spread over time")
-    moments = choose_moments(spread)
+    closures = loop_closures(data.rows("sightings"), spread)
+    moments = choose_moments(closures, spread)
+    figure.set_label(_about_moments(data, moments))
     if moments is None:
         for axes in zooms:
             axes.set_axis_off()
     else:
-        robot = moments[0]
+        robot = moments.closure.robot
         spread_m = spread[spread["robot"] == robot].set_index("iteration")["spread_m"]
         _mark_moments(panels[robot], timeline, data.path_of(robot), spread_m, moments)
         _draw_zooms(zooms, data, spread_m, moments)
@@ -144,22 +154,43 @@ def spread_over_time(clouds: pd.DataFrame) -> pd.DataFrame:
     return variance.sum(axis="columns").pow(0.5).rename("spread_m").reset_index()
 
 
-def choose_moments(spread: pd.DataFrame) -> Moments | None:
-    """Return the two iterations between which one robot's spread fell by the largest factor.
+def choose_moments(closures: Sequence[LoopClosure], spread: pd.DataFrame) -> Moments | None:
+    """Return a moment before and one after the loop closure with the largest fall of the spread.
 
-    The wide set comes before the narrow one, so the fall is the effect of revisiting known ground.
-    Return None if the spread of no robot ever fell.
+    In each window the stored iteration with the median spread is chosen, because the spread of a
+    single frame varies with the resampling. Return None without a loop closure.
+
+    Args:
+        closures: loop closures of the robots.
+        spread: rows of `spread_over_time`.
     """
-    best, best_ratio = None, 1.0
-    for robot, rows in spread[spread["spread_m"] > 0].groupby("robot", sort=False):
-        values, iteration = rows["spread_m"].to_numpy(), rows["iteration"].to_numpy()
-        ratio = np.maximum.accumulate(values) / values
-        tight = int(np.argmax(ratio))
-        if ratio[tight] > best_ratio:
-            best_ratio = ratio[tight]
-            wide = int(np.argmax(values[:tight]))
-            best = (str(robot), int(iteration[wide]), int(iteration[tight]))
-    return best
+    known = [each for each in closures if min(each.before_m, each.after_m) > 0]
+    if not known:
+        return None
+    closure = min(known, key=lambda each: each.after_m / each.before_m)
+    own = spread[spread["robot"] == closure.robot].set_index("iteration")["spread_m"]
+    k = closure.iteration
+    windows = ((k - WINDOW_FRAMES, k - 1), (k, k + WINDOW_FRAMES - 1))
+    inside = (own[(own.index >= first) & (own.index <= last)] for first, last in windows)
+    before, after = (each.sort_values().index[len(each) // 2] for each in inside)
+    return Moments(closure, int(before), int(after))
+
+
+def _about_moments(data: ResultTables, moments: Moments | None) -> str:
+    """Return the part of the caption about the loop closure."""
+    if not data.has("sightings"):
+        return "The result was made before loop closures were stored."
+    if moments is None:
+        return "No robot closes a loop: none comes back to its landmarks after new ground."
+    closure = moments.closure
+    before_mm, after_mm = (1e3 * value for value in (closure.before_m, closure.after_m))
+    text = (
+        f"{closure.robot} closes a loop at k = {closure.iteration}: {closure.n_returned} landmarks "
+        f"come back into view in {WINDOW_FRAMES} iterations. A is a particle set before it, B one "
+        f"after it. The median spread of the {WINDOW_FRAMES} iterations before and after is "
+        f"{before_mm:.2g} and {after_mm:.2g} mm"
+    )
+    return f"{text}." if after_mm < before_mm else f"{text}; it does not fall."
 
 
 def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -> None:
@@ -181,7 +212,7 @@ def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -
 def _mark_moments(
     on_path: Axes, timeline: Axes, path: np.ndarray, spread_m: pd.Series, moments: Moments
 ) -> None:
-    """Mark the wide set as A and the narrow set as B, on the path and on the time line."""
+    """Mark the sets before and after the closure as A and B, on the path and the time line."""
     box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
     look: dict[str, Any] = {"textcoords": "offset points", "fontweight": "bold"}
     boxed = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
@@ -195,23 +226,23 @@ def _mark_moments(
 def _draw_zooms(
     zooms: list[Axes], data: ResultTables, spread_m: pd.Series, moments: Moments
 ) -> None:
-    """Draw the wide and the narrow particle set at the same scale."""
-    robot, *iterations = moments
+    """Draw the particle sets before and after the closure at the same scale."""
+    closure, *iterations = moments
+    robot = closure.robot
     clouds = data.of_robot("clouds", robot).set_index("iteration")[_PLANE]
-    n_landmarks = data.of_robot("robots", robot).set_index("iteration")["n_landmarks"]
+    sightings = data.of_robot("sightings", robot).set_index("iteration")
     sets = [clouds.loc[[k]].to_numpy() for k in iterations]
     reach = _ZOOM_MARGIN * max(float(np.abs(p - p.mean(axis=0)).max()) for p in sets)
     style = {"marker": ".", "markersize": 2.5, "alpha": 0.7, "color": data.colours[robot]}
-    names = ("A, wide", "B, tight")
+    names = ("A, before", "B, after")
     for axes, name, k, particles in zip(zooms, names, iterations, sets, strict=True):
         axes.plot(*data.path_of(robot).T, color=GRAY, zorder=1)
         plan.add_points(axes, particles, **style)
         plan.set_square(axes, particles.mean(axis=0), reach)
         axes.locator_params(nbins=4)
         plan.label_plan(axes, robot)
-        # The number is large on new ground and small on known ground.
-        grown = n_landmarks[k] - n_landmarks[max(0, k - _RECENT_ITERATIONS)]
+        recent = sightings.loc[max(0, k - WINDOW_FRAMES + 1) : k, ["n_new", "n_returned"]].sum()
         title = f"{name}: k = {k}, spread {1e3 * spread_m[k]:.1f} mm\n"
         # Two lines: the panels are narrow, and the last one ends at the edge of the page.
-        title += f"+{grown} landmarks in {_RECENT_ITERATIONS} iterations"
+        title += f"{recent['n_new']} new landmarks, {recent['n_returned']} came back"
         axes.set_title(title, fontsize=6.5)

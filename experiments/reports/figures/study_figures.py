@@ -15,6 +15,7 @@ from experiments.reports.figures import style
 from experiments.reports.figures.result_tables import NothingToDraw
 from experiments.reports.figures.style import BLACK, GRAY
 from experiments.studies.independence_trial import STRATEGIES
+from experiments.studies.paper_claims import crossings
 from experiments.studies.refusal_cases import FEW, POSTER_RADII_M
 from experiments.studies.refusal_rates import (
     VERDICTS,
@@ -37,6 +38,9 @@ _RATIO_TICKS = (1, 2, 5, 10, 20, 50, 100)
 _RATIO_RANGE = (0.9, 11.0)  # smallest range of the axis
 _MARGIN = 1.15  # around the values drawn
 _ROWS = ("success (%)", "error over the oracle's", "time of one call (ms)")
+
+# Error against the share of false pairs
+_LEAST_ERROR_M = 1e-3
 
 # Independence
 _HEIGHT_IN = 8.6
@@ -123,6 +127,41 @@ def draw_benchmark(summary: pd.DataFrame) -> Figure:
     return figure
 
 
+def draw_crossing(rows: pd.DataFrame) -> Figure:
+    """Draw the median error against the share of false pairs, a panel per share of unpaired ones.
+
+    Shares are spaced by their rank: the first crossing lies at a few percent. Dotted lines are the
+    shares at which the order of SVD and ICP changes.
+    """
+    unpaired = rows["unpaired_share"].unique()
+    methods = rows["method"].unique().tolist()
+    styles = style.aligner_styles(methods)
+    shares = np.sort(rows["outlier_share"].unique())
+    at = crossings(rows, "svd", "icp")
+    figure = Figure(figsize=(style.PAGE_WIDTH_IN, 3.2))
+    panels = figure.subplots(1, len(unpaired), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, of in zip(panels, unpaired, strict=True):
+        own = rows[rows["unpaired_share"] == of]
+        for method in methods:
+            line = own[own["method"] == method].sort_values("outlier_share")
+            place = np.searchsorted(shares, line["outlier_share"])
+            axes.plot(place, line["error_m"].clip(lower=_LEAST_ERROR_M), **styles[method])
+        for share in at[of]:
+            place = float(np.interp(share, shares, np.arange(len(shares))))
+            axes.axvline(place, color=BLACK, linestyle=":", linewidth=0.8)
+            text = {"xytext": (2, -9), "textcoords": "offset points", "fontsize": 7}
+            axes.annotate(
+                f"{share:.1%}", xy=(place, 1.0), xycoords=("data", "axes fraction"), **text
+            )
+        axes.set(yscale="log", xlabel="false pairs (%)")
+        axes.set_title(f"{of:.0%} of the landmarks without a partner")
+        axes.set_xticks(np.arange(len(shares)), [f"{100 * share:g}" for share in shares])
+        style.write_plainly(axes.yaxis)
+    panels[0].set_ylabel("median translation error (m)")
+    style.aligner_legend(figure, {name: styles[name] for name in methods}, 4)
+    return figure
+
+
 def draw_independence(teams: pd.DataFrame, costs: pd.DataFrame) -> Figure:
     """Draw costs and errors of each strategy, one column for each size of team.
 
@@ -137,8 +176,21 @@ def draw_independence(teams: pd.DataFrame, costs: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(style.PAGE_WIDTH_IN, _HEIGHT_IN))
     panels = figure.subplots(len(_PANELS), len(sizes), sharex="col", sharey="row", squeeze=False)
     for size, column in zip(sizes, panels.T, strict=True):
-        for (_, bold, thin), axes in zip(_PANELS, column, strict=True):
-            _add_strategies(axes, rows[rows["n_robots"] == size], bold, thin)
+        of_size = rows[rows["n_robots"] == size]
+        for strategy in STRATEGIES:
+            line = _STRATEGY_STYLES[strategy.name]
+            for _, own in of_size[of_size["strategy"] == strategy.name].groupby("seed"):
+                part = own[own["n_merged"] < own["n_robots"]]
+                for (_, bold, thin), axes in zip(_PANELS, column, strict=True):
+                    unit = _MM_PER_M if _is_error(bold) else 1.0
+                    axes.plot(own["since"], own[bold] * unit, **line)
+                    if thin:
+                        axes.plot(own["since"], own[thin], **line | _OF_TEAM)
+                    if _is_error(bold):
+                        axes.plot(part["since"], part[bold] * unit, **line | _HOLLOW)
+        for axes in column:
+            axes.axvline(0.0, color=GRAY, linewidth=0.8)
+            axes.set_yscale("log")
         column[0].set_title(f"{size} robots")
         column[-1].set_xlabel("iterations since robots first share ground")
         column[-1].xaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -179,21 +231,6 @@ def _is_error(column: str) -> bool:
     return column.endswith("rmse_m")
 
 
-def _add_strategies(axes: Axes, rows: pd.DataFrame, bold: str, thin: str) -> None:
-    """Draw one column for every strategy and seed, and a second one as thin lines."""
-    for strategy in STRATEGIES:
-        mine, line = rows[rows["strategy"] == strategy.name], _STRATEGY_STYLES[strategy.name]
-        for _, own in mine.groupby("seed"):
-            axes.plot(own["since"], own[bold] * (_MM_PER_M if _is_error(bold) else 1.0), **line)
-            if thin:
-                axes.plot(own["since"], own[thin], **line | _OF_TEAM)
-            part = own[own["n_merged"] < own["n_robots"]]
-            if _is_error(bold):
-                axes.plot(part["since"], part[bold] * _MM_PER_M, **line | _HOLLOW)
-    axes.axvline(0.0, color=GRAY, linewidth=0.8)
-    axes.set_yscale("log")
-
-
 def draw_refusal(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms: float) -> Figure:
     """Draw false against missed merges, the shares accepted, and the calibration.
 
@@ -209,7 +246,23 @@ def draw_refusal(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms
     label = f"{_SUPPORT_OF}, number of inliers alone"
     line = {"color": GRAY, "linestyle": ":", "label": label}
     _draw_sweep(curve, own.assign(score=-own["n_inliers"]), _floor(refusals), **line)
-    _draw_accepted_shares(rates, refusals[refusals["aligner"] == first])
+    # Share accepted by the first aligner against the threshold, by kind of ground
+    own = refusals[refusals["aligner"] == first]
+    kinds = [
+        (without_common_ground(own), "no common ground", GRAY, "-"),
+        (mergeable(own), f"{MERGEABLE_PAIRS} or more true pairs", BLACK, "-"),
+        (own[own["ground"] == FEW], "20, in one corner", BLACK, "--"),
+    ]
+    for radius_m, colour in zip(POSTER_RADII_M, _POSTER_COLOURS, strict=True):
+        label = f"a {2 * radius_m:g} m picture in both"
+        kinds.append((own[own["poster_radius_m"] == radius_m], label, colour, ":"))
+    for rows, label, colour, dashes in kinds:
+        if len(rows):
+            accepted = share_up_to(rows["log10_false_alarms"], _THRESHOLDS)
+            line = {"color": colour, "linestyle": dashes, "label": f"{label} ({len(rows)})"}
+            rates.plot(_THRESHOLDS, accepted, **line)
+    rates.set_xlabel("threshold on log10 of the false alarms")
+    rates.set_ylabel(f"share accepted, {first}")
     # Measured against stated number of false alarms
     stated, measured = calibration["stated"], calibration["motions_a_pair"]
     n = int(calibration["n_pairs"].iloc[0])
@@ -230,25 +283,6 @@ def draw_refusal(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms
     legend = {"loc": "upper left", "title": f"Above: {first} (pairs of maps)", "alignment": "left"}
     key.legend(*rates.get_legend_handles_labels(), **legend)
     return figure
-
-
-def _draw_accepted_shares(axes: Axes, own: pd.DataFrame) -> None:
-    """Draw the share accepted by one aligner against the threshold, by kind of ground."""
-    kinds = [
-        (without_common_ground(own), "no common ground", GRAY, "-"),
-        (mergeable(own), f"{MERGEABLE_PAIRS} or more true pairs", BLACK, "-"),
-        (own[own["ground"] == FEW], "20, in one corner", BLACK, "--"),
-    ]
-    for radius_m, colour in zip(POSTER_RADII_M, _POSTER_COLOURS, strict=True):
-        label = f"a {2 * radius_m:g} m picture in both"
-        kinds.append((own[own["poster_radius_m"] == radius_m], label, colour, ":"))
-    for rows, label, colour, dashes in kinds:
-        if len(rows):
-            accepted = share_up_to(rows["log10_false_alarms"], _THRESHOLDS)
-            text = f"{label} ({len(rows)})"
-            axes.plot(_THRESHOLDS, accepted, color=colour, linestyle=dashes, label=text)
-    axes.set_xlabel("threshold on log10 of the false alarms")
-    axes.set_ylabel(f"share accepted, {own['aligner'].iloc[0]}")
 
 
 def draw_refusal_kinds(refusals: pd.DataFrame) -> Figure:

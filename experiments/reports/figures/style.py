@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogFormatter
 
 from experiments.evaluation.criteria import ORACLE
-from experiments.evaluation.fused_map_errors import FILTERED, SMOOTHED
+from experiments.evaluation.map_errors import FILTERED, SMOOTHED
 from mapfusion.fusion.fusers import REFERENCE
 
 PAGE_WIDTH_IN = 7.2  # two columns of a journal page
@@ -64,6 +64,7 @@ _KNOWN_ALIGNERS: dict[str, tuple[Any, ...]] = {
 _KNOWN_FUSERS: dict[str, tuple[Any, ...]] = {
     "kalman": (ORANGE, (0, (1, 1)), "D"),
     "kalman-drift": (VERMILLION, (0, (6, 1, 1, 1)), "s"),
+    "kalman_as_printed": (WINE, (0, (3, 1, 1, 1, 1, 1)), "X"),
     "covariance_intersection": (GREEN, (0, (5, 1)), "^"),
     "joint": (BLUE, "-", "o"),
     REFERENCE: (BLACK, (0, (4, 2)), "x"),

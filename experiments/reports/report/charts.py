@@ -149,7 +149,7 @@ _PANELS = {
     "rotation_estimated": (2, 1),
     "rotation_refined": (2, 2),
 }
-_DODGE = 0.055  # share of a bin by which the intervals of two methods are apart
+_BIN_SHARE = 0.8  # share of a bin's width over which the intervals of the methods are spread
 
 _PANELS_APART = 0.09  # share of the figure's width
 
@@ -361,15 +361,10 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
     """Draw `success_curves`, one panel for each quantity; None if there are none."""
     if not curves:
         return None
-    n_rows = -(-len(curves) // 2)
-    figure = make_subplots(
-        n_rows,
-        min(len(curves), 2),
-        vertical_spacing=0.36 / n_rows,
-        horizontal_spacing=_PANELS_APART,
-    )
-    for place, each in enumerate(curves):
-        row, col = place // 2 + 1, place % 2 + 1
+    n_rows = len(curves)  # over the whole width, so that intervals do not overlap
+    figure = make_subplots(n_rows, 1, vertical_spacing=0.28 / n_rows)
+    panel: Any
+    for panel, each in enumerate(curves, start=1):
         bins = np.arange(len(each["bins"]))
         for number, (name, style) in enumerate(styles.items()):
             own = each["aligners"][name]
@@ -381,24 +376,25 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
             interval = {"type": "data", "array": rounded(high - rate), "width": 0}
             interval |= {"arrayminus": rounded(rate - low), "thickness": 1.5}
             trace = go.Scatter(
-                x=bins + _DODGE * (number - (len(styles) - 1) / 2),
+                x=bins + _BIN_SHARE * ((number + 0.5) / len(styles) - 0.5),
                 y=rounded(rate),
                 customdata=list(zip(rounded(low), rounded(high), own["n"], strict=True)),
                 name=shown,
                 legendgroup=name,
-                showlegend=place == 0,
-                mode="lines+markers",
-                line={"color": style["hex"], "dash": style["dash"], "width": 1.5},
-                marker={"size": 6, "symbol": style["marker"]},
-                error_y=interval | {"color": faint(style["hex"], 0.45)},
+                showlegend=panel == 1,
+                mode="markers",
+                marker={"size": 8, "symbol": style["marker"], "color": style["hex"]},
+                error_y=interval | {"color": faint(style["hex"], 0.6)},
                 hovertemplate=f"{shown}: {hover}%{{customdata[2]}} maps<extra></extra>",
             )
-            figure.add_trace(trace, row, col)
+            figure.add_trace(trace, panel, 1)
         ticks = {"tickvals": bins.tolist(), "ticktext": each["bins"], "showgrid": False}
-        figure.update_xaxes(**ticks, title_text=each["label"], row=row, col=col)
-    figure.update_yaxes(range=[-3, 103], ticksuffix=" %")
-    figure.update_yaxes(title_text="correct", col=1)
-    return figure.update_layout(height=60 + 330 * n_rows, hovermode="closest")
+        ticks |= {"range": [-0.5, len(bins) - 0.5]}
+        figure.update_xaxes(**ticks, title_text=each["label"], row=panel)
+        for edge in bins[1:] - 0.5:
+            figure.add_vline(edge, line_width=1, line_color=faint(NEUTRAL), row=panel)
+    figure.update_yaxes(range=[-3, 103], ticksuffix=" %", title_text="correct")
+    return figure.update_layout(height=60 + 270 * n_rows, hovermode="closest")
 
 
 def time_figure(curves: dict[str, Any], styles: Styles) -> go.Figure | None:

@@ -5,7 +5,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +15,18 @@ from PIL import Image
 from ruamel.yaml import YAML
 
 from experiments.evaluation import criteria, metrics, tables
-from experiments.evaluation.checks import Outcome
 from experiments.evaluation.criteria import (
     methods_in,
+    path_rms,
     setting_columns,
     with_common_ground_at_any_time,
 )
 from experiments.evaluation.evaluated_run import finding_row_lines
-from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.map_consistency import GROSS_M
-from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.metrics import Outcome
 from experiments.evaluation.result import require_result
-from experiments.evaluation.result_files import read_provenance
+from experiments.evaluation.tables import read_provenance
 from experiments.reports import formatting
 from experiments.reports.export import write_text
 from experiments.reports.figures.drawing import FIGURES, caption
@@ -51,11 +51,19 @@ from experiments.reports.report.charts import (
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
-from experiments.reports.terminal.run_screen import team_lines
+from experiments.reports.study_files import claims_table
+from experiments.reports.terminal.run_screen import images_by, team_lines
 from experiments.scenario.settings import Bound
-from experiments.studies.comparison import natural_key
+from experiments.studies.comparison import (
+    BETTER,
+    WORSE,
+    compare_values,
+    natural_key,
+    values_by_setting,
+)
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
+from experiments.studies.paper_claims import SCENARIOS, compare_with_paper
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
 from mapfusion.errors import InputError, install_command
@@ -182,12 +190,40 @@ def contents_of(path: Path) -> dict[str, Any]:
     runs = find_runs(path)
     if not runs.sweeps:
         require_result(path)
-    if not runs.has("errors") or (reduced := reduced_errors(runs)).maps.empty:
-        if runs.sweeps or not (data := ResultTables(path)).no_truth:
-            raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
-        return _without_truth(path, runs, data)
+    reduced = reduced_errors(runs) if runs.has("errors") else None
+    has_errors = reduced is not None and not reduced.maps.empty
+    data = None if runs.sweeps else ResultTables(path)
+    if not has_errors and (data is None or not data.no_truth):
+        raise InputError(f"{path}: no pair of maps was aligned, there is nothing to report on")
+    provenance, stages = _provenance(path, runs)
+    timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
+    common = {
+        "provenance": provenance,
+        "stages": stages,
+        "stage_times": _stage_times(runs),
+        "failed": runs.failed.to_dict("records"),
+    }
+    if data is not None and not has_errors:
+        # Without truth there are no errors and no success.
+        own, styles = _of_result(data), _page_styles(data.aligners)
+        times = time_curves(timings, data.aligners) if len(timings) else {}
+        charts = {"errors": None, "success": None, "times": time_figure(times, styles)}
+        absent = [name for name, label in data.labels.items() if label != name]
+        own |= {"charts": own["charts"] | charts, "absent": absent, "outcomes": ()}
+        claims: list[dict[Any, Any]] = []
+        return (
+            own
+            | common
+            | {
+                "no_truth": True,
+                "ranking": None,
+                "styles": styles,
+                "claims": claims,
+            }
+        )
+    assert reduced is not None
     maps = reduced.maps
-    if runs.sweeps:
+    if data is None:
         # The sections of single results are empty.
         empty = ("outcomes", "robots", "fits", "smoother", "team", "edges", "figures", "missing")
         empty += ("scenario_text", "fusers", "fuser_figures", "places", "findings")
@@ -196,58 +232,48 @@ def contents_of(path: Path) -> dict[str, Any]:
             "description": ", ".join(maps["scenario"].unique()),
             "spread_text": "runs; each run is the median of its repetitions",
             "charts": {"map": None},
+            "compared": list(_compared_settings(path, runs)),
         }
         groups = list(_by_configuration(reduced.medians))
     else:
-        data = ResultTables(path)
         own, errors = _of_result(data), runs.read("errors")
         groups = [(f"{a} – {b}", of_pair(errors, (a, b))) for a, b in data.pairs]
         if len(data.pairs) > 1:
             groups.append(("all pairs", errors))
     aligners = methods_in(maps, oracle=True)
-    drawn_in = aligner_styles(aligners)
-    styles = {name: chart_style(drawn_in[name]) for name in aligners}
-    timings = runs.read("aligner_timings") if runs.has("aligner_timings") else pd.DataFrame()
-    provenance, stages = _provenance(path, runs)
-    return own | {
-        "no_truth": False,
-        "ranking": recommend(maps, timings, aligners),
-        "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
-        "settings": setting_columns(maps),
-        "styles": styles,
-        "charts": own["charts"]
+    styles = _page_styles(aligners)
+    times = time_curves(timings, aligners) if len(timings) else {}
+    charts = {
+        "errors": error_figure([(n, error_curves(r, aligners)) for n, r in groups], styles),
+        "success": success_figure(success_curves(maps, aligners), styles),
+        "times": time_figure(times, styles),
+    }
+    own |= {"charts": own["charts"] | charts, "absent": reduced.absent}
+    return (
+        own
+        | common
         | {
-            "errors": error_figure([(n, error_curves(r, aligners)) for n, r in groups], styles),
-            "success": success_figure(success_curves(maps, aligners), styles),
-            "times": time_figure(time_curves(timings, aligners) if len(timings) else {}, styles),
-        },
-        "absent": reduced.absent,
-        "provenance": provenance,
-        "stages": stages,
-        "stage_times": _stage_times(runs),
-        "failed": runs.failed.to_dict("records"),
-    }
+            "no_truth": False,
+            "ranking": recommend(maps, timings, aligners),
+            "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
+            "settings": setting_columns(maps),
+            "styles": styles,
+            "claims": _claims(runs),
+        }
+    )
 
 
-def _without_truth(path: Path, runs: Runs, data: ResultTables) -> dict[str, Any]:
-    """Collect the contents for a result without truth, which has no errors and no success."""
-    styles = {name: chart_style(style) for name, style in data.styles.items()}
-    times = time_curves(runs.read("aligner_timings"), data.aligners)
-    provenance, stages = _provenance(path, runs)
-    own = _of_result(data)
-    return own | {
-        "no_truth": True,
-        "outcomes": (),
-        "ranking": None,
-        "styles": styles,
-        "charts": own["charts"]
-        | {"errors": None, "success": None, "times": time_figure(times, styles)},
-        "absent": [name for name, label in data.labels.items() if label != name],
-        "provenance": provenance,
-        "stages": stages,
-        "stage_times": _stage_times(runs),
-        "failed": [],
-    }
+def _claims(runs: Runs) -> list[dict[Any, Any]]:
+    """Return the table of the paper's claims for runs of the paper's experiment; else nothing."""
+    if not set(SCENARIOS) & set(runs.described["scenario"]):
+        return []
+    return claims_table(compare_with_paper([runs])).to_dict("records")
+
+
+def _page_styles(aligners: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Return the styles of aligners in the page's and Plotly's terms."""
+    styles = aligner_styles(aligners)
+    return {name: chart_style(styles[name]) for name in aligners}
 
 
 def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -262,10 +288,44 @@ def _by_configuration(spread: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]
         yield ", ".join([scenario, *settings]), rows
 
 
+# Comparisons of values in the report of a sweep: each reads all tables once.
+_MOST_COMPARED = 8
+
+
+def _compared_settings(path: Path, runs: Runs) -> Iterator[dict[str, Any]]:
+    """Yield for each setting that a sweep varied what a value changes against the first one."""
+    pairs = [
+        (setting, first, other)
+        for setting, (first, *others) in values_by_setting(runs).items()
+        for other in others
+    ]
+    for setting, first, other in pairs[:_MOST_COMPARED]:
+        try:
+            found = compare_values(path, setting, first, other)
+        except InputError:  # no run with the one value matches a run with the other
+            continue
+        judged = found.table[~found.table["timed"]]
+        changed = judged[judged["verdict"].isin([BETTER, WORSE])].sort_values("p_holm")
+        counts = changed["verdict"].value_counts()
+        yield {
+            "setting": setting,
+            "first": first,
+            "other": other,
+            "n_runs": found.n_runs,
+            "unit": found.unit,
+            "n_better": int(counts.get(BETTER, 0)),
+            "n_worse": int(counts.get(WORSE, 0)),
+            "n_measures": len(judged),
+            "weak": found.n_runs < FEW_RUNS,
+            "changed": changed.to_dict("records"),
+        }
+
+
 def _of_result(data: ResultTables) -> dict[str, Any]:
     """Return the title and the sections of a result; a section without its tables is empty."""
     outcomes: list[Outcome] = []  # of this run alone
-    needed = set(metrics.USED_TABLES) - {"smoother", "fusers"}  # older results lack these two
+    # older results lack some tables
+    needed = set(metrics.USED_TABLES) - {"smoother", "fusers", "sightings"}
     if all(map(data.has, needed)):
         used = {name: data.rows(name).assign(seed=0) for name in metrics.USED_TABLES}
         for metric, bound in data.scenario.get("expect", {}).items():
@@ -280,8 +340,9 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
     return {
         "title": f"{data.scenario['name']}, seed {data.scenario['seed']}",
         "description": data.scenario.get("description", ""),
+        "compared": (),
         "spread_text": "repetitions on the same maps",
-        "charts": {"map": map_figure(data, {n: chart_style(s) for n, s in data.styles.items()})},
+        "charts": {"map": map_figure(data, _page_styles(data.aligners))},
         "outcomes": outcomes,
         "findings": list(finding_row_lines(data.rows("findings"))),
         "robots": path_rms(data.table("robots")).to_dict("records"),
@@ -308,7 +369,7 @@ def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
                 size = dict(zip(("width", "height"), picture.size, strict=True))
             png = base64.b64encode(data).decode()
             how = _OF_FUSERS.get(name, "")
-            yield {"about": caption(name), "how": how, "png": png, **size}
+            yield {"about": caption(name, file.parent), "how": how, "png": png, **size}
 
 
 _PAGE = Path(__file__).parent / "page"
@@ -358,6 +419,10 @@ def templates() -> jinja2.Environment:
     )
     environment.globals |= {"text": formatting, "criteria": criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
-    environment.globals |= {"gross_m": GROSS_M, "install_command": install_command}
+    environment.globals |= {
+        "gross_m": GROSS_M,
+        "images_by": images_by,
+        "install_command": install_command,
+    }
     environment.tests["nan"] = math.isnan
     return environment

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 
-from experiments.pipeline.tables import unpacked
+from experiments.pipeline.stages.align import unpacked
 from experiments.reports.figures.floor_plan import LEVEL_TEXT, semi_axes
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.reports.figures.style import ORANGE
@@ -43,6 +43,7 @@ _MOTION = ("tx_m", "ty_m", "theta_rad")
 _ANSWER = ["aligner", "iteration", "repetition"]
 _STAGES = {"refined": "refined_", "as estimated": ""}
 _NO_POINTS = np.zeros((0, 2))
+_HIDDEN_AT_FIRST = {"ellipses", "particles", "true", "false"}
 
 Placement = tuple[str, str]  # aligner and stage
 _View = tuple[Attributes, list[int]]  # values of each attribute, and indices of the traces
@@ -136,9 +137,11 @@ def _view(layers: list[_Layer], maps: "_Maps", pair: Pair, placement: Placement)
     chosen = [layers[place] for place in drawn]
     attributes = {
         "visible": [
-            (not layer.robot or layer.robot in pair)
+            _at_first(layer, placement)
+            if (not layer.robot or layer.robot in pair)
             and layer.pair in {None, pair}
             and layer.placement in {None, placement}
+            else False
             for layer in chosen
         ],
         "carpet": [
@@ -149,6 +152,18 @@ def _view(layers: list[_Layer], maps: "_Maps", pair: Pair, placement: Placement)
         ],
     }
     return attributes, drawn
+
+
+def _at_first(layer: _Layer, placement: Placement) -> bool | str:
+    """Return Plotly's visibility of a trace that a placement has: shown, or in the legend only.
+
+    At first walls, paths and landmarks are shown; everything else would cover them.
+    """
+    meta = layer.trace.get("meta") or {}
+    if meta.get("layer") == "frame":
+        return meta["placement"][0] == placement[0] or "legendonly"
+    fused = meta.get("layer") == "landmarks" and layer.pair is not None
+    return "legendonly" if fused or meta.get("layer") in _HIDDEN_AT_FIRST else True
 
 
 class _Maps:

@@ -12,26 +12,27 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.evaluation import tables
-from experiments.evaluation.checks import CheckedScenario
 from experiments.evaluation.criteria import (
     ANSWERABLE_PAIRS,
     ORACLE,
     answerable,
     at_the_end,
     has_common_ground,
+    is_used_by_team,
     merged_robots,
     methods_in,
+    path_rms,
     right_refined,
     summarise_alignments,
 )
-from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.map_consistency import GROSS_M
-from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.result import renderer
+from experiments.evaluation.result_files import read_provenance
 from experiments.evaluation.run_plan import RunPlan
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.evaluation.tables import SHOWN
-from experiments.evaluation.team_errors import is_used_by_team
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
 from experiments.reports.formatting import listed, metres, percent, radians, two_digits
@@ -49,6 +50,7 @@ from mapfusion.align.alignment import NOT_RUN, Status
 from mapfusion.fusion.fusers import FusedMap
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.se2 import motion_sigma
+from sim.renderer import NAMES
 
 
 def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -> Iterator[str]:
@@ -88,12 +90,42 @@ def edge_lines(edges: pd.DataFrame) -> Iterator[str]:
 
 _SEEDS_SHOWN = 3  # one by one, in a table of checks
 
+# Columns of the tables of a run
+_ALIGNERS = columns("", aligner="aligner")
+_ALIGNERS |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
+_ALIGNERS |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
+_PAIRS = [("pair", ""), ("error, m", ".3f"), ("error, rad", "+.4f")]
+_PAIRS += [("oracle, m", ".3f"), ("oracle, rad", "+.4f"), ("true pairs", ">")]
+_ANSWERS = columns("", aligner="aligner")
+_ANSWERS |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
+_PATHS = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
+_PATHS |= columns(".3f", odometry_m="odometry, m") | columns(".2f", over_odometry="ratio")
+_PATHS |= columns("d", n_landmarks="landmarks\never seen")
+_SMOOTHER = columns("", robot="robot") | columns(".3f", path_rmse_m="path, m")
+_SMOOTHER |= columns(".1f", filter_over_smoother="FastSLAM\n/ smoother")
+_SMOOTHER |= columns(".3f", landmark_rmse_m="landmarks\nm")
+_SMOOTHER |= columns(".3f", filter_landmark_rmse_m="FastSLAM's\nm")
+_SMOOTHER |= columns(".1%", gross_share="gross\n") | columns(".2f", nees_per_dof="NEES\n/ dof")
+_SMOOTHER |= columns(".0%", coverage_95="in\n95 %")
+_FUSERS = columns("", fuser="fuser") | columns(".3f", landmark_rmse_m="frame\nm")
+_FUSERS |= columns(".3f", fitted_rmse_m="fitted\nm") | columns(".1%", gross_share="gross\n")
+_FUSERS |= columns(".2f", over_better_parent="over\nparent", over_better_filter="over\nfilter")
+_FUSERS |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
+_FUSERS |= columns(".3f", alignment_error_m="T_a_b\nm", alignment_sigma_m="sigma\nm")
+_TEAM_PAIRS = columns("", pair="pair", place="its alignment")
+_TEAM_PAIRS |= columns(".3f", refined_translation_error_m="alone\nm")
+_TEAM_PAIRS |= columns("+.4f", refined_rotation_error_rad="\nrad")
+_TEAM_PAIRS |= columns(".3f", team_translation_error_m="in the team\nm")
+_TEAM_PAIRS |= columns("+.4f", team_rotation_error_rad="\nrad") | columns("d", n_common="common")
+_WORK = columns("", stage="stage") | columns(".1f", seconds="work, s")
+_WORK |= columns(".0%", share="share") | columns("d", tasks="tasks")
+
 
 def print_plan(plan: RunPlan, results: Path, jobs: int) -> None:
     """Print the tasks of a planned run, and an estimate of its time and memory."""
     frames = sorted(set(plan.n_frames.values()))
     n_frames = f"{frames[0]}" + (f" to {frames[-1]}" if len(frames) > 1 else "")
-    n_robots, source = len(plan.n_frames), renderer(plan.scenario)
+    n_robots, source = len(plan.n_frames), images_by(renderer(plan.scenario))
     shown = columns("", name="stage") | columns("d", finished="finished", to_do="to do")
     shown |= columns(".1f", work_s="work, s")
     basis = "typical rates of two cores; this machine may need half or twice as long"
@@ -115,6 +147,16 @@ def print_plan(plan: RunPlan, results: Path, jobs: int) -> None:
             f"  It uses {basis}. Nothing was run.",
         ]
     )
+
+
+def image_source(result: Path) -> str:
+    """Say who drew the images of a result's cameras."""
+    return images_by(str(read_provenance(result / "provenance.json").get("renderer", "unknown")))
+
+
+def images_by(name: str) -> str:
+    """Say who draws images, by the name of the renderer in a result."""
+    return name.replace(NAMES["tiny"], f"PyBullet's {NAMES['tiny']}")
 
 
 def closing_lines(result: Path) -> tuple[str, str]:
@@ -182,9 +224,26 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
     errors = table("errors")
     aligners = methods_in(errors, oracle=True)
     if aligners:
-        _print_aligners(errors, aligner_summary(errors, table("aligner_timings"), aligners))
+        note = f"{NO_ESTIMATE}\nspread: 10-90 % of the repetitions; ok: accepted"
+        if len(maps := answerable(errors)):
+            n_offered = maps["n_correspondences"]
+            share = (maps["n_true"] / n_offered).median()
+            note += f"\npairs offered: {n_offered.median():.0f}, {share:.0%} of them true"
+        title = f"Alignment errors: medians over iterations with {ANSWERABLE_PAIRS}+ true pairs"
+        summary = aligner_summary(errors, table("aligner_timings"), aligners)
+        print_frame(summary, _ALIGNERS, title, note)
         print_lines(f"  {line}" for line in not_run_lines(errors))
-        _print_pairs(errors, aligners[0])
+        # Each pair at its last iteration: the first aligner, refined, beside the oracle
+        names = ["refined_translation_error_m", "refined_rotation_error_rad"]
+        bands = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])
+        medians = bands[names].T.to_dict("list")
+        rows = []
+        for last in at_the_end(errors).drop_duplicates(ROBOT_PAIR).to_dict("records"):
+            pair = (last["robot_a"], last["robot_b"])
+            found = (*medians[(*pair, aligners[0])], *medians[(*pair, ORACLE)])
+            n_true = f"{last['n_true']} of {last['n_correspondences']}"
+            rows.append([" - ".join(pair), *found, n_true])
+        print_table(_PAIRS, rows, f"Pairs at the last iteration, {aligners[0]} refined")
     elif len(estimates := table("estimates")):
         # Without truth: shares of maps and repetitions
         by_aligner = estimates.groupby("aligner", sort=False)
@@ -193,76 +252,44 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
             for name, column in (("estimated", "status"), ("refined", "refined_status"))
         }
         rows = pd.DataFrame(shares | {"accepted": by_aligner["accepted"].mean()}).reset_index()
-        shown = columns("", aligner="aligner")
-        shown |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
         note = "share of all maps and repetitions; accepted: more than chance, not contradicted"
-        print_frame(rows, shown, "Answers (no truth: errors are unknown)", note)
+        print_frame(rows, _ANSWERS, "Answers (no truth: errors are unknown)", note)
         print_lines(f"  {line}" for line in not_run_lines(estimates))
-    shown = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
-    shown |= columns(".3f", odometry_m="odometry, m") | columns(".2f", over_odometry="ratio")
-    shown |= columns("d", n_landmarks="landmarks\never seen")
     paths = path_rms(table("robots"))
     known = paths["path_m"].notna().any()
-    print_frame(paths, shown, "Position errors (RMS)" if known else "Robots (no truth: no errors)")
+    print_frame(paths, _PATHS, "Position errors (RMS)" if known else "Robots (no truth: no errors)")
     print_lines(["  Maps and figures contain landmarks with slam.min_count or more observations."])
-    _print_smoother(table("smoother"))
-    _print_fusers(table("fusers"))
-    pairs = table("team_pairs")
-    if len(pairs) > 1:
-        names = pairs["robot_a"] + " - " + pairs["robot_b"]
-        shown = columns("", pair="pair", place="its alignment")
-        shown |= columns(".3f", refined_translation_error_m="alone\nm")
-        shown |= columns("+.4f", refined_rotation_error_rad="\nrad")
-        shown |= columns(".3f", team_translation_error_m="in the team\nm")
-        shown |= columns("+.4f", team_rotation_error_rad="\nrad") | columns("d", n_common="common")
-        note = "errors of T_a_b, from the pair's own alignment and from all of the team\n"
-        note += "its alignment: agreement with loops of the others; common: landmarks of both maps"
-        print_frame(pairs.assign(pair=names), shown, "Pairs in the team", note)
-    # Work of each stage, and of a run beside its stages
-    times = tables.work_by_stage(table("timings"))
-    times["share"] = times["seconds"] / times["seconds"].sum()
-    shown = columns("", stage="stage") | columns(".1f", seconds="work, s")
-    shown |= columns(".0%", share="share") | columns("d", tasks="tasks")
-    note = "time of one process at a time, including work of earlier runs\n"
-    note += "start: imports and the scenario, in this command's own process"
-    print_frame(times, shown, "Work by stage", note)
-    told = team_lines(table("fused_motions"), table("team"), pairs)
-    print_lines(f"  {line}" for line in (*told, *edge_lines(table("team_edges"))))
-    drawn = [] if skipped_figures is None else [f"Figures: {result / 'figures'}"]
-    print_lines(["   ".join([*drawn, f"Tables: {result / 'tables'}"])])
-    print_skipped(skipped_figures or ())
-
-
-def _print_smoother(rows: pd.DataFrame) -> None:
-    """Print the errors of the batch smoother beside those of the filter."""
-    smoothed = rows[rows["not_smoothed"] == ""]
-    if smoothed["path_rmse_m"].notna().any() or smoothed["landmark_rmse_m"].notna().any():
-        shown = columns("", robot="robot") | columns(".3f", path_rmse_m="path, m")
-        shown |= columns(".1f", filter_over_smoother="FastSLAM\n/ smoother")
-        shown |= columns(".3f", landmark_rmse_m="landmarks\nm")
-        shown |= columns(".3f", filter_landmark_rmse_m="FastSLAM's\nm")
-        shown |= columns(".1%", gross_share="gross\n") | columns(".2f", nees_per_dof="NEES\n/ dof")
-        shown |= columns(".0%", coverage_95="in\n95 %")
+    smoother = table("smoother")
+    smoothed = smoother[smoother["not_smoothed"] == ""]
+    if smoothed[["path_rmse_m", "landmark_rmse_m"]].notna().any(axis=None):
         note = f"paths from the start; landmarks fitted, without gross ones (over {GROSS_M} m)"
-        print_frame(smoothed, shown, "Batch smoother beside the filter", note)
-    reasons = rows[["robot", "not_smoothed"]].itertuples(index=False)
+        print_frame(smoothed, _SMOOTHER, "Batch smoother beside the filter", note)
+    reasons = smoother[["robot", "not_smoothed"]].itertuples(index=False)
     print_lines(f"  {robot} is not smoothed: {why}" for robot, why in reasons if why)
-
-
-def _print_fusers(rows: pd.DataFrame) -> None:
-    """Print the errors of the fused maps, by fuser."""
-    shown = columns("", fuser="fuser") | columns(".3f", landmark_rmse_m="frame\nm")
-    shown |= columns(".3f", fitted_rmse_m="fitted\nm") | columns(".1%", gross_share="gross\n")
-    shown |= columns(".2f", over_better_parent="over\nparent", over_better_filter="over\nfilter")
-    shown |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
-    shown |= columns(".3f", alignment_error_m="T_a_b\nm", alignment_sigma_m="sigma\nm")
+    fused = last_fused(table("fusers"))
     note = f"RMS errors in the map's frame and fitted, without gross ones (over {GROSS_M} m)\n"
     note += "over: fitted error over that of the better given map, and FastSLAM map\n"
     note += "T_a_b: median error of the other robots' poses, with the stated sigma"
-    last = last_fused(rows)
-    print_frame(last, shown, "Fusers: maps of all robots together, at the end", note)
-    reasons = last[["fuser", "fallback"]].itertuples(index=False)
+    print_frame(fused, _FUSERS, "Fusers: maps of all robots together, at the end", note)
+    reasons = fused[["fuser", "fallback"]].itertuples(index=False)
     print_lines(f"  {fuser}: {why}" for fuser, why in reasons if why)
+    pairs = table("team_pairs")
+    if len(pairs) > 1:
+        names = pairs["robot_a"] + " - " + pairs["robot_b"]
+        note = "errors of T_a_b, from the pair's own alignment and from all of the team\n"
+        note += "its alignment: agreement with loops of the others; common: landmarks of both maps"
+        print_frame(pairs.assign(pair=names), _TEAM_PAIRS, "Pairs in the team", note)
+    # Work of each stage, and of a run beside its stages
+    times = tables.work_by_stage(table("timings"))
+    times["share"] = times["seconds"] / times["seconds"].sum()
+    note = "time of one process at a time, including work of earlier runs\n"
+    note += "start: imports and the scenario, in this command's own process"
+    print_frame(times, _WORK, "Work by stage", note)
+    team = team_lines(table("fused_motions"), table("team"), pairs)
+    print_lines(f"  {line}" for line in (*team, *edge_lines(table("team_edges"))))
+    drawn = [] if skipped_figures is None else [f"Figures: {result / 'figures'}"]
+    print_lines(["   ".join([*drawn, f"Tables: {result / 'tables'}"])])
+    print_skipped(skipped_figures or ())
 
 
 def not_run_lines(errors: pd.DataFrame) -> list[str]:
@@ -274,39 +301,6 @@ def not_run_lines(errors: pd.DataFrame) -> list[str]:
         share = "" if status == Status.ABSENT else f" in {len(rows)} of {n_rows[aligner]} rows"
         lines.append(f"{aligner}: {status}{share}: {reason}")
     return lines
-
-
-def _print_aligners(errors: pd.DataFrame, summary: pd.DataFrame) -> None:
-    """Print medians of the errors and times, by aligner."""
-    shown = columns("", aligner="aligner")
-    shown |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
-    shown |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
-    maps = answerable(errors)
-    note = f"{NO_ESTIMATE}\n"
-    note += "spread: 10-90 % of the repetitions; ok: accepted"
-    if len(maps):
-        n_offered = maps["n_correspondences"]
-        share = (maps["n_true"] / n_offered).median()
-        note += f"\npairs offered: {n_offered.median():.0f}, {share:.0%} of them true"
-    title = f"Alignment errors: medians over iterations with {ANSWERABLE_PAIRS}+ true pairs"
-    print_frame(summary, shown, title, note)
-
-
-def _print_pairs(errors: pd.DataFrame, aligner: str) -> None:
-    """Print each pair at its last iteration: one aligner, refined, beside the oracle."""
-    shown = [("pair", "")]
-    for whose in ("error", "oracle"):
-        shown += [(f"{whose}, m", ".3f"), (f"{whose}, rad", "+.4f")]
-    names = [f"refined_{quantity}" for quantity in ("translation_error_m", "rotation_error_rad")]
-    bands = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])
-    medians = bands[names].T.to_dict("list")
-    rows = []
-    for last in at_the_end(errors).drop_duplicates(ROBOT_PAIR).to_dict("records"):
-        pair = (last["robot_a"], last["robot_b"])
-        found = (*medians[(*pair, aligner)], *medians[(*pair, ORACLE)])
-        rows.append([" - ".join(pair), *found, f"{last['n_true']} of {last['n_correspondences']}"])
-    title = f"Pairs at the last iteration, {aligner} refined"
-    print_table([*shown, ("true pairs", ">")], rows, title)
 
 
 def print_checks(checks: Sequence[CheckedScenario]) -> None:

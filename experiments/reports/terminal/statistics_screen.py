@@ -66,7 +66,18 @@ _NEES |= columns(".0%", share_in_gate="in gate")
 def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]) -> None:
     """Print the main tables, and the folder of all tables."""
     _print_success(_rows(summary, "success_at_the_end"), summary.n_runs)
-    _print_by_true_pairs(_rows(summary, "success_by_true_pairs"))
+    by_pairs = _rows(summary, "success_by_true_pairs")
+    if len(by_pairs):
+        # One column per bin of the number of true pairs
+        last = np.where(by_pairs["to"] == math.inf, "+", "")
+        by_pairs = by_pairs.assign(bin=by_pairs["from"].map("{:.0f}".format) + last)
+        index = [*_labels(by_pairs), "aligner"]
+        shares = by_pairs.pivot_table("estimated_success", index, "bin", sort=False)
+        bins = {name: name for name in by_pairs.sort_values("from")["bin"] if name in shares}
+        shown = _METHOD | columns(".0%", **bins)
+        note = "by the number of true pairs, from the lower edge of each bin; "
+        note += "intervals: see the files"
+        _print(shares.reset_index(), shown, "Share of the maps right as estimated", note)
     ratios = _rows(summary, "error_over_oracle")
     for stage, kind in _STAGES.items():
         shown = _METHOD | columns(".0%", **{f"{stage}_share": "given"})
@@ -83,25 +94,23 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
         paths = paths[paths["error"].notna() & (paths["delta_unit"] != "frames")]
         note = "ATE: after the best rigid fit; RPE: relative, along a metre; (95 %, bootstrap)"
         _print(paths, _PATHS, "Path errors, median over robots and runs", note)
-    smoothed = _rows(summary, "smoother")
-    if len(smoothed):
-        note = "ratio: FastSLAM's final path over the smoothed one; landmarks: fitted; "
-        note += "(95 %, bootstrap)"
-        _print(smoothed, _SMOOTHER, "Batch smoother, median over robots and runs", note)
-    fused = _rows(summary, "fusers")
-    if len(fused):
-        note = "landmarks: RMS in the frame of the first robot, without gross ones; over filter:\n"
-        note += "fitted error over that of the better FastSLAM map; (95 %, bootstrap)"
-        _print(fused, _FUSERS, "Fused maps by fuser at the end, median over runs", note)
-    team, pairs = _rows(summary, "team"), _rows(summary, "team_pairs")
+    note = "ratio: FastSLAM's final path over the smoothed one; landmarks: fitted; "
+    note += "(95 %, bootstrap)"
+    title = "Batch smoother, median over robots and runs"
+    _print(_rows(summary, "smoother"), _SMOOTHER, title, note)
+    note = "landmarks: RMS in the frame of the first robot, without gross ones; over filter:\n"
+    note += "fitted error over that of the better FastSLAM map; (95 %, bootstrap)"
+    title = "Fused maps by fuser at the end, median over runs"
+    _print(_rows(summary, "fusers"), _FUSERS, title, note)
+    team = _rows(summary, "team")
     if len(team):
         robots = team["n_robots"].map(str) + "/" + team["n_team"].map(str)
         note = "all merged robots under one rigid fit, median over runs; (95 %, bootstrap)"
         _print(team.assign(robots=robots), _TEAM, "Path errors of teams (ATE)", note)
-    if len(pairs):
-        note = "precision: right ones of those used; recall: found ones of those that met;\n"
-        note += "errors of T_a_b, medians over pairs in one map; (95 %, Wilson, bootstrap)"
-        _print(pairs, _TEAM_PAIRS, "Alignments between robots at the end", note)
+    note = "precision: right ones of those used; recall: found ones of those that met;\n"
+    note += "errors of T_a_b, medians over pairs in one map; (95 %, Wilson, bootstrap)"
+    title = "Alignments between robots at the end"
+    _print(_rows(summary, "team_pairs"), _TEAM_PAIRS, title, note)
     nees = _rows(summary, "nees")
     if len(nees):
         low, high = (nees[name].map("{:.2f}".format) for name in ("band_low", "band_high"))
@@ -155,21 +164,6 @@ def _print_success(rows: pd.DataFrame, n_runs: int) -> None:
         shown |= columns(".0%", refused_apart="refused without\ncommon ground")
     caption = "though wrong: share of all pairs of maps; (95 %, Wilson)"
     _print(rows, shown, "Verdicts at the end", caption)
-
-
-def _print_by_true_pairs(rows: pd.DataFrame) -> None:
-    """Print success as estimated by the number of true pairs, one column per bin."""
-    if rows.empty:
-        return
-    last = np.where(rows["to"] == math.inf, "+", "")
-    rows = rows.assign(bin=rows["from"].map("{:.0f}".format) + last)
-    shares = rows.pivot_table("estimated_success", [*_labels(rows), "aligner"], "bin", sort=False)
-    bins = {name: name for name in rows.sort_values("from")["bin"] if name in shares}
-    caption = (
-        "by the number of true pairs, from the lower edge of each bin; intervals: see the files"
-    )
-    title = "Share of the maps right as estimated"
-    _print(shares.reset_index(), _METHOD | columns(".0%", **bins), title, caption)
 
 
 def _print_best_against_others(rows: pd.DataFrame, ratios: pd.DataFrame) -> None:

@@ -16,9 +16,9 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_M,
     RIGHT_WITHIN_RAD,
 )
-from experiments.evaluation.odometry_calibration import filter_settings
+from experiments.evaluation.single_steps import filter_settings
 from experiments.reports.formatting import interval, two_digits
-from experiments.reports.study_files import SHOWN, shown_numbers
+from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
     Column,
@@ -79,6 +79,14 @@ def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[st
         print_table(headings, cells, title, note)
     print_lines([f"Tables and figure: {folder}"])
     print_skipped(skipped)
+
+
+def print_claims(values: pd.DataFrame) -> None:
+    """Print verdict and value of each claim of the paper, a column per scenario and renderer."""
+    table = claims_table(values).drop(columns=["measure", "why"])
+    shown = table.map(lambda text: str(text).replace("**", ""))
+    headings = [(str(name), "") for name in shown.columns]
+    print_table(headings, shown.to_numpy().tolist(), "The paper beside this software")
 
 
 MAX_ROWS_SHOWN = 60
@@ -244,7 +252,9 @@ def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
         first = [own[0][name] for name in ("first_iteration", "first_iteration_by_chance")]
         times = ["–" if math.isnan(value) else f"{value:.0f}" for value in first]
         found.append([kind, *shares, *times])
-    shown = columns(">", kept="accepted", ambiguous="ambi-\nguous", uncertain="too un-\ncertain")
+    shown = columns(
+        ">", accepted="accepted", ambiguous="ambi-\nguous", uncertain="too un-\ncertain"
+    )
     shown |= columns(">", refused="refused", first="first at\niteration", chance="by\nchance")
     print_table(
         [("kind of world", ""), *shown.values()],

@@ -113,7 +113,7 @@ def test_ctrl_c_before_the_command_starts(
     def press() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("experiments.pipeline.code_version.use_kernel_cache", press)
+    monkeypatch.setattr("experiments.pipeline.stage.use_kernel_cache", press)
     reply = command(capsys, "scenarios", "--schema")
     assert reply.code == 130
     assert len(reply.err.splitlines()) == 1
@@ -373,3 +373,35 @@ def test_runs_with_little_to_go_on(
         capsys, "check", path, "--jobs", 1, "--results", tmp_path, "--seeds", 3, *changes
     )
     assert reply.code == (name == "nothing alike")
+
+
+def test_a_dry_run_prints_the_plan_and_writes_nothing(
+    tiny_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results = tmp_path / "results"
+    reply = command(capsys, "run", tiny_path, "--dry-run", "--results", results, "--jobs", 1)
+    assert reply.code == 0
+    assert "tiny, seed 3: 2 robots, 44 frames each; images: PyBullet's TinyRenderer" in reply.out
+    assert ["slam", "0", "2"] in [line.split()[:3] for line in reply.out.splitlines()]
+    assert "Nothing was run." in reply.out
+    assert not results.exists()
+    wrong = ("run", tiny_path, "--dry-run", "--set", "drive.frames=1")
+    assert command(capsys, *wrong).code == 2
+
+
+def test_a_run_without_figures_leaves_none_and_ends_with_advice(
+    tiny_path: Path, tiny_results_copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = tiny_results_copy / "tiny-3" / "figures"
+    figures.mkdir(exist_ok=True)
+    outdated, own = figures / "fig10_fused_map.png", figures / "mine.png"
+    for file in (outdated, own):
+        file.write_bytes(b"")
+    arguments = ("run", tiny_path, "--results", tiny_results_copy, "--no-figures", "--jobs", 1)
+    reply = command(capsys, *arguments)
+    assert reply.code == 0
+    assert [file.name for file in figures.iterdir()] == [own.name]
+    *_, images, advice, opens = reply.out.strip().splitlines()
+    assert images == "Images of the cameras: PyBullet's TinyRenderer"
+    assert advice.startswith("Method to use: ")
+    assert opens == f"Open the report: mapfusion report {tiny_results_copy / 'tiny-3'} --open"

@@ -1,16 +1,30 @@
-"""What any command offers: its version, `python -m`, completion in the shell."""
+"""What any command offers: its version, `python -m`, completion in the shell, and the manual."""
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
 import pytest
+import typer
 
-from tests.helpers.tiny_scenario import command
+from experiments.cli.completion import (
+    complete_format,
+    complete_scenario_or_tag,
+    complete_setting,
+)
+from experiments.cli.main import app
+from experiments.reports import result_export
+from experiments.scenario.suite import entries
+from experiments.scenario.yaml_files import SHIPPED
+from mapfusion.datasets.formats import EXPORTERS
+from mapfusion.errors import DISTRIBUTION
+from tests.helpers.tiny_scenario import assert_refused, command
 
 ROOT = Path(__file__).parents[3]
+PAGES = sorted((ROOT / "experiments" / "docs").glob("*.md"))
 
 
 def asked(*arguments: str, **settings: str) -> str:
@@ -28,14 +42,71 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert asked("--version") == f"mapfusion {version}"
 
 
+def test_texts_name_our_distribution_and_pages_that_exist() -> None:
+    """`pip install mapfusion` would install another project's package."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["name"] == DISTRIBUTION
+    extras, pages = set(project["optional-dependencies"]), {each.stem for each in PAGES}
+    folders = [ROOT / name for name in ("mapfusion", "sim", "experiments", "scenarios")]
+    for path in (path for folder in folders for path in folder.rglob("*.*")):
+        if path.suffix not in (".py", ".md", ".yaml", ".j2"):
+            continue
+        text = path.read_text(encoding="utf-8")
+        installed = re.findall(r"pip install\s+'?(mapfusion[\w-]*)", text)
+        asked = re.findall(r"\bmapfusion(-\w+)?\[(\w+)\]", text)
+        assert set(installed) <= {DISTRIBUTION}, path
+        assert {f"mapfusion{end}" for end, _ in asked} <= {DISTRIBUTION}, path
+        assert {extra for _, extra in asked} <= extras, path
+        assert set(re.findall(r"`mapfusion docs\s+([a-z]+)`", text)) <= pages, path
+        assert path.suffix == ".md" or "experiments/docs" not in text, path
+
+
+def test_the_manual_is_listed_and_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    listed = command(capsys, "docs").out
+    assert str(PAGES[0].parent) in listed
+    for page in PAGES:
+        assert page.stem in listed
+        assert command(capsys, "docs", page.stem).out.strip() == page.read_text("utf-8").strip()
+    assert_refused(command(capsys, "docs", "formatz"), "formatz", "did you mean formats?")
+    assert_refused(command(capsys, "docs", "../../README"), "no such page")
+
+
 def test_the_citation_is_of_this_version() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
 
 
-def test_the_shell_completes_commands() -> None:
-    told = asked(COMP_WORDS="mapfusion sce", COMP_CWORD="1", _MAPFUSION_COMPLETE="complete_bash")
-    assert told.split() == ["scenarios"]
+def completed(line: str) -> list[str]:
+    """What the shell offers at the end of a line."""
+    words = len(line.split(" ")) - 1
+    shell = {"COMP_WORDS": line, "COMP_CWORD": f"{words}", "_MAPFUSION_COMPLETE": "complete_bash"}
+    return asked(**shell).split()
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("mapfusion sce", ["scenarios"]),
+        ("mapfusion run qu", ["quick"]),
+        ("mapfusion run ful", ["full"]),
+        ("mapfusion align a b --aligner cli", ["clique"]),
+    ],
+)
+def test_the_shell_completes_commands_and_names(line: str, offered: list[str]) -> None:
+    assert completed(line) == offered
+
+
+def test_completed_names_are_those_that_commands_take() -> None:
+    context = typer.Context(typer.main.get_command(app), info_name="export")
+    assert complete_format(context, "") == [*result_export._FILES, result_export._RERUN]
+    context.info_name = "record"
+    assert complete_format(context, "ros") == [name for name in EXPORTERS if name.startswith("ros")]
+    keys = complete_setting("slam.filter.n_")
+    assert keys == ["slam.filter.n_particles="]
+    tags = {tag for entry in entries() for tag in entry["tags"]}
+    assert set(complete_scenario_or_tag("")) == tags | {
+        path.stem for path in SHIPPED.glob("*.yaml")
+    }
 
 
 @pytest.mark.parametrize(

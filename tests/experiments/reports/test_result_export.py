@@ -16,7 +16,7 @@ from evo.core.metrics import APE, PoseRelation
 from evo.tools.file_interface import read_kitti_poses_file, read_tum_trajectory_file
 
 from experiments.evaluation import tables
-from experiments.pipeline.tables import alignment_of
+from experiments.pipeline.stages.align import alignment_of
 from experiments.reports import result_export
 from experiments.reports.figures.result_tables import ResultTables, of_pair
 from mapfusion.geometry import se2
@@ -214,7 +214,7 @@ def test_g2os_odometry_chains_to_the_tables(graph: Graph, trio_result: Path) -> 
 def test_g2os_weights_are_mahalanobis_distances_in_the_frame_of_a(
     graph: Graph, trio_result: Path
 ) -> None:
-    """Whatever its error turns: a T that is off by d has d' S^-1 d, with S as in `estimates`."""
+    """An edge with error d has the cost d' S^-1 d, with S as in `estimates`."""
     data = ResultTables(trio_result)
     sizes = [
         len(data.of_robot("paths", robot)) + len(read_map(trio_result / f"maps/{robot}.parquet"))
@@ -314,7 +314,7 @@ Logged = dict[str, dict[int, Any]]  # by entity and frame
 
 
 def stand_in(logged: Logged) -> ModuleType:
-    """A module of that name that notes what is logged."""
+    """Module of that name that records the calls."""
 
     class Stream:
         def __init__(self, *_: object, **__: object) -> None:

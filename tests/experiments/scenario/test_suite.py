@@ -9,6 +9,7 @@ from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import SHIPPED as SUITE
 from experiments.scenario.suite import entries, scenarios_of
 from mapfusion.errors import InputError
+from mapfusion.fastslam.proposal import Proposal
 from tests.helpers.tiny_scenario import assert_refused, command
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
@@ -149,6 +150,23 @@ def test_the_mission_s_own_scenarios_keep_pybullet_s_pictures(name: str) -> None
     scenario = load_scenario(SCENARIOS / f"{name}.yaml")
     assert isinstance(scenario, Simulation)
     assert scenario.render.renderer == "tiny"
+
+
+def test_the_paper_as_printed_drives_as_the_paper_does() -> None:
+    """Only methods and renderer differ, so that both scenarios can be compared."""
+    printed, usual = (
+        load_scenario(SCENARIOS / f"{name}.yaml") for name in ("paper_as_printed", "paper")
+    )
+    assert isinstance(printed, Simulation)
+    assert isinstance(usual, Simulation)
+    for section in ("world", "robots", "drive", "camera", "odometry", "evaluate"):
+        assert getattr(printed, section) == getattr(usual, section), section
+    filtered = printed.slam.filter
+    assert (filtered.proposal, filtered.close_loops) == (Proposal.MOTION, False)
+    assert [entry.name for entry in printed.align.aligners] == ["ransac", "svd", "icp", "impicp"]
+    assert printed.align.aligners[1].parameters == {"points": "space"}
+    assert (printed.merge.fuser, printed.smooth.max_memory_gb) == ("kalman", 0)
+    assert printed.fuse.fusers == ["kalman", "kalman_as_printed"]
 
 
 def test_the_default_suite_is_five_worlds_that_fit_the_hour() -> None:

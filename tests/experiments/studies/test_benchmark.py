@@ -46,6 +46,20 @@ def quiet(stage: str, done: int, total: int) -> None:
     del stage, done, total
 
 
+def test_landmarks_without_a_partner_change_nothing_else() -> None:
+    alone, among = (
+        synthetic_pair(60, 0.5, np.random.default_rng(3), share) for share in (0.0, 0.75)
+    )
+    assert (len(alone.map_a), len(among.map_a), len(among.map_b)) == (60, 240, 240)
+    for name in ("index_a", "index_b", "distance"):
+        left, right = (getattr(each.correspondences, name) for each in (alone, among))
+        np.testing.assert_array_equal(left, right)
+    np.testing.assert_array_equal(among.map_a.position_m[:60], alone.map_a.position_m)
+    in_frame_b = se2.transform_points(se2.inverse(among.T_a_b), among.map_a.position_m[60:])
+    for own in (in_frame_b, among.map_b.position_m[60:]):
+        assert kstest(own[:, 0], "uniform", (-SIZE_M / 2, SIZE_M)).pvalue > 1e-3
+
+
 def test_good_and_bad_methods_are_told_apart(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
     trials = run_benchmark(SMALL, Store(tmp_path), lambda *now: told.append(now))
@@ -174,7 +188,7 @@ def test_command_writes_tables_and_figure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--trials", 2, "--pairs", 60, "--outliers", 0.5, "--results", tmp_path]
-    reply = command(capsys, "study", "benchmark", "--method", "ransac", *options)
+    reply = command(capsys, "study", "benchmark", "--aligner", "ransac", *options)
     assert reply.code == 0
     assert "60 pairs" in reply.out
     folder = tmp_path / "benchmark"
@@ -197,7 +211,10 @@ def test_command_writes_tables_and_figure(
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--method", "ransack"], "--method: unknown aligner 'ransack', known are ransac"),
+        (
+            ["--aligner", "ransack"],
+            "--aligner ransack: unknown aligner 'ransack', known are ransac",
+        ),
         (["--outliers", "1.5"], "'--outliers': Input should be less than or equal to 1"),
         (["--trials", "0"], "'--trials': Input should be greater than or equal to 1"),
     ],
@@ -214,8 +231,9 @@ def test_bad_input_is_one_line(
 def test_methods_of_a_scenario(tmp_path: Path, tiny_path: Path) -> None:
     assert [entry.name for entry in entries_of([], tiny_path)] == ["ransac", "svd", "icp"]
     assert [entry.name for entry in entries_of(["icp"], tiny_path)] == ["icp"]
-    with pytest.raises(InputError, match=r"align\.aligners: none is named opencv"):
-        entries_of(["opencv"], tiny_path)
+    assert [entry.name for entry in entries_of(["gnc", "svd"], tiny_path)] == ["gnc", "svd"]
+    with pytest.raises(InputError, match=r"--aligner nobody: unknown aligner 'nobody'"):
+        entries_of(["nobody"], tiny_path)
     assert {"ransac", "opencv", "kiss_matcher"} <= {entry.name for entry in entries_of([])}
 
 

@@ -57,7 +57,7 @@ def scenario(trio_result: Path) -> Simulation:
 
 @pytest.fixture(scope="module")
 def results(trio_result: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of results with the logs of that run alone."""
+    """Return a folder of results that holds only the logs of that run."""
     folder = tmp_path_factory.mktemp("results")
     shutil.copytree(trio_result.parent / "store" / "log", folder / "store" / "log")
     return folder
@@ -229,7 +229,7 @@ def test_command_writes_tables_page_and_figure(
 
 
 def test_a_smaller_team_is_some_of_the_larger_one(scenario: Simulation, results: Path) -> None:
-    """What two robots do by themselves, and their alignment, is measured for both teams at once."""
+    """The work of two robots and of their alignment is measured once for both teams."""
     run = EvaluatedRun.of(scenario, Store.of(results))
     two, three = (team_of(run, n) for n in (2, 3))
     keys = {name: stage.key for name, stage in three.by_robot.items()}
@@ -270,7 +270,7 @@ FIRST, LAST = 10, 30
 
 @dataclass
 class MadeUpTeam:
-    """Where stages would have left their tables."""
+    """Team whose stages have left made-up tables in a folder."""
 
     root: Path
     iterations: tuple[int, ...] = ITERATIONS

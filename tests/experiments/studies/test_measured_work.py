@@ -1,4 +1,4 @@
-"""The meter against work whose memory and time are known."""
+"""Tests of the meter on work whose memory and time are known."""
 
 import math
 import multiprocessing

@@ -18,9 +18,9 @@ from experiments.reports.terminal.study_screen import print_kinds, print_reliabi
 from experiments.studies.refusal_rates import (
     N_BINS,
     Rate,
+    answers_with_probability,
     by_kind,
     first_right_answers,
-    judged_answers,
     of_any_method,
     pooled,
     reliability,
@@ -134,7 +134,7 @@ def answers(stated: np.ndarray, right: np.ndarray, n_runs: int) -> pd.DataFrame:
     rows["kind"] = np.where(np.arange(len(stated)) % 2, "a", "b")
     rows = rows.assign(ground="common", n_common=9, accepted=True, status="accepted")
     rows = rows.assign(refined_rotation_error_rad=0.0, beats_chance=True, n_true=30)
-    return judged_answers(rows.assign(log10_false_alarms=-5.0, aligner="ransac"))
+    return answers_with_probability(rows.assign(log10_false_alarms=-5.0, aligner="ransac"))
 
 
 def test_a_probability_that_holds_errs_by_what_chance_gives() -> None:
@@ -160,7 +160,7 @@ def test_one_that_is_too_sure_errs_by_as_much() -> None:
 
 
 def test_runs_are_resampled_whole() -> None:
-    """All answers of a run alike: the interval is that of the runs, not of the answers."""
+    """If all answers of a run are equal, the interval is that of the runs."""
     rng = np.random.default_rng(2)
     of_run = rng.random(40) < 0.5
     rows = answers(np.full(4000, 0.5), of_run[np.arange(4000) % 40], 40)

@@ -33,7 +33,7 @@ MATCHING = MatchParameters(max_descriptor_distance=0.3)
 
 
 def described(name: str, points: np.ndarray, T_world_map: list[float], seed: int):
-    """A robot with one map whose landmarks look as their seed says."""
+    """Return a robot with one map whose descriptors depend on the seed."""
     made = robot(name, points, np.array(T_world_map))
     vectors = np.random.default_rng(seed).standard_normal((len(points), DESCRIPTOR_LENGTH))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -171,14 +171,14 @@ def test_stated_number_of_false_alarms_bounds_the_measured_one() -> None:
 
 @pytest.fixture
 def few_pairs(monkeypatch: pytest.MonkeyPatch) -> int:
-    """How many pairs of maps the command calibrates by; thousands are dear and show no more."""
+    """Calibrate with few pairs of maps; thousands take long and test no more."""
     monkeypatch.setattr(results, "N_PAIRS_OF_MAPS", 50)
     return 50
 
 
 @pytest.fixture(scope="module")
 def other_result(tiny: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny scenario in another world: another seed's textures; one aligner is enough here."""
+    """Return the result of the tiny scenario with another seed's textures and one aligner."""
     folder = tmp_path_factory.mktemp("other")
     alone = {"aligners": tiny.align.aligners[:1], "repetitions": 1}
     align = tiny.align.model_copy(update=alone)
@@ -224,7 +224,7 @@ def test_the_command_crosses_two_worlds(
 def test_worlds_may_be_scenarios_with_seeds(
     tiny: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As a sweep leaves them: maps in the store, no result folder. Posters are told apart."""
+    """Write maps to a store without a result folder, as a sweep does."""
     short = tiny.model_copy(
         update={
             "drive": tiny.drive.model_copy(update={"frames": 16}),

@@ -54,7 +54,7 @@ GRID = ("--set", "slam.filter.n_particles=5,10", "--set", "align.repetitions=1")
 
 @pytest.fixture(scope="module")
 def short_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny scenario with fewer frames, and of two aligners one that draws nothing."""
+    """Write the tiny scenario with fewer frames and two aligners."""
     path = tmp_path_factory.mktemp("short") / "short.yaml"
     asked = SHORT.replace("    - {name: icp, method: icp}\n", "")
     # so that all runs have something to fuse: small maps of few particles, which see one place
@@ -199,7 +199,7 @@ def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
     short_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two workers need 0.3 GB each before they begin; other machines have what they have."""
-    monkeypatch.setattr("experiments.pipeline.stages.memory.memory_bytes", lambda: 0.6e9)
+    monkeypatch.setattr("experiments.pipeline.stages.pipeline.memory_bytes", lambda: 0.6e9)
     asked = prepare([short_path], [0], [], tmp_path)
     (reason,) = execute(asked, 2, None, lambda _: None).failed.values()
     assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason
@@ -247,7 +247,7 @@ def _whole_runs(sweep: Path) -> int:
 
 
 def test_two_sweeps_at_once_on_one_store(swept: Path, short_path: Path, tmp_path: Path) -> None:
-    """They do some work twice, and nothing wrong."""
+    """Both sweeps may compute a stage twice, but results are right."""
     arguments = ("sweep", short_path, "--seeds", "1", *GRID)
     with (
         KilledCommand((*arguments, "-o", tmp_path / "one"), tmp_path, jobs=1) as one,

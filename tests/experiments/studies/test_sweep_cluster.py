@@ -55,7 +55,7 @@ def scenario(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def other_machine(tmp_path: Path) -> OtherMachine:
-    """Where kernels run as plain Python: it has none compiled, and is given little to do."""
+    """Return a machine without compiled kernels; they run there as plain Python."""
     return OtherMachine(tmp_path / "elsewhere", NUMBA_DISABLE_JIT="1")
 
 
@@ -76,7 +76,7 @@ def scheduler(other_machine: OtherMachine, tmp_path: Path) -> Iterator[str]:
 
 
 def _address(told: Path) -> str:
-    """What the scheduler's file says; empty as long as it is not written to its end."""
+    """Return the content of the scheduler's file, or nothing while it is incomplete."""
     try:
         return json.loads(told.read_text())["address"]
     except (FileNotFoundError, json.JSONDecodeError):

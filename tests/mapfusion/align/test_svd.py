@@ -21,15 +21,24 @@ def listing(m, m_prime):
     return (vt.T @ w).T
 
 
-def test_is_algorithm_1():
+@pytest.mark.parametrize(("points", "n"), [("plane", 2), ("space", 3)])
+def test_is_algorithm_1(points, n):
+    """With points of space the listing gives the 4x4 matrix of eq. 11."""
     pair = given_pairs(np.random.default_rng(1), 50, 0.8, 0.1)
-    m, m_prime = pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :2]
-    T = listing(m, m_prime)
+    T = listing(pair.map_a.position_m[:, :n], pair.map_b.position_m[:, :n])
     u, _, vt = np.linalg.svd(T[:2, :2])
     nearest = u @ np.diag([1, np.linalg.det(u @ vt)]) @ vt
-    printed, _ = solve(m, m_prime, "printed")
-    np.testing.assert_allclose(printed[:2], T[:2, 2], atol=1e-9)
+    maps = (pair.map_a, pair.map_b, pair.correspondences)
+    printed = as_aligner(Svd(points=points)).align(*maps, RNG).T_a_b
+    np.testing.assert_allclose(printed[:2], T[:2, -1], atol=1e-9)
     np.testing.assert_allclose(se2.rotation(printed[2]), nearest, atol=1e-9)
+
+
+@pytest.mark.parametrize(("n_pairs", "status"), [(3, "degenerate"), (4, "accepted")])
+def test_a_4x4_matrix_needs_four_pairs(n_pairs, status):
+    pair = given_pairs(np.random.default_rng(8), n_pairs)
+    aligner = as_aligner(Svd(points="space"))
+    assert aligner.align(pair.map_a, pair.map_b, pair.correspondences, RNG).status == status
 
 
 def test_result_of_the_listing_is_no_rotation():
@@ -61,12 +70,13 @@ def test_printed_translation_depends_on_where_map_b_begins():
 
 
 @pytest.mark.parametrize("translation", ["printed", "solved"])
-def test_covariance_against_monte_carlo(translation):
+@pytest.mark.parametrize("n", [2, 3])
+def test_covariance_against_monte_carlo(translation, n):
     """Map a has different noise for each landmark, which the fit does not use."""
     pair = given_pairs(np.random.default_rng(6), 30)
     rng = np.random.default_rng(7)
     sigma = rng.uniform(0.01, 0.2, 30)
-    m, m_prime = pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :2]
+    m, m_prime = pair.map_a.position_m[:, :2], pair.map_b.position_m[:, :n]
     fits = np.array(
         [
             solve(m + sigma[:, None] * rng.standard_normal((30, 2)), m_prime, translation)[0]
@@ -97,6 +107,8 @@ def test_one_common_wall_is_degenerate(across_m, status):
     assert ("line" in alignment.reason) == (alignment.status is Status.DEGENERATE)
 
 
-def test_unknown_translation_is_named():
+def test_unknown_options_are_named():
     with pytest.raises(ValueError, match="translation: is 'guessed', expected one of printed"):
         Svd(translation="guessed")
+    with pytest.raises(ValueError, match="points: is 'line', expected one of plane, space"):
+        Svd(points="line")

@@ -110,7 +110,7 @@ class LoggedTeam:
 
 
 def labels(landmarks: LandmarkMap) -> np.ndarray:
-    """Which landmarks of the world they are."""
+    """Return the labels of the world's landmarks."""
     assert landmarks.label is not None
     return landmarks.label
 

@@ -1,4 +1,4 @@
-"""Fusers by name, our own and those of installed packages."""
+"""Fusers by name, our own and those of installed packages; natural order of map names."""
 
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from mapfusion.fusion import fusers
-from mapfusion.fusion.fusers import FUSERS, GROUP, make_fuser
+from mapfusion.fusion.fusers import FUSERS, GROUP, make_fuser, name_order
 from mapfusion.fusion.joint import JointFuser
 
 
@@ -81,3 +81,19 @@ def test_a_former_import_is_told_with_the_new_module(
 def test_what_cannot_be_used_is_told(name: str, told: str) -> None:
     with pytest.raises(ValueError, match=told):
         make_fuser(name)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["R1", "R2", "R10"],
+        ["2", "10", "A", "R", "R0", "R1", "R2b", "R02c", "R10", "robot 3"],
+        ["", "1", "a"],
+        ["R1", "R1" + "0" * 5000],  # more digits than `int` takes
+        ["R01", "R1"],  # equal numbers, yet different names
+    ],
+)
+def test_numbers_count_as_such(names: list[str]) -> None:
+    shuffled = names[::-1]
+    assert sorted(shuffled, key=name_order) == names
+    assert len({str(name_order(name)) for name in names}) == len(names)

@@ -230,7 +230,7 @@ def test_a_known_identity_needs_no_gate() -> None:
 
 
 def test_the_gate_keeps_the_share_of_true_pairs_that_it_promises() -> None:
-    """What two maps share cancels in their difference, else it would keep nearly all of them."""
+    """Errors that two maps share cancel; otherwise the gate would keep nearly all pairs."""
     kept = []
     for seed in range(8):
         team = DrawnTeam([slice(0, 300), slice(0, 300)], seed)

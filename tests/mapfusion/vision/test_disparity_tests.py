@@ -27,7 +27,7 @@ def apart(half: int = HALF) -> np.ndarray:
 
 
 def columns(left: np.ndarray, u: int, v: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What is known of a window (n, 5), what may be there beyond (n, 7), places (n, 4) x y u v."""
+    """Return columns of the plane (n, 5), of further terms (n, 7), and x, y, u, v (n, 4)."""
     x, y = (k.ravel() for k in np.meshgrid(*[np.arange(-HALF, HALF + 1)] * 2))
     inside = (u + x >= 1) & (u + x <= left.shape[1] - 2) & (v + y >= 0) & (v + y < len(left))
     x, y = x[inside], y[inside]

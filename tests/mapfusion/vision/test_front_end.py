@@ -39,7 +39,7 @@ def everything(features: Features) -> np.ndarray:
 def observe(
     camera: StereoCamera, features: Features, keep: np.ndarray, parameters: FrontEndParameters
 ) -> Observations:
-    """What is observed of features that no track moves."""
+    """Return the observations of features without tracks."""
     given = (features.disparity_px, features.sigma_disparity_px)
     rows = observable(camera, *given, keep, parameters)
     uv, disparity, sigma = (values[rows] for values in (features.uv_px, *given))

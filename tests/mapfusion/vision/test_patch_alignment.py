@@ -28,7 +28,7 @@ def before_and_after(
     offset: float = 0.0,
     bend: np.ndarray = STRAIGHT,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What is at POINT + x in the one lies at PLACE + LINEAR x / (1 + h'x) in the other."""
+    """Draw two images: POINT + x of the first is PLACE + LINEAR x / (1 + h'x) in the second."""
     v, u = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].astype(float)
     picture, rng = Picture(seed), np.random.default_rng(seed)
     back = np.linalg.inv(LINEAR) @ (np.stack([u.ravel(), v.ravel()]) - PLACE[:, None])

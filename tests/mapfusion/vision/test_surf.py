@@ -68,7 +68,7 @@ def test_moves_with_the_image(image: np.ndarray) -> None:
 
 
 def test_magnified_image_at_magnified_scale_is_the_same(image: np.ndarray) -> None:
-    """What a metric window is for. Pixels doubled are the same picture, exactly."""
+    """An image of doubled pixels is the same picture, as a metric window requires."""
     uv, s = np.array([[50.3, 41.8]]), np.array([1.7])
     magnified = image.repeat(2, axis=0).repeat(2, axis=1)
     np.testing.assert_allclose(

@@ -272,7 +272,7 @@ def test_finds_the_largest_set_that_one_motion_explains() -> None:
 
 
 def explained(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether one turn about the height axis and one shift map the points onto each other."""
+    """Return True if one turn about the height axis and one shift map the points to each other."""
     a, b = before[:, :2] - before[:, :2].mean(0), after[:, :2] - after[:, :2].mean(0)
     turn = np.angle(np.sum((a[:, 0] + 1j * a[:, 1]) * (b[:, 0] - 1j * b[:, 1])))
     left = a - transform_points([0, 0, turn], b)

@@ -1,4 +1,4 @@
-"""Each figure on ordinary and on degenerate results."""
+"""Tests of each figure, on ordinary and on degenerate results."""
 
 import hashlib
 import re
@@ -15,13 +15,14 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from experiments.evaluation import tables
+from experiments.evaluation.loop_closures import LoopClosure
 from experiments.pipeline.workers import workers
 from experiments.reports.figures import drawing
 from experiments.reports.figures.drawing import FIGURES, Drawing, draw_all, draw_figure, save_figure
 from experiments.reports.figures.error_figures import draw_coverage, draw_fusers
 from experiments.reports.figures.map_figures import draw_two_maps
 from experiments.reports.figures.result_tables import ResultTables
-from experiments.reports.figures.slam_figures import choose_moments, spread_over_time
+from experiments.reports.figures.slam_figures import Moments, choose_moments, spread_over_time
 from experiments.reports.figures.style import aligner_styles, house_style
 from mapfusion.errors import InputError
 
@@ -50,7 +51,7 @@ def test_all_figures_are_drawn(trio_copy: Path) -> None:
         else:
             assert file.stat().st_size < MAX_SVG_BYTES
     assert sorted(file.name for file in (trio_copy / "figures").iterdir()) == sorted(
-        [*(file.name for file in files), "drawn.json"]
+        [*(file.name for file in files), *(f"{name}.txt" for name in FIGURES), "drawn.json"]
     )
 
 
@@ -169,7 +170,7 @@ def test_the_two_maps_are_drawn_in_one_scale(trio_result: Path) -> None:
     spans = [[np.ptp(a.get_xlim()), np.ptp(a.get_ylim())] for a in figure.axes]
     np.testing.assert_allclose(spans[0], spans[1])
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert [label for label in labels if re.search(r"particles at the end, spread x\d+", label)]
+    assert [label for label in labels if re.search(r"particles at k = \d+, spread x\d+", label)]
     assert all("(seen 3 times or more)" in axes.get_title() for axes in figure.axes)
 
 
@@ -248,7 +249,7 @@ def test_a_figure_without_data_is_remembered_with_its_reason(
 
 
 class _Asked:
-    """A pool that only keeps what it is asked for."""
+    """Pool that records the submitted tasks and runs none."""
 
     def __init__(self) -> None:
         self.tags: list[str] = []
@@ -261,13 +262,14 @@ def test_a_figure_is_begun_once_all_that_it_reads_is_written(tmp_path: Path) -> 
     pool: Any = _Asked()
     drawing = Drawing(pool)
     begun = []
-    for part in ("tracks", "fusers", "paths", "robots", "clouds", "robots", "scenario"):
+    parts = ("tracks", "fusers", "paths", "robots", "sightings", "clouds", "robots", "scenario")
+    for part in parts:
         drawing.written(tmp_path, part)
         begun.append(list(pool.tags))
     with_fusers = ["fig11_fusers"]
     with_robots = [*with_fusers, "fig01_tracks"]
     with_clouds = [*with_robots, "fig03_dispersion"]
-    assert begun == [[], with_fusers, with_fusers, with_robots, *[with_clouds] * 3]
+    assert begun == [[], *[with_fusers] * 2, *[with_robots] * 2, *[with_clouds] * 3]
 
 
 def test_what_is_not_written_yet_is_not_read(trio_result: Path) -> None:
@@ -315,15 +317,21 @@ def spreads(robot: str, values: list[float]) -> pd.DataFrame:
     return pd.DataFrame({"robot": robot, "iteration": iteration, "spread_m": values})
 
 
-def test_moments_are_the_deepest_fall_of_the_spread() -> None:
-    spread = pd.concat(
-        [spreads("R1", [0, 0.1, 0.2, 0.1, 0.3]), spreads("R2", [0, 0.3, 0.2, 0.01, 0.9, 0.8])]
-    )
-    assert choose_moments(spread) == ("R2", 10, 30)
+def test_moments_lie_before_and_after_the_closure_with_the_largest_fall() -> None:
+    closures = [
+        LoopClosure("R1", 50, 40, before_m=0.2, after_m=0.1),
+        LoopClosure("R2", 60, 40, before_m=0.3, after_m=0.1),
+    ]
+    own = [0.9, 0.1, 0.5, 0.3, 0.2, 0.4, 0.1, 0.01, 0.2, 0.3, 0.05, 0.9]
+    spread = pd.concat([spreads("R1", [0.2] * 12), spreads("R2", own)])
+    moments = choose_moments(closures, spread)
+    assert moments is not None
+    # windows: 10 to 59 with values 0.1 0.5 0.3 0.2 0.4, and 60 to 109 with 0.1 0.01 0.2 0.3 0.05
+    assert moments == Moments(closures[1], 30, 60)
 
 
-def test_particles_that_only_spread_have_no_such_moments() -> None:
-    assert choose_moments(spreads("R1", [0, 0.1, 0.2, 0.3])) is None
+def test_without_a_loop_closure_there_are_no_moments() -> None:
+    assert choose_moments([], spreads("R1", [0, 0.1, 0.3, 0.01])) is None
 
 
 def test_spread_is_the_root_mean_square_distance_from_the_mean() -> None:

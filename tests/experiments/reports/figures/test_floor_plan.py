@@ -1,14 +1,16 @@
-"""Floor plans: views, scales and error ellipses."""
+"""Tests of floor plans and of the common style."""
 
 import io
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from experiments.reports.figures import floor_plan
 from experiments.reports.figures.floor_plan import add_ellipses, semi_axes
+from experiments.reports.figures.style import write_plainly
 
 
 def test_strays_are_out_of_view_and_counted() -> None:
@@ -27,7 +29,7 @@ def test_strays_are_out_of_view_and_counted() -> None:
 
 
 def test_of_a_house_much_larger_than_its_map_the_surroundings_are_shown() -> None:
-    """A map of 10 m by 2 m in a house of 400 m: 10 m around it; and to a wall that is nearer."""
+    """A map of 10 m in a house of 400 m is shown with 10 m around it, or up to a nearer wall."""
     landmarks = np.array([[0.0, 0.0, 1.0], [10.0, 2.0, 1.0]])
     landmarks = np.repeat(landmarks, 300, axis=0)  # no stray
     house = [np.array([[-200.0, -3.0], [200.0, -3.0]]), np.array([[-200.0, 50.0], [200.0, 50.0]])]
@@ -131,3 +133,25 @@ def test_ellipses_are_drawn_to_scale_at_their_place() -> None:
     assert columns.max() == pytest.approx(250 + half_x, abs=tolerance_px)
     assert rows.min() == pytest.approx(230 - half_y, abs=tolerance_px)
     assert rows.max() == pytest.approx(230 + half_y, abs=tolerance_px)
+
+
+def labels_between_powers(least: float, most: float) -> list[str]:
+    """Return the tick labels of an axis with these ends, without empty ones."""
+    figure = Figure()
+    axes = figure.subplots()
+    axes.set_yscale("log")
+    write_plainly(axes.yaxis)
+    axes.set_ylim(least, most)
+    FigureCanvasAgg(figure).draw()
+    assert "0.001" in [label.get_text() for label in axes.yaxis.get_majorticklabels()]
+    return [text for label in axes.yaxis.get_minorticklabels() if (text := label.get_text())]
+
+
+def test_an_axis_of_few_powers_of_ten_has_plain_numbers_between_them() -> None:
+    labels = labels_between_powers(2e-4, 9e-3)
+    assert {"0.0003", "0.002"} <= set(labels)
+    assert all(2e-4 <= float(label) <= 9e-3 and "e" not in label for label in labels)
+
+
+def test_an_axis_of_many_powers_has_none_between_them() -> None:
+    assert labels_between_powers(1e-4, 10) == []

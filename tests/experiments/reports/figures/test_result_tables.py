@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.evaluation import tables
-from experiments.reports.figures.map_figures import judge_correspondences
+from experiments.reports.figures.map_figures import classify_correspondences
 from experiments.reports.figures.result_tables import ResultTables
 from mapfusion.errors import InputError
 from mapfusion.files import DIGEST
@@ -95,7 +95,7 @@ def test_correspondences_are_judged_by_the_truth(trio_result: Path) -> None:
         c, s = np.cos(theta), np.sin(theta)
         return np.array([x + c * own[0] - s * own[1], y + s * own[0] + c * own[1], own[2]])
 
-    right, names = judge_correspondences(data, PAIR)
+    right, names = classify_correspondences(data, PAIR)
     assert names[0] == "true correspondences"
     rows = data.last_correspondences(PAIR)
     expected = [
@@ -109,7 +109,7 @@ def test_correspondences_are_judged_by_the_truth(trio_result: Path) -> None:
 def test_without_the_truth_they_are_judged_by_the_first_aligners_inliers(trio_copy: Path) -> None:
     (trio_copy / "world.json").unlink()
     data = ResultTables(trio_copy)
-    right, names = judge_correspondences(data, PAIR)
+    right, names = classify_correspondences(data, PAIR)
     estimates = data.table("estimates")
     chosen = (estimates["robot_a"] == PAIR[0]) & (estimates["robot_b"] == PAIR[1])
     chosen &= (estimates["iteration"] == data.last_iteration(PAIR)) & (estimates["repetition"] == 0)

@@ -263,6 +263,28 @@ def test_the_theme_is_that_of_the_system(opened: Opened) -> None:
     assert light[1] != dark[1]
 
 
+@pytest.mark.parametrize("system", ["light", "dark"])
+def test_the_first_click_on_the_switch_changes_the_theme(opened: Opened, system: Any) -> None:
+    page = opened.page
+    text = "document.getElementById('chart-errors')._fullLayout.font.color"
+    seen = f"[getComputedStyle(document.body).backgroundColor, {text}]"
+    page.emulate_media(color_scheme=system)
+    page.wait_for_timeout(3000)
+    shown = [page.evaluate(seen)]
+    for _ in range(2):
+        page.locator("#theme").click()
+        page.wait_for_timeout(3000)
+        shown.append(page.evaluate(seen))
+    assert shown[0] == shown[2]
+    assert all(before != after for before, after in zip(shown[0], shown[1], strict=True))
+
+
+def test_the_table_of_methods_fits_a_wide_window(opened: Opened) -> None:
+    opened.page.set_viewport_size({"width": 1400, "height": 900})
+    table = "document.querySelector('.standings').parentElement"
+    assert opened.page.evaluate(f"{table}.scrollWidth <= {table}.clientWidth")
+
+
 def test_it_prints(opened: Opened, tmp_path: Path) -> None:
     pages = tmp_path / "report.pdf"
     opened.page.pdf(path=pages)

@@ -1,4 +1,4 @@
-"""The map's figure holds the values of the tables."""
+"""Tests of the map view: its figure holds the values of the tables."""
 
 import json
 from pathlib import Path

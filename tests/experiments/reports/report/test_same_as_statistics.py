@@ -1,4 +1,4 @@
-"""The report and `mapfusion statistics` say the same of the same run."""
+"""The report and `mapfusion statistics` show the same numbers for the same run."""
 
 import shutil
 from pathlib import Path

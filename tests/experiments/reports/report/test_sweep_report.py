@@ -1,7 +1,10 @@
-"""The report of a sweep: many runs, no maps."""
+"""Tests of the report of a sweep: many runs, no maps."""
 
+import re
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from tests.helpers.made_up_sweep import write_sweep
@@ -70,3 +73,24 @@ def test_a_sweep_without_a_finished_run(
     reply = command(capsys, "report", folder)
     assert reply.code == 2
     assert "nothing to report on" in reply.complaints[0]
+
+
+def test_the_better_value_of_a_setting_is_named(trio_result: Path, tmp_path: Path) -> None:
+    sweep = write_sweep(tmp_path / "sweep", trio_result, range(8), ("50", "200"))
+    for file in (sweep / "errors").glob("*-200.parquet"):
+        rows = pq.read_table(file).to_pandas()
+        lengths = [name for name in rows if name.endswith(("error_m", "error_rad"))]
+        written = pa.Table.from_pandas(
+            rows.assign(**{name: rows[name] / 2 for name in lengths}), preserve_index=False
+        )
+        pq.write_table(written.replace_schema_metadata(pq.read_schema(file).metadata), file)
+    words = " ".join(page_of(sweep, tmp_path / "report.html").words.split())
+    assert re.search(r"200 is better than 50: better in \d+ of \d+ measures, worse in none", words)
+    assert "over 7 runs of each." in words  # the runs of the last seed failed
+    assert "better 7 of 7 runs" in words
+
+
+def test_equal_values_are_called_equal(page: Page) -> None:
+    words = " ".join(page.words.split())
+    assert "No difference between 50 and 200 beyond noise" in words
+    assert "over 5 runs of each. So few runs are a hint only; 6 seeds or more decide." in words

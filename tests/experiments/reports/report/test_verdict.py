@@ -1,4 +1,4 @@
-"""What the report says first, of rankings whose message is plain."""
+"""Tests of the first lines of the report, on rankings with a clear result."""
 
 import math
 from dataclasses import replace

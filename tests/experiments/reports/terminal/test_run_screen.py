@@ -144,7 +144,7 @@ def test_what_comes_from_users_is_shown_as_it_is(capsys: pytest.CaptureFixture[s
 
 
 def test_one_place_prints() -> None:
-    """So that no other can take text for markup."""
+    """Other modules could read text from users as markup."""
     for path in Path("experiments").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         has_console = "Console(" in text or "rich.print" in text or "from rich import print" in text
@@ -177,7 +177,7 @@ def test_progress_on_a_terminal_takes_no_label_for_markup(monkeypatch: pytest.Mo
 
 
 def _all_shown(screen: BinaryIO) -> bytes:
-    """What reached a terminal that is closed: piece by piece, as the kernel hands it on later."""
+    """Return the text that a closed terminal received; the kernel passes it on in pieces."""
     shown = b""
     with suppress(OSError):  # Linux ends a terminal that is closed with an error, others with b""
         while piece := os.read(screen.fileno(), 100_000):

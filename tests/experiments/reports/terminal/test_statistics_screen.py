@@ -1,4 +1,4 @@
-"""What `statistics` and `compare` say, word by word, of tables made up for it."""
+"""Tests of the screens of `statistics` and `compare` on made-up tables."""
 
 import numpy as np
 import pandas as pd

@@ -1,0 +1,382 @@
+"""Errors of smoothed and fused maps: the tables `smoother`, `fusers` and `fuser_coverage`.
+
+The true point of a fused landmark is the mean of the true points of its parents. `map_consistency`
+defines gross landmarks, which are left out, and consistency.
+
+Coverage is the share of landmarks whose confidence ellipse contains the true point. It is computed
+for fused maps, and for the landmarks of all robots before fusion. A coverage below the nominal
+probability shows an overconfident map, one above it a conservative map.
+"""
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.evaluation.alignment_errors import alignment_nees
+from experiments.evaluation.fused_landmarks import FusedTeam
+from experiments.evaluation.map_consistency import (
+    Consistency,
+    FittedMap,
+    consistencies,
+    fit_to_truth,
+    relative_consistency,
+    rmse,
+)
+from experiments.evaluation.truth import (
+    EvaluatedRobot,
+    degrees_of_freedom,
+    landmark_truth,
+    motion_errors,
+    truth_or_unknown,
+)
+from experiments.pipeline.stages.slam import RobotFolders, final_path
+from experiments.pipeline.stages.smooth import (
+    read_endings,
+    read_smoothed,
+    read_smoothed_path,
+    smoothed_owners,
+)
+from mapfusion.files import POSE_FIELDS, named_columns
+from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.fusers import FusedMap, Fusion
+from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import RobotLog
+
+
+@dataclass(frozen=True)
+class SmoothedRobot:
+    """Smoothed maps and paths of a robot, by iteration, with the truth.
+
+    Attributes:
+        robot: maps of the filter, and true path.
+        filter_path: path of the filter at the end, shape (T, 3).
+        maps: smoothed maps; only the last one has its joint covariance.
+        points_world_m: true points of each map, shape (N, 3), NaN where unknown.
+        paths: smoothed paths until each iteration k, shape (k + 1, 3).
+        ending: convergence of the smoother at the last iteration.
+        not_smoothed: reasons by iteration where smoothing failed.
+    """
+
+    robot: EvaluatedRobot
+    filter_path: Float
+    maps: dict[int, LandmarkMap]
+    points_world_m: dict[int, Float]
+    paths: dict[int, Float]
+    ending: dict[str, Any]
+    not_smoothed: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def last_path(self) -> Float:
+        """Smoothed path of the whole log, shape (T, 3); NaN if smoothing failed."""
+        unknown = np.full_like(self.filter_path, np.nan)
+        return self.paths.get(len(self.filter_path) - 1, unknown)
+
+    def given_at(self, iteration: int) -> tuple[int | None, str]:
+        """Return the iteration of the smoothed map that a fuser is given at an iteration.
+
+        Returns:
+            The iteration of the last smoothed map until then, or None: the fuser is given the
+            filter's map. And the reason if smoothing failed at the iteration; else empty.
+        """
+        at = max((k for k in self.maps if k <= iteration), default=None)
+        lacking = max((k for k in self.not_smoothed if k <= iteration), default=-1)
+        if (at is not None and at > lacking) or lacking < 0:
+            return at, ""
+        instead = "FastSLAM's map" if at is None else f"its map until frame {at}"
+        return at, f"{self.not_smoothed[lacking]}; {instead} stands in"
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of the table `smoother`: last map and whole path."""
+        robot, last = self.robot, len(self.filter_path) - 1
+        path_m, filter_m = (
+            path_rmse_m(path, robot.path.T_map_robot) for path in (self.last_path, self.filter_path)
+        )
+        row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
+        row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | self.ending
+        row["not_smoothed"] = self.given_at(last)[1]
+        of_filter = fit_to_truth(robot.maps[last], robot.points_world_m[last])
+        row |= {
+            "filter_landmark_rmse_m": of_filter.rmse_m,
+            "filter_gross_share": of_filter.gross_share,
+        }
+        if last not in self.maps:
+            return row | {"n_landmarks": 0}
+        landmarks = self.maps[last]
+        fit = fit_to_truth(landmarks, self.points_world_m[last])
+        row |= {"landmark_rmse_m": fit.rmse_m, "gross_share": fit.gross_share}
+        row |= {"n_landmarks": len(landmarks)}
+        consistency = relative_consistency(landmarks, fit)
+        names = ("nees_per_dof", "marginal_nees_per_dof", "coverage_95")
+        return row | {name: getattr(consistency, name) for name in names}
+
+
+def load_smoothed(
+    robot: EvaluatedRobot, folders: RobotFolders, log: RobotLog, smooth: Path
+) -> SmoothedRobot:
+    """Load a robot's smoothed maps and paths with the truth; NaN where unknown.
+
+    Args:
+        robot: maps of the filter, and true path.
+        folders: folders of its log and of the stage `slam`.
+        log: its log.
+        smooth: folder of the stage `smooth`.
+    """
+    truth, maps = truth_or_unknown(folders.log, log), read_smoothed(smooth, last_whole=True)
+    points = landmark_truth(truth, partial(smoothed_owners, smooth, folders.slam), maps)
+    endings = read_endings(smooth)
+    reasons = dict(zip(endings["iteration"].tolist(), endings["not_smoothed"], strict=True))
+    not_smoothed = {k: str(why) for k, why in reasons.items() if why}
+    ending = {str(name): value for name, value in endings.to_dict("records")[-1].items()}
+    path, paths = final_path(folders.slam), read_smoothed_path(smooth)
+    return SmoothedRobot(robot, path, maps, points, paths, ending, not_smoothed)
+
+
+def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
+    """Return the rows of the table `smoothed_paths`."""
+    rows = [
+        pd.DataFrame(named_columns(POSE_FIELDS, path)).assign(
+            robot=each.robot.name, iteration=k, frame=np.arange(len(path))
+        )
+        for each in smoothed
+        for k, path in each.paths.items()
+    ]
+    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
+
+
+def path_rmse_m(path: Float, truth: Float) -> float:
+    """Return the RMS position error without a fit; NaN if no pose is known in both paths."""
+    known = np.isfinite(path).all(axis=1) & np.isfinite(truth).all(axis=1)
+    if not known.any():
+        return np.nan
+    error_m = np.linalg.norm(path[known, :2] - truth[known, :2], axis=1)
+    return float(np.sqrt(np.mean(error_m**2)))
+
+
+_MOTION_FIGURES = ("alignment_error_m", "alignment_error_rad")
+_MOTION_FIGURES += ("alignment_sigma_m", "alignment_sigma_rad", "alignment_nees_per_dof")
+_LEAST = 3  # common landmarks: a rigid fit of two is always exact
+
+
+@dataclass(frozen=True)
+class GivenMap:
+    """Map of a robot that a fuser was given.
+
+    Attributes:
+        robot: the robot.
+        landmarks: the map, of the filter or smoothed.
+        points_world_m: its true points, shape (N, 3).
+        of_filter: map of the filter at the same iteration.
+        of_filter_world_m: its true points, shape (L, 3).
+        fallback: map that replaces a missing smoothed map, with the reason; else empty.
+    """
+
+    robot: EvaluatedRobot
+    landmarks: LandmarkMap
+    points_world_m: Float
+    of_filter: LandmarkMap
+    of_filter_world_m: Float
+    fallback: str = ""
+
+    @classmethod
+    def at(cls, robot: EvaluatedRobot, smoothed: SmoothedRobot | None, k: int) -> "GivenMap":
+        """Choose the map at an iteration as the stage `fuse` does (`given_teams`).
+
+        Args:
+            robot: the robot.
+            smoothed: its smoothed maps, for a fuser of smoothed maps. The last one until the
+                iteration is chosen, or the filter's map if there is none.
+            k: the iteration.
+        """
+        filtered = robot.at(k)
+        if smoothed is None:
+            return cls(robot, *filtered, *filtered)
+        at, why = smoothed.given_at(k)
+        fallback = f"{robot.name} is not smoothed: {why}" if why else ""
+        if at is None:
+            return cls(robot, *filtered, *filtered, fallback)
+        return cls(robot, smoothed.maps[at], smoothed.points_world_m[at], *filtered, fallback)
+
+
+@dataclass(frozen=True)
+class EvaluatedFusion:
+    """Fused map with the maps that it was made of.
+
+    Attributes:
+        fuser: name of the fuser.
+        iteration: iteration of the maps.
+        fusion: fused map of the most robots.
+        given: maps of all M robots.
+    """
+
+    fuser: str
+    iteration: int
+    fusion: FusedMap
+    given: Sequence[GivenMap]
+
+    def team(self) -> FusedTeam:
+        """Return the fusion as a team of robots with the maps that the fuser was given."""
+        k, robots = self.iteration, []
+        for given in self.given:
+            maps, points = {k: given.landmarks}, {k: given.points_world_m}
+            robots.append(replace(given.robot, maps=maps, points_world_m=points))
+        return FusedTeam(robots, (), k, Fusion((self.fusion,), ()))
+
+    @property
+    def fallback(self) -> str:
+        """Fallback fuser or map with the reason; else empty."""
+        own = f"a simpler fuser stands in: {self.fusion.fallback}" if self.fusion.fallback else ""
+        maps = (self.given[k].fallback for k in self.fusion.members)
+        return "; ".join(filter(None, (own, *maps)))
+
+    @cached_property
+    def fit(self) -> FittedMap:
+        """Fit of the true points to the fused map."""
+        frame = self.given[self.fusion.members[0]].robot
+        return fit_to_truth(
+            self.fusion.landmarks, frame.in_map_frame(self.team().truth_of(self.fusion))
+        )
+
+    @cached_property
+    def consistency(self) -> tuple[Consistency, Consistency]:
+        """Consistency of the fused map after the rigid fit, and in its frame."""
+        return consistencies(self.fusion.landmarks, self.fit)
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of the table `fusers`."""
+        landmarks, fit = self.fusion.landmarks, self.fit
+        lengths = np.linalg.norm(fit.error_m[~fit.gross], axis=1)
+        relative, in_frame = self.consistency
+        return {
+            "fuser": self.fuser,
+            "iteration": self.iteration,
+            "n_robots": len(self.fusion.members),
+            "n_landmarks": len(landmarks),
+            "landmark_rmse_m": rmse(fit.frame_error_m[~fit.gross]),
+            "fitted_rmse_m": fit.rmse_m,
+            "fitted_median_m": np.median(lengths) if len(lengths) else np.nan,
+            "gross_share": fit.gross_share,
+            "over_better_parent": self._over_better_map(of_filter=False),
+            "over_better_filter": self._over_better_map(of_filter=True),
+            "nees_per_dof": relative.nees_per_dof,
+            "marginal_nees_per_dof": relative.marginal_nees_per_dof,
+            "coverage_95": relative.coverage_95,
+            "frame_nees_per_dof": in_frame.marginal_nees_per_dof,
+            "frame_coverage_95": in_frame.coverage_95,
+            "duplicate_share": self.fusion.duplicate_share,
+            "fallback": self.fallback,
+        } | self._motion_errors()
+
+    def _over_better_map(self, of_filter: bool) -> float:
+        """Return the error of the fused map over the error of the better of two robots' maps.
+
+        The errors are RMS values over the common landmarks of two robots, after a rigid fit of
+        each map. The result is the median over pairs of robots.
+
+        Args:
+            of_filter: compare with the maps of the filter; else with the maps of the fuser.
+        """
+        parents, errors = self.fusion.parents, {}
+        if of_filter:
+            # rows of the same landmarks in the filter's maps, found by their first observation
+            parents = np.full_like(self.fusion.parents, ABSENT)
+            for k, given in enumerate(self.given):
+                origin = given.of_filter.source_observation
+                row_of = pd.Series(np.arange(len(origin)), index=origin)
+                has = self.fusion.parents[:, k] != ABSENT
+                own = given.landmarks.source_observation[self.fusion.parents[has, k]]
+                parents[has, k] = row_of.reindex(own).fillna(ABSENT).to_numpy(dtype=np.int64)
+        for k in self.fusion.members:
+            # errors of a robot's map; NaN for gross landmarks and unknown true points
+            given = self.given[k]
+            landmarks, points = given.landmarks, given.points_world_m
+            if of_filter:
+                landmarks, points = given.of_filter, given.of_filter_world_m
+            own_fit, errors[k] = fit_to_truth(landmarks, points), np.full(len(landmarks), np.nan)
+            length_m = np.linalg.norm(own_fit.error_m, axis=1)
+            errors[k][own_fit.rows] = np.where(own_fit.gross, np.nan, length_m)
+        fused, fit = np.full(len(parents), np.nan), self.fit
+        fused[fit.rows[~fit.gross]] = np.linalg.norm(fit.error_m[~fit.gross], axis=1)
+        ratios = []
+        for a, b in itertools.combinations(self.fusion.members, 2):
+            both = (parents[:, a] != ABSENT) & (parents[:, b] != ABSENT)
+            of_a, of_b = errors[a][parents[both, a]], errors[b][parents[both, b]]
+            three = np.stack([fused[both], of_a, of_b])
+            three = three[:, np.isfinite(three).all(axis=0)]
+            if three.shape[1] >= _LEAST:
+                rms = np.sqrt(np.mean(three**2, axis=1))
+                ratios.append(rms[0] / min(rms[1:]) if min(rms[1:]) > 0 else np.nan)
+        return float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else np.nan
+
+    def _motion_errors(self) -> dict[str, float]:
+        """Return median errors, standard deviations and NEES of the motions of the robots' maps."""
+        first, *others = self.fusion.members
+        T_world_first, errors = self.given[first].robot.path.T_world_map, []
+        for k in others:
+            T_true = se2.between(T_world_first, self.given[k].robot.path.T_world_map)
+            T, covariance = self.fusion.T_first_map[k], self.fusion.motion_covariance[k]
+            error_m, error_rad = motion_errors(T, T_true)
+            nees = alignment_nees(T, covariance, T_true)
+            errors.append([error_m, abs(error_rad), *se2.motion_sigma(covariance), nees / 3])
+        medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
+        return dict(zip(_MOTION_FIGURES, medians.tolist(), strict=True))
+
+
+def last_fused(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of the table `fusers` at the last iteration of each fuser and run."""
+    keys = [name for name in ("run_id", "fuser") if name in rows]
+    return rows[rows["iteration"] == rows.groupby(keys)["iteration"].transform("max")]
+
+
+# Nominal probabilities of confidence ellipses; denser where gates and bounds usually are.
+NOMINAL_COVERAGES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+FUSED, FILTERED, SMOOTHED = "fused", "filter", "smoothed"  # kinds of maps
+_Both = tuple[Consistency, Consistency]  # after the rigid fit, and in the frame of the map
+
+
+def coverage_rows(fusions: Sequence[EvaluatedFusion]) -> list[dict[str, Any]]:
+    """Return the rows of the table `fuser_coverage`: maps before and after the last fusion."""
+    last = max((fusion.iteration for fusion in fusions), default=None)
+    at_end = [fusion for fusion in fusions if fusion.iteration == last]
+    # maps before fusion by kind and robot; several fusers are given the same ones
+    maps: dict[str, dict[str, tuple[EvaluatedRobot, LandmarkMap, Float]]] = {}
+    for given in (given for fusion in at_end for given in fusion.given):
+        robot = given.robot
+        of_filter = (robot, given.of_filter, given.of_filter_world_m)
+        maps.setdefault(FILTERED, {})[robot.name] = of_filter
+        if given.landmarks is not given.of_filter:
+            own = (robot, given.landmarks, given.points_world_m)
+            maps.setdefault(SMOOTHED, {})[robot.name] = own
+    rows = []
+    for kind, by_robot in maps.items():
+        found = []
+        for robot, landmarks, points in by_robot.values():
+            fit = fit_to_truth(landmarks, robot.in_map_frame(points))
+            found.append(consistencies(landmarks, fit))
+        rows += _coverage_of(found, at_end[0], {"map": kind, "fuser": ""})
+    for fusion in at_end:
+        keys = {"map": FUSED, "fuser": fusion.fuser}
+        rows += _coverage_of([fusion.consistency], fusion, keys)
+    return rows
+
+
+def _coverage_of(
+    maps: Sequence[_Both], fusion: EvaluatedFusion, keys: dict[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Yield a row for each nominal coverage; none if no true point is known."""
+    relative, frame = (
+        np.concatenate([each.own_nees for each in both]) for both in zip(*maps, strict=True)
+    )
+    d = degrees_of_freedom(fusion.fusion.landmarks)
+    for nominal in NOMINAL_COVERAGES if len(relative) else ():
+        bound = chi_square_bound(nominal, d)
+        shares = {"coverage": np.mean(relative <= bound), "frame_coverage": np.mean(frame <= bound)}
+        about = {"iteration": fusion.iteration, "n_landmarks": len(relative)}
+        yield keys | about | {"nominal": nominal} | shares

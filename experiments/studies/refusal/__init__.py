@@ -1,1 +1,0 @@
-"""Refusal study: maps with and without common ground, and the verdicts on them."""
