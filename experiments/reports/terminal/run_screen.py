@@ -29,10 +29,9 @@ from experiments.evaluation.map_consistency import GROSS_M
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.result import renderer
-from experiments.evaluation.result_files import read_provenance
 from experiments.evaluation.run_plan import RunPlan
 from experiments.evaluation.single_steps import MergeResult, final_status
-from experiments.evaluation.tables import SHOWN
+from experiments.evaluation.tables import SHOWN, read_provenance
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
 from experiments.reports.formatting import listed, metres, percent, radians, two_digits
