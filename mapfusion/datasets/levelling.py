@@ -118,7 +118,6 @@ _MIN_POINTS = 12  # four times the number of parameters of a plane
 _TOLERANCES = (0.3, 0.1, 0.03, 0.01, 0.0)
 _STEPS = 3  # iterations of gate and fit at each tolerance
 _MAX_SLOPE_RAD = 0.35  # steeper planes are walls
-_MEDIAN_SQUARE = chi_square_bound(0.5, 1)  # of squared distances in standard deviations
 
 
 @dataclass(frozen=True)
@@ -186,7 +185,8 @@ def fit_floor(points: Observations, camera_height_m: float, probability: float) 
             plane = np.linalg.solve(normal, weighted.T @ position[inside, 2])
     if np.hypot(plane[0], plane[1]) > np.tan(_MAX_SLOPE_RAD):
         return None
-    excess = max(float(np.median(square[inside])) / _MEDIAN_SQUARE, 1.0)
+    # squares relative to the median of one standard normal variable
+    excess = max(float(np.median(square[inside])) / chi_square_bound(0.5, 1), 1.0)
     covariance = np.array(excess * np.linalg.inv(normal), dtype=np.float64)
     return Floor(plane, covariance, int(inside.sum()))
 
