@@ -8,7 +8,7 @@ import scipy.linalg  # noqa: F401  # its threads are limited only once it is the
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
 
-from experiments.pipeline.code_version import use_kernel_cache
+from experiments.pipeline.stage import use_kernel_cache
 from experiments.pipeline.workers import single_threaded
 
 # No test may depend on how fast the machine is; by default an example may take 0.2 s.

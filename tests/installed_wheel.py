@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import pytest
 
-from experiments.pipeline.code_version import source_hash
+from experiments.pipeline.stage import source_hash
 from mapfusion.errors import install_command
 from tests.helpers.tiny_scenario import TINY
 
@@ -127,10 +127,17 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "tiny.yaml").write_text(TINY)
     settings = {**os.environ, "PYTHONPATH": str(ROOT)}
+    large = (
+        "camera.width_px=640",
+        "camera.height_px=480",
+        "camera.focal_px=577",
+        "drive.frames=12",
+    )
+    pictures = ("-o", "pictures", "--format", "kitti", *(f"--set={each}" for each in large))
     for command in (
         ("run", "tiny.yaml"),
         ("record", "tiny.yaml", "-o", "logs"),
-        ("record", "tiny.yaml", "-o", "pictures", "--format", "kitti"),
+        ("record", "tiny.yaml", *pictures),
     ):
         words = (sys.executable, "-m", "experiments", *command)
         subprocess.run(words, cwd=folder, env=settings, check=True, capture_output=True)
@@ -138,7 +145,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_is_the_same_program(installed: Installed) -> None:
-    code = "import sim; from experiments.pipeline.code_version import *; print(sim, source_hash())"
+    code = "import sim; from experiments.pipeline.stage import *; print(sim, source_hash())"
     told = installed.answer("python", "-c", code)
     assert str(installed.environment) in told
     assert source_hash() in told  # no file is missing, and none of other packages is among them
@@ -159,7 +166,7 @@ def test_the_suite_is_there(installed: Installed) -> None:
     assert "quick" in installed.answer("mapfusion", "scenarios")
     for name in installed.answer("mapfusion", "scenarios", "--copy", "dark").split():
         copied = installed.folder / name
-        assert copied.read_bytes().endswith((ROOT / "scenarios" / copied.name).read_bytes())
+        assert copied.read_bytes().startswith((ROOT / "scenarios" / copied.name).read_bytes())
 
 
 def test_the_manual_is_there(installed: Installed) -> None:
@@ -198,14 +205,18 @@ def test_logs_become_maps_that_are_aligned_and_merged(installed: Installed, reco
         log = recorded / "logs" / Path(name).stem
         installed.answer("mapfusion", "slam", log, "-o", name)
     assert "ransac" in installed.answer("mapfusion", "align", *maps)
-    installed.run("mapfusion", "merge", *maps, "-o", "fused.parquet")  # of a tiny world: may fail
-    stored = [recorded / "results" / "tiny-3" / "maps" / name for name in maps]
-    assert "T_a_b" in installed.answer("mapfusion", "align", *stored, "--json")
+    installed.answer("mapfusion", "merge", *maps, "-o", "fused.parquet")
+    assert (installed.folder / "fused.parquet").is_file()
 
 
-def test_recordings_are_imported_and_run(installed: Installed, recorded: Path) -> None:
+def test_a_recording_is_imported(installed: Installed, recorded: Path) -> None:
     folder = recorded / "pictures" / "R1"
-    assert "R1" in installed.answer("mapfusion", "import", "kitti", folder, "-o", "imported")
+    command = ("import", "kitti", folder, "--odometry", "images", "-o", "imported")
+    installed.answer("mapfusion", *command)
+    assert [*(installed.folder / "imported").rglob("observations.parquet")]
+
+
+def test_recorded_logs_are_run(installed: Installed, recorded: Path) -> None:
     logs = [str(recorded / "logs" / robot) for robot in ("R1", "R2")]
     text = f"schema_version: 1\nname: recorded\nlogs: {logs}\nevaluate: {{every: 40}}\n"
     (installed.folder / "recorded.yaml").write_text(text)

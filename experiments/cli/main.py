@@ -56,7 +56,7 @@ def _options(version: _Version = False) -> None:
 
 def main() -> None:
     """Run the command; print one line and set the exit code for errors that users can cause."""
-    from experiments.pipeline.code_version import use_kernel_cache
+    from experiments.pipeline.stage import use_kernel_cache
     from experiments.pipeline.workers import save_defect
 
     for stream in (sys.stdout, sys.stderr):

@@ -40,7 +40,7 @@ def run(
     to use, and the command that opens the report. Exit code 1 if no robot's map can be used.
     """
     from experiments.cli.options import require_result_folder
-    from experiments.evaluation.checks import load_checked
+    from experiments.evaluation.metrics import load_checked
     from experiments.scenario.suite import scenarios_of, with_aligners
 
     require_result_folder(output)
@@ -198,7 +198,7 @@ def check(
     scenario cannot be run. No scenario runs if one of them cannot be read.
     """
     from experiments.cli.options import DOCUMENT, JUNIT, require_file
-    from experiments.evaluation.checks import CheckedScenario, check_all
+    from experiments.evaluation.metrics import CheckedScenario, check_all
     from experiments.reports import export
     from experiments.reports.terminal import layout, run_screen
     from experiments.scenario.seeds import parse_seeds

@@ -28,7 +28,7 @@ def record(
     """
     from experiments.cli.options import require_folder
     from experiments.evaluation import single_steps as single
-    from experiments.evaluation.checks import load_checked
+    from experiments.evaluation.metrics import load_checked
     from experiments.evaluation.single_steps import write_drives
     from experiments.reports.terminal.layout import print_paths, progress
     from experiments.scenario.suite import one_scenario

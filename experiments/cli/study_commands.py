@@ -350,7 +350,7 @@ def calibrate(
 ) -> None:
     """Calibrate and correct odometry of logs: `mapfusion study calibrate raw/robot* -o logs`."""
     from experiments.cli.options import require_folder
-    from experiments.evaluation.odometry_calibration import calibrate_logs
+    from experiments.evaluation.single_steps import calibrate_logs
     from experiments.reports import export
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of

@@ -18,6 +18,7 @@ import pandas as pd
 
 from experiments.evaluation import tables
 from experiments.evaluation.tables import SHOWN
+from mapfusion.fusion.team_graph import EdgeStatus
 
 ORACLE = "oracle"  # the aligner that is given the true correspondences
 # An alignment is right if the refinement can correct it: the limit is the default gate of the
@@ -224,3 +225,45 @@ def methods_in(maps: pd.DataFrame, oracle: bool = False) -> list[str]:
     """Return the aligners in order of appearance; the oracle, if wanted, last."""
     found = maps["aligner"].drop_duplicates().tolist()
     return [name for name in found if name != ORACLE] + [ORACLE] * (oracle and ORACLE in found)
+
+
+def rms(values: pd.Series) -> float:
+    """Return the root mean square of the known values; NaN if none is known."""
+    return float(np.sqrt(np.mean(np.square(values.dropna())))) if values.notna().any() else np.nan
+
+
+def path_rms(robots: pd.DataFrame, by: Sequence[str] = ("robot",)) -> pd.DataFrame:
+    """Return RMS position errors of FastSLAM's online paths and of odometry alone.
+
+    Args:
+        robots: rows of the table `robots`.
+        by: columns that identify a robot of a run.
+
+    Returns:
+        One row for each robot. Columns: those of `by`, path_m, odometry_m, over_odometry (their
+        ratio), n_landmarks at the end and n_frames.
+    """
+    groups = robots.groupby(list(by), sort=False)
+    path_m, odometry_m = (groups[f"{of}_error_m"].agg(rms) for of in ("path", "odometry"))
+    columns = {"path_m": path_m, "odometry_m": odometry_m, "n_frames": groups.size()}
+    columns |= {"over_odometry": path_m / odometry_m.where(odometry_m > 0)}
+    if "n_landmarks" in robots:
+        columns |= {"n_landmarks": groups["n_landmarks"].last()}
+    return pd.DataFrame(columns).reset_index()
+
+
+def is_used_by_team(pairs: pd.DataFrame) -> pd.Series:
+    """Return True for rows of `team_pairs` whose alignment moved maps in the fusion."""
+    return pairs["place"].isin([EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE])
+
+
+def edge_precision(pairs: pd.DataFrame) -> float:
+    """Return the share of right alignments among those that the team uses; NaN if it uses none."""
+    used = pairs[is_used_by_team(pairs)]
+    return float(1 - is_false_merge(used).mean())
+
+
+def edge_recall(pairs: pd.DataFrame) -> float:
+    """Return the share of pairs with common ground whose right alignment the team uses."""
+    overlapping = pairs[has_common_ground(pairs)]
+    return float((right_refined(overlapping) & is_used_by_team(overlapping)).mean())

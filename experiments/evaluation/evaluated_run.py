@@ -1,8 +1,8 @@
-"""Run of a scenario with its evaluation, and findings about its logs."""
+"""Run of a scenario with its evaluation, timing of its aligners, and findings about its logs."""
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,27 +12,42 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import pair_evaluation, tables
-from experiments.evaluation.aligner_timing import AlignerTiming
+from experiments.evaluation import tables
 from experiments.evaluation.alignment_errors import (
+    ALIGNED,
+    EVALUATION_STAGE,
+    EvaluationSettings,
+)
+from experiments.evaluation.fused_landmarks import FusedTeam, MergeSettings
+from experiments.evaluation.map_errors import (
+    EvaluatedFusion,
+    GivenMap,
+    SmoothedRobot,
+    load_smoothed,
+)
+from experiments.evaluation.truth import (
     EvaluatedRobot,
     MapPair,
+    common_landmarks,
     join_map_pairs,
+    load_robot,
 )
-from experiments.evaluation.checks import why_no_truth
-from experiments.evaluation.fused_landmarks import FusedTeam, MergeSettings
-from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
-from experiments.evaluation.pair_evaluation import ALIGNED, EvaluationSettings
-from experiments.evaluation.smoothed_robots import SmoothedRobot, load_smoothed
 from experiments.pipeline.stage import Stage
+from experiments.pipeline.stages.align import latest_at
 from experiments.pipeline.stages.fuse import read_fusions
-from experiments.pipeline.stages.match import latest_at
-from experiments.pipeline.stages.memory import require_memory
-from experiments.pipeline.stages.pipeline import PairStages, Pipeline, RobotStages, build_pipeline
+from experiments.pipeline.stages.pipeline import (
+    PairStages,
+    Pipeline,
+    RobotStages,
+    build_pipeline,
+    require_memory,
+)
 from experiments.pipeline.stages.slam import RobotFolders, read_findings, stored_maps
 from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
+from experiments.plugins.discovery import callable_aligner
+from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AnyScenario, Recording
 from mapfusion.datasets.log_consistency import Finding, truth_finding
 from mapfusion.datasets.relative_motion import composed_spans, observed_spans, odometry_motions
@@ -42,9 +57,78 @@ from mapfusion.fusion.fusers import make_fuser
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log, read_true_poses
+from mapfusion.verification.registration import Aligner
 
 TABLES_PART = "tables"  # part of a run outside its stages, in the table `timings`
 _EVALUATION_TABLES = {"errors", "fusion"}  # the stage `align` writes the other tables of pairs
+
+
+_PERCENTILES = {"elapsed_low_s": 10, "elapsed_s": 50, "elapsed_high_s": 90}
+_WARM_UP = "warm-up"  # name of the random generators of calls that are not timed
+
+
+@dataclass(frozen=True)
+class AlignerTiming:
+    """Aligners ready for timing on the maps of one pair of robots.
+
+    Attributes:
+        seed: seed of the scenario.
+        repeats: number of timings of each aligner on each pair of maps.
+        aligners: aligners by name; their kernels are compiled and their processes run.
+        maps: pairs of maps, evenly spread over the run.
+        n_common: number of common landmarks of each pair of maps; UNKNOWN without truth.
+    """
+
+    seed: int
+    repeats: int
+    aligners: Mapping[str, Aligner]
+    maps: Sequence[MapPair]
+    n_common: Sequence[int]
+
+    @classmethod
+    def of(cls, scenario: AnyScenario, map_pairs: Sequence[MapPair]) -> "AlignerTiming":
+        """Choose pairs of maps of two robots and warm up all aligners.
+
+        Other processes may be busy meanwhile.
+        """
+        settings = scenario.evaluate
+        spread = np.linspace(0, len(map_pairs) - 1, settings.timing_points)
+        maps = [map_pairs[k] for k in np.unique(spread.round().astype(int))]
+        aligners = {
+            entry.name: callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
+            for entry in scenario.align.aligners
+        }
+        n_common = []
+        for pair in maps:
+            points_a, points_b = pair.points_world_m
+            known = all(np.isfinite(own).any() for own in (points_a, points_b))
+            radius_m = settings.true_pair_radius_m
+            n_common.append(
+                common_landmarks(points_a, points_b, radius_m) if known else tables.UNKNOWN
+            )
+        ready = cls(scenario.seed, settings.timing_repeats, aligners, maps, n_common)
+        for smallest_or_largest in (maps[0], maps[-1]):  # some aligners treat few pairs apart
+            for name in aligners:
+                ready._call(name, smallest_or_largest, _WARM_UP)
+        return ready
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the rows of the table `aligner_timings`; nothing else may run meanwhile."""
+        rows, elapsed_s = [], []
+        for maps, n_common in zip(self.maps, self.n_common, strict=True):
+            self._call(next(iter(self.aligners)), maps, _WARM_UP)  # load the maps into CPU caches
+            counts = {"n_correspondences": len(maps.offered), "n_common": n_common}
+            for name in self.aligners:
+                rows.append(maps.keys | counts | {"aligner": name})
+                elapsed_s.append([self._call(name, maps, k) for k in range(self.repeats)])
+        times = np.percentile(elapsed_s, list(_PERCENTILES.values()), axis=1).T
+        named = (dict(zip(_PERCENTILES, each, strict=True)) for each in times.tolist())
+        return [row | each for row, each in zip(rows, named, strict=True)]
+
+    def _call(self, name: str, maps: MapPair, repeat: int | str) -> float:
+        """Call an aligner and return its time in s."""
+        rng = generator(self.seed, "timing", name, repeat)
+        return self.aligners[name].align(*maps.maps, maps.offered, rng).elapsed_s
 
 
 @dataclass(frozen=True)
@@ -72,14 +156,15 @@ class EvaluatedRun:
         pipeline = build_pipeline(scenario)
         merge = MergeSettings(scenario.merge.aligner, scenario.merge.parameters)
         radius_m = scenario.evaluate.true_pair_radius_m
-        settings = EvaluationSettings(scenario.align.judge, merge, radius_m)
-        no_truth = why_no_truth(scenario)
-        evaluations, label, writes = [], "compare with the truth", pair_evaluation.WRITES
+        settings = EvaluationSettings(scenario.align.verifier, merge, radius_m)
+        no_truth = scenario.why_no_truth()
+        kind, evaluations = EVALUATION_STAGE, []
         for pair in () if no_truth else pipeline.pairs:
             before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
             before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
-            stage = Stage("judge", label, settings, pair_evaluation.run, writes, before)
-            evaluations.append(stage)
+            evaluations.append(
+                Stage(kind.name, kind.label, settings, kind.work, kind.writes, before)
+            )
         return cls(pipeline, settings, tuple(evaluations), store, no_truth)
 
     @property
@@ -113,12 +198,15 @@ class EvaluatedRun:
     def load_robots(self) -> list[EvaluatedRobot]:
         """Load the maps of all robots with the truth, without the viewing evidence."""
         folders = map(self.robot_folders, self.pipeline.robots)
-        return [pair_evaluation.load_robot(each, viewing=False) for each in folders]
+        return [load_robot(each, viewing=False) for each in folders]
 
     def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
         """Return the stored maps of all robots at an iteration, by robot."""
         folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
-        return {name: latest_at(stored_maps(each), iteration) for name, each in folders.items()}
+        return {
+            name: latest_at(stored_maps(each, viewing=True), iteration)
+            for name, each in folders.items()
+        }
 
     def load_smoothed(self, robots: Sequence[EvaluatedRobot]) -> list[SmoothedRobot]:
         """Load the smoothed maps and paths of all robots with the truth."""
@@ -198,7 +286,7 @@ class EvaluatedRun:
 
         Args:
             jobs: number of processes.
-            on_progress: is told of finished tasks.
+            on_progress: called with the number of finished tasks.
             only: stages that are needed; empty for all stages.
 
         Raises:

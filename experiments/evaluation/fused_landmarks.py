@@ -17,8 +17,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot, MapPair
-from experiments.evaluation.truth import degrees_of_freedom, fit_rmse_m, squared_mahalanobis
+from experiments.evaluation.truth import (
+    EvaluatedRobot,
+    MapPair,
+    degrees_of_freedom,
+    fit_rmse_m,
+    squared_mahalanobis,
+)
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.files import named_columns, point_columns
 from mapfusion.fusion.aligned_landmarks import ABSENT, AlignedLandmarks

@@ -135,8 +135,8 @@ def consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, 
 
     Both leave out gross landmarks. The solution of the linear system is shared.
     """
-    kept = ~fit.gross
-    rows = fit.rows[kept]
+    not_gross = ~fit.gross
+    rows = fit.rows[not_gross]
     if len(rows) < _LEAST:
         return UNKNOWN, UNKNOWN
     d = degrees_of_freedom(landmarks)
@@ -147,8 +147,8 @@ def consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, 
     own, common = known.own_m2[rows, :d, :d], known.common_m[rows, :, :d]
     common_flat = common.transpose(1, 0, 2).reshape(known.rank, d * len(rows))
     joint = _LowRankCovariance(own, common_flat)
-    error, frame_error = fit.error_m[kept, :d], fit.frame_error_m[kept, :d]
-    J = rigid_motions(fit.truth_m[kept], d)
+    error, frame_error = fit.error_m[not_gross, :d], fit.frame_error_m[not_gross, :d]
+    J = rigid_motions(fit.truth_m[not_gross], d)
     columns = [error[..., None], J, frame_error[..., None]]
     solved = joint.solve(np.concatenate(columns, axis=2)).reshape(error.size, -1)
     n_gauge, no_gauge = J.shape[2], J[..., :0]

@@ -1,4 +1,4 @@
-"""Metrics of one or more runs, which scenarios can bound in `expect`.
+"""Metrics that scenarios bound in `expect`, and checks of these bounds.
 
 A metric is a function of the tables of one or more runs, concatenated, with a column `seed`. It
 returns one number; NaN if the tables have no row for it. Errors are summarised over repetitions on
@@ -11,24 +11,36 @@ function with `@metric(NAME=WHICH, ...)` defines several metrics.
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import criteria
+from experiments.evaluation import criteria, tables
 from experiments.evaluation.criteria import (
     ORACLE,
+    NothingMerged,
+    edge_precision,
+    edge_recall,
     error_over_oracle,
     merged_robots,
+    nothing_merged,
+    path_rms,
     rich,
+    rms,
     summarise_alignments,
 )
 from experiments.evaluation.loop_closures import loop_closures
-from experiments.evaluation.path_errors import path_rms, rms
-from experiments.evaluation.team_errors import edge_precision, edge_recall
-from experiments.scenario.settings import FUSER_METRICS
+from experiments.scenario.loading import load_scenario
+from experiments.scenario.settings import FUSER_METRICS, AnyScenario, Bound
+from experiments.scenario.suite import scenarios_of
+from mapfusion.errors import InputError
 
 # The four methods of the paper, algorithm 1 in both readings, as the default list names them.
 PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
@@ -269,3 +281,159 @@ def compute(name: str, tables: Tables) -> float:
         rows = rows[rows["fuser"] == method].sort_values("iteration", kind="stable")
         return float(rows.groupby("seed")[of_method].last().median())
     return float(ALIGNER_METRICS[of_method](tables, method))
+
+
+def load_checked(
+    path: Path,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    content: dict[str, Any] | None = None,
+) -> AnyScenario:
+    """Load a scenario whose expected metrics can be computed; arguments as of `load_scenario`.
+
+    Raises:
+        InputError: the scenario is wrong, or an expected metric needs a truth that is unknown.
+    """
+    scenario = load_scenario(path, overrides, seed, content)
+    needing_truth = [name for name in scenario.expect if name not in WITHOUT_TRUTH]
+    if needing_truth and (reason := scenario.why_no_truth()):
+        name = needing_truth[0]
+        raise InputError(f"{path}: expect.{name}: {reason}; leave `expect` out, or add the file")
+    return scenario
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Value of an expected metric.
+
+    Attributes:
+        scenario: name of the scenario.
+        metric: name of the metric.
+        value: value over all seeds.
+        bound: range of the expectation.
+        per_seed: values by seed.
+    """
+
+    scenario: str
+    metric: str
+    value: float
+    bound: Bound
+    per_seed: Mapping[int, float]
+
+    @property
+    def passed(self) -> bool:
+        """True if the value is finite and within the bound."""
+        low = -math.inf if self.bound.min is None else self.bound.min
+        high = math.inf if self.bound.max is None else self.bound.max
+        return math.isfinite(self.value) and low <= self.value <= high
+
+    @property
+    def bound_text(self) -> str:
+        """Bound as an inequality of x."""
+        low = "" if self.bound.min is None else f"{self.bound.min:g} <= "
+        high = "" if self.bound.max is None else f" <= {self.bound.max:g}"
+        return f"{low}x{high}"
+
+
+def check(scenario: AnyScenario, results: Mapping[int, Path]) -> list[Outcome]:
+    """Compute the expected metrics of a scenario from its result folders by seed."""
+    by_seed: dict[int, dict[str, pd.DataFrame]] = {seed: {} for seed in results}
+    for seed, result in results.items():
+        for name in USED_TABLES:
+            rows = tables.read(tables.table_path(result, name), name)
+            by_seed[seed][name] = rows.assign(seed=seed)
+    parts = {name: [own[name] for own in by_seed.values()] for name in USED_TABLES}
+    pooled = {name: pd.concat(each, ignore_index=True) for name, each in parts.items()}
+    outcomes = []
+    for name, bound in scenario.expect.items():
+        per_seed = {seed: compute(name, own) for seed, own in by_seed.items()}
+        value = compute(name, pooled)
+        outcomes.append(Outcome(scenario.name, name, value, bound, per_seed))
+    return outcomes
+
+
+@dataclass(frozen=True)
+class CheckedScenario:
+    """Outcomes of a scenario, or an error.
+
+    A scenario without outcomes, error and times was not run, because another one cannot be read.
+
+    Attributes:
+        scenario: name of the scenario.
+        outcomes: values of the expected metrics.
+        error: message if the scenario cannot be read or run; the error belongs to the last seed.
+        elapsed_s: wall-clock time by seed, of all runs that were started.
+        unmerged: seeds whose maps should have been merged but were not.
+    """
+
+    scenario: str
+    outcomes: Sequence[Outcome] = ()
+    error: str = ""
+    elapsed_s: Mapping[int, float] = field(default_factory=dict)
+    unmerged: Mapping[int, NothingMerged] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> bool:
+        """True if all runs finished, all bounds hold and maps were merged where possible."""
+        ran = bool(self.elapsed_s) and not self.error
+        return ran and not self.unmerged and all(outcome.passed for outcome in self.outcomes)
+
+
+def check_all(
+    words: Sequence[str],
+    seeds: Sequence[int],
+    overrides: Sequence[str],
+    run: Callable[[AnyScenario], Path],
+) -> Iterator[CheckedScenario]:
+    """Run and check scenarios.
+
+    No scenario runs if one of them cannot be read. A failed run ends its own scenario. Errors
+    other than `InputError` are raised again after the result of the scenario was yielded.
+
+    Args:
+        words: files, names or tags of scenarios.
+        seeds: seeds of the runs of each scenario.
+        overrides: entries `key.sub=value` that replace values of the scenarios.
+        run: runs a scenario and returns its result folder.
+    """
+    loaded: list[CheckedScenario | list[AnyScenario]] = []
+    for word in words:
+        try:
+            paths = scenarios_of([word])
+        except InputError as error:
+            loaded.append(CheckedScenario(word, error=str(error)))
+            continue
+        for path in paths:
+            try:
+                loaded.append([load_checked(path, overrides, seed) for seed in seeds])
+            except InputError as error:
+                loaded.append(CheckedScenario(path.stem, error=str(error)))
+    unreadable = any(isinstance(each, CheckedScenario) for each in loaded)
+    for each in loaded:
+        if isinstance(each, CheckedScenario):
+            yield each
+            continue
+        name, folders, elapsed_s = each[0].name, dict[int, Path](), dict[int, float]()
+        if unreadable:
+            yield CheckedScenario(name)
+            continue
+        try:
+            for scenario in each:
+                started_s = time.perf_counter()
+                try:
+                    folders[scenario.seed] = run(scenario)
+                finally:
+                    elapsed_s[scenario.seed] = time.perf_counter() - started_s
+            outcomes = check(each[0], folders)
+            # a scenario may bound the number of merged robots itself
+            tested = {} if MERGED_ROBOTS in each[0].expect else folders
+            merges = {seed: nothing_merged(folder) for seed, folder in tested.items()}
+            unmerged = {seed: merge for seed, merge in merges.items() if merge and merge.failed}
+        except InputError as error:
+            yield CheckedScenario(name, error=str(error), elapsed_s=elapsed_s)
+        except Exception as error:
+            text = f"{type(error).__name__}: {error}"
+            yield CheckedScenario(name, error=text, elapsed_s=elapsed_s)
+            raise
+        else:
+            yield CheckedScenario(name, outcomes, elapsed_s=elapsed_s, unmerged=unmerged)

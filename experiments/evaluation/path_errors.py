@@ -1,17 +1,24 @@
-"""Errors of paths: absolute trajectory error (ATE) and relative pose error (RPE).
+"""Errors of the paths of robots and teams: absolute trajectory error, relative pose error.
 
 Both are defined as in Sturm et al. (2012), in the plane. The tests compare them with evo (`evo_ape
 -a` and `evo_rpe --pairs_from_reference`), whose seven statistics are used.
+
+The ATE of a team is computed in two steps. First each path is moved as the robot's map was moved
+into the fused map. Then one rigid fit moves all paths together onto the truth. So relative errors
+between robots count. For one robot the value is the ATE of evo.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.truth import PathTruth
+from experiments.evaluation import criteria
+from experiments.evaluation.fused_landmarks import FusedTeam, team_edge_rows
+from experiments.evaluation.truth import PathTruth, motion_errors
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.files import POSE_FIELDS
 from mapfusion.geometry import se2
@@ -31,31 +38,6 @@ STATISTICS: dict[str, Callable[[Float], float]] = {
 def seven_statistics(errors: Float) -> dict[str, float]:
     """Return the statistics of evo of errors (N,); NaN for N = 0. `std` is the population's."""
     return {name: of(errors) if len(errors) else np.nan for name, of in STATISTICS.items()}
-
-
-def rms(values: pd.Series) -> float:
-    """Return the root mean square of the known values; NaN if none is known."""
-    return float(np.sqrt(np.mean(np.square(values.dropna())))) if values.notna().any() else np.nan
-
-
-def path_rms(robots: pd.DataFrame, by: Sequence[str] = ("robot",)) -> pd.DataFrame:
-    """Return RMS position errors of FastSLAM's online paths and of odometry alone.
-
-    Args:
-        robots: rows of the table `robots`.
-        by: columns that identify a robot of a run.
-
-    Returns:
-        One row for each robot. Columns: those of `by`, path_m, odometry_m, over_odometry (their
-        ratio), n_landmarks at the end and n_frames.
-    """
-    groups = robots.groupby(list(by), sort=False)
-    path_m, odometry_m = (groups[f"{of}_error_m"].agg(rms) for of in ("path", "odometry"))
-    columns = {"path_m": path_m, "odometry_m": odometry_m, "n_frames": groups.size()}
-    columns |= {"over_odometry": path_m / odometry_m.where(odometry_m > 0)}
-    if "n_landmarks" in robots:
-        columns |= {"n_landmarks": groups["n_landmarks"].last()}
-    return pd.DataFrame(columns).reset_index()
 
 
 def ate_m(path: Float, truth: Float, fit: bool = True) -> Float:
@@ -172,3 +154,117 @@ def path_statistics_rows(paths: pd.DataFrame) -> list[dict[str, Any]]:
                 key |= {"delta": delta, "delta_unit": unit, "n": len(errors)}
                 rows.append(key | seven_statistics(errors))
     return rows
+
+
+_PAIR = ["robot_a", "robot_b"]
+# Columns of `team_pairs` from the row of `errors` of the pair.
+_OWN_ALIGNMENT = [
+    "accepted",
+    "n_common",
+    "refined_translation_error_m",
+    "refined_rotation_error_rad",
+]
+
+
+def team_rows(
+    team: FusedTeam, paths: pd.DataFrame, T_first_smoothed: Float | None = None
+) -> list[dict[str, Any]]:
+    """Return the rows of the table `team`; none if nothing was merged.
+
+    Args:
+        team: last maps, merged.
+        paths: rows of the table `paths`.
+        T_first_smoothed: motions of the maps by a fuser of smoothed maps, shape (M, 3), NaN for
+            maps that it left out. If it merged the same robots, it moves their smoothed paths.
+    """
+    own = dict(iter(paths.groupby("robot", sort=False)))
+    rows = []
+    for number, T_first_map in enumerate(_placements(team), start=1):
+        placed = np.isfinite(T_first_map[:, 0])
+        members = [(k, robot) for k, robot in enumerate(team.robots) if placed[k]]
+        row = {"component": number, "n_robots": len(members), "n_team": len(team.robots)}
+        member_paths = [own[robot.name] for _, robot in members]
+        for source in SOURCES:
+            column = f"{source}_{POSE_FIELDS[0]}"
+            if not all(column in path and path[column].notna().any() for path in member_paths):
+                continue
+            T_moved = T_first_map
+            if source == SMOOTHED and T_first_smoothed is not None:
+                same = np.array_equal(np.isfinite(T_first_smoothed[:, 0]), placed)
+                T_moved = T_first_smoothed if same else T_first_map
+            errors = team_ate_m(
+                [
+                    PlacedPath(
+                        _poses(own[robot.name], source),
+                        _poses(own[robot.name], "truth"),
+                        T_moved[k],
+                        robot.path.T_world_map,
+                    )
+                    for k, robot in members
+                ]
+            )
+            rows.append(row | {"source": source, "n": len(errors)} | seven_statistics(errors))
+    return rows
+
+
+def _placements(team: FusedTeam) -> Iterator[Float]:
+    """Yield T_first_map (M, 3) of each group of merged robots, or of a single robot."""
+    if team.fusion is None:
+        yield np.zeros((1, 3))
+    else:
+        yield from (each.T_first_map for each in team.fusion.fused if len(each.members) > 1)
+
+
+def _poses(paths: pd.DataFrame, source: str) -> Float:
+    """Return the poses (T, 3) of a robot from a source or from the truth."""
+    return paths[[f"{source}_{name}" for name in POSE_FIELDS]].to_numpy()
+
+
+@dataclass(frozen=True)
+class PlacedPath:
+    """Path of one robot with the truth.
+
+    Attributes:
+        poses: estimated poses in the frame of the robot's map, shape (T, 3).
+        truth: true poses in the same frame, shape (T, 3); NaN where unknown.
+        T_first_map: motion of the robot's map into the fused map, shape (3,).
+        T_world_map: true origin of the frame, shape (3,).
+    """
+
+    poses: Float
+    truth: Float
+    T_first_map: Float
+    T_world_map: Float
+
+    def in_one_frame(self) -> tuple[Float, Float]:
+        """Return estimated poses in the fused frame and true poses in the world, shape (n, 3)."""
+        known = np.isfinite(self.truth).all(axis=1)
+        poses, truth = self.poses[known], self.truth[known]
+        return se2.compose(self.T_first_map, poses), se2.compose(self.T_world_map, truth)
+
+
+def team_ate_m(paths: Sequence[PlacedPath]) -> Float:
+    """Return position errors (N,) in m of all robots after one rigid fit of all paths."""
+    estimated_and_true = zip(*(own.in_one_frame() for own in paths), strict=True)
+    path, truth = (np.concatenate(poses) for poses in estimated_and_true)
+    return ate_m(path, truth)
+
+
+def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.DataFrame:
+    """Return the rows of the table `team_pairs`: own alignment and relative pose in the team."""
+    edges = team_edge_rows(team)
+    if edges.empty:
+        return edges
+    used = (errors["aligner"] == aligner) & (errors["repetition"] == 0)
+    rows = edges.merge(criteria.at_the_end(errors[used])[[*_PAIR, *_OWN_ALIGNMENT]], "left", _PAIR)
+    index = {robot.name: k for k, robot in enumerate(team.robots)}
+    a, b = rows[_PAIR].map(index.get).to_numpy().T
+    # errors of T_a_b in the fused maps; NaN for robots in different maps
+    T_world_map = np.array([robot.path.T_world_map for robot in team.robots])
+    T_true = se2.between(T_world_map[a], T_world_map[b])
+    errors_of_team = np.full((2, len(a)), np.nan)
+    for T_first_map in _placements(team):
+        known = np.stack(motion_errors(se2.between(T_first_map[a], T_first_map[b]), T_true))
+        errors_of_team = np.where(np.isfinite(known), known, errors_of_team)
+    translation_m, rotation_rad = errors_of_team
+    return rows.assign(team_translation_error_m=translation_m, team_rotation_error_rad=rotation_rad)

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import fused_landmarks, tables
-from experiments.evaluation.alignment_errors import EvaluatedRobot
+from experiments.evaluation.alignment_errors import ALIGNED
 from experiments.evaluation.evaluated_run import TABLES_PART, EvaluatedRun, finding_rows
 from experiments.evaluation.fused_landmarks import (
     FusedTeam,
@@ -26,14 +26,22 @@ from experiments.evaluation.fused_landmarks import (
     map_history_rows,
     true_pair_rows,
 )
-from experiments.evaluation.fused_map_errors import EvaluatedFusion, coverage_rows
 from experiments.evaluation.loop_closures import sighting_rows
-from experiments.evaluation.pair_evaluation import ALIGNED
-from experiments.evaluation.path_errors import path_statistics_rows, robot_paths
-from experiments.evaluation.result_files import RESULT_SCHEMA_VERSION, require_tables
-from experiments.evaluation.smoothed_robots import SmoothedRobot, smoothed_path_rows, smoother_rows
-from experiments.evaluation.team_errors import team_pair_rows, team_rows
-from experiments.pipeline.code_version import library_versions
+from experiments.evaluation.map_errors import (
+    EvaluatedFusion,
+    SmoothedRobot,
+    coverage_rows,
+    smoothed_path_rows,
+)
+from experiments.evaluation.path_errors import (
+    path_statistics_rows,
+    robot_paths,
+    team_pair_rows,
+    team_rows,
+)
+from experiments.evaluation.tables import RESULT_SCHEMA_VERSION, require_tables
+from experiments.evaluation.truth import EvaluatedRobot
+from experiments.pipeline.stage import library_versions
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
 from experiments.pipeline.stages.slam import stored_maps
@@ -197,7 +205,7 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
     return makers | {
         "frame_times": frame_times,
         "findings": lambda: finding_rows(run),
-        "smoother": lambda: smoother_rows(smoothed()),
+        "smoother": lambda: [each.row() for each in smoothed()],
         "team_edges": lambda: fused_landmarks.team_edge_rows(team),
         "timings": timings,
     }
@@ -255,7 +263,7 @@ def run_scenario(
         scenario: the scenario.
         results: folder of results and of the store.
         jobs: number of processes.
-        on_progress: is told of finished tasks.
+        on_progress: called with the number of finished tasks.
         fresh: discard stored stages first.
         output: folder of the result; `results/NAME-SEED` by default.
         on_written: is called as by `write_result`.

@@ -4,16 +4,16 @@ The time of a stage is estimated from its number of frames or pairs of maps, wit
 earlier runs in the same folder of results, else with typical rates.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.evaluation import tables
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.result_files import read_scenario
+from experiments.evaluation.tables import read_scenario
 from experiments.pipeline.stage import Stage
-from experiments.pipeline.stages.memory import process_bytes, require_memory
+from experiments.pipeline.stages.pipeline import process_bytes, require_memory
 from experiments.pipeline.store import Store
 from experiments.pipeline.tasks import task_names
 from experiments.scenario.loading import scenario_of
@@ -92,7 +92,7 @@ def plan_run(scenario: AnyScenario, results: Path, jobs: int, fresh: bool = Fals
     require_memory(run.pipeline, jobs)
     rates, n_earlier = _rates_of_earlier_runs(results)
     rates, amounts = dict(_TYPICAL_S) | rates, _amounts(run)
-    to_do, finished, work_s = Counter[str](), Counter[str](), Counter[str]()
+    to_do, finished, work_s = Counter[str](), Counter[str](), defaultdict[str, float](float)
     ends_s: dict[Stage, float] = {}  # earliest end of each stage
     for stage in run.stages():
         names = task_names(stage)
@@ -103,7 +103,7 @@ def plan_run(scenario: AnyScenario, results: Path, jobs: int, fresh: bool = Fals
         to_do[stage.name] += len(left)
         finished[stage.name] += len(names) - len(left)
         work_s[stage.name] += own_s
-    total_s = work_s.total()
+    total_s = sum(work_s.values())
     stages = tuple(PlannedStage(n, to_do[n], finished[n], work_s[n]) for n in to_do)
     elapsed_s = _OUTSIDE_S + max(total_s / jobs, *ends_s.values())
     n_frames = {robot.name: robot.n_frames for robot in run.pipeline.robots}
@@ -149,7 +149,7 @@ def _rates_of_earlier_runs(results: Path) -> tuple[dict[str, float], int]:
     """
     found = [path.parent.parent for path in results.glob("*/tables/timings.parquet")]
     found.sort(key=lambda result: (result / "tables" / "timings.parquet").stat().st_mtime)
-    seconds, amounts, n_read = Counter[str](), Counter[str](), 0
+    seconds, amounts, n_read = defaultdict[str, float](float), defaultdict[str, float](float), 0
     for result in found[-_MOST_RUNS:]:
         try:
             data = read_scenario(result / "scenario.json")

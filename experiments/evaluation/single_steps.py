@@ -1,8 +1,9 @@
-"""Single steps on a user's files: record, export as a dataset, slam, align, merge."""
+"""Single steps on a user's files: record, export as a dataset, slam, align, merge, calibrate."""
 
 import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,19 +11,19 @@ import numpy as np
 
 from experiments.evaluation.evaluated_run import EvaluatedRun, finding_of_truth
 from experiments.pipeline.stage import Stage
+from experiments.pipeline.stages.align import estimate_row
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.pipeline.stages.features import render_frame
-from experiments.pipeline.stages.log import measured_odometry
-from experiments.pipeline.stages.observed import told_tilt
+from experiments.pipeline.stages.log import measured_odometry, measured_tilt
 from experiments.pipeline.stages.pipeline import SimulatedRobotStages
 from experiments.pipeline.store import Store, link_or_copy, retry_damaged
-from experiments.pipeline.tables import estimate_row
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
 from mapfusion.align.alignment import NOT_RUN, Pairs, Status
 from mapfusion.align.correspondences import match
+from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import EXPORTERS, export_drive
@@ -33,8 +34,19 @@ from mapfusion.files import Write, write_together
 from mapfusion.fusion.fusers import AlignedPair, Fusion, make_fuser, name_order
 from mapfusion.fusion.merge import merge as merge_maps
 from mapfusion.fusion.team_graph import EdgeStatus
+from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
-from mapfusion.robot_log import read_log, read_odometry_covariance, read_true_poses
+from mapfusion.robot_log import (
+    TRUTH_FILES,
+    read_log,
+    read_odometry_covariance,
+    read_true_poses,
+    write_log,
+)
+from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
+from mapfusion.smoother.odometry_calibration import Calibration, calibrate
+from mapfusion.smoother.smooth import SmootherParameters
+from mapfusion.tables import NO_LABEL
 from mapfusion.verification.registration import Registration
 from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
@@ -188,7 +200,7 @@ def save_fused(path: Path, merged: MergeResult) -> list[Path]:
 
 def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     aligner = callable_aligner(entry.method, entry.parameters, entry.time_limit_s)
-    return Registration(aligner, settings.refinement, settings.judge)
+    return Registration(aligner, settings.refinement, settings.verifier)
 
 
 def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, Any]]:
@@ -199,7 +211,7 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
     """
     map_a, map_b = read_map(path_a), read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
-    evidence = settings.align.judge.on(Pairs(map_a, map_b, pairs)).evidence
+    evidence = settings.align.verifier.on(Pairs(map_a, map_b, pairs)).evidence
     for entry in settings.align.aligners:
         registration = _registration(entry, settings.align)
         given = map_a, map_b, pairs, evidence
@@ -268,7 +280,7 @@ def write_drives(
         output: folder of the datasets.
         results: folder of the store.
         jobs: number of processes.
-        on_progress: is told of finished tasks and frames.
+        on_progress: called with the number of finished tasks and frames.
 
     Returns:
         The paths that `mapfusion import` reads.
@@ -315,5 +327,78 @@ def _stereo_drive(
         measured_odometry(robot.log.settings, trajectory),
         pair,
         None if tilts is None else tilts[index],
-        told_tilt(robot.observed.settings, trajectory),
+        measured_tilt(robot.observed.settings, trajectory),
     )
+
+
+def calibrate_logs(
+    logs: Sequence[Path], output: Path | None, settings: Scenario, on_progress: OnProgress
+) -> Calibration:
+    """Calibrate the odometry of logs, and write corrected logs.
+
+    Landmarks are identified by labels if all observations have one, else by FastSLAM with the
+    settings of the scenario. The truth is copied, but not read.
+
+    Args:
+        logs: folders of logs, one for each robot.
+        output: folder of the corrected logs; None writes nothing.
+        settings: settings of the filter and of the smoother.
+        on_progress: called with the number of finished frames and steps.
+
+    Raises:
+        InputError: a log cannot be read or calibrated, or a corrected log cannot be written.
+    """
+    loaded = [read_log(path) for path in logs]
+    names = [log.robot for log in loaded]
+    for path, name in zip(logs, names, strict=True):
+        if names.count(name) > 1:
+            raise InputError(f"{path}: robot {name} has more than one log here")
+    landmarks, paths = [], list[Float | None]()
+    for log in loaded:
+        label, frame = log.observations.label, None
+        if label is not None and not np.any(label == NO_LABEL):
+            landmarks.append(label.astype(np.int64))
+            paths.append(None)
+            continue
+        rng = generator(settings.seed, "slam", log.robot)
+        for frame in run_log(log, settings.slam.filter, rng):
+            on_progress(f"FastSLAM of {log.robot}", frame.iteration + 1, len(log))
+        if frame is None:
+            raise InputError(f"log {log.robot}: holds no frame")
+        landmarks.append(frame.slam.best_associations())
+        paths.append(frame.slam.best_path())
+    parameters = SmootherParameters(
+        stray_m=settings.smooth.stray_m, min_count=settings.slam.min_count
+    )
+    calibration = calibrate(
+        loaded,
+        landmarks,
+        paths,
+        parameters,
+        lambda done, most: on_progress("calibrate", done, most),
+    )
+    if output is not None:
+        for source, log, robot in zip(logs, loaded, calibration.robots, strict=True):
+            folder = output / log.robot
+            try:
+                write_log(folder, robot.error.corrected_log(log))
+                for name in (*TRUTH_FILES, ATTITUDE_FILE):
+                    (folder / name).unlink(missing_ok=True)
+                    if (source / name).exists():
+                        link_or_copy(source / name, folder / name)
+            except OSError as error:
+                raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
+    return calibration
+
+
+def filter_settings(calibration: Calibration) -> dict[str, Any]:
+    """Return the section `slam.filter.motion` of a scenario for corrected logs."""
+    motion = {name: float(f"{value:.3g}") for name, value in asdict(calibration.motion).items()}
+    wanted = {
+        *NOISE_PARAMETERS,
+        "scale_error",
+        "track_error",
+        "lateral_m_per_sqrt_m",
+        "lateral_slip_m_per_rad",
+    }
+    return {"slam": {"filter": {"motion": {k: v for k, v in motion.items() if k in wanted}}}}

@@ -1,4 +1,4 @@
-"""Schemas of the result tables, which figures, checks and users' scripts read.
+"""Files of a result folder: schemas of its tables, and its JSON files.
 
 The tables are Parquet files in `RESULT/tables/`. Names of columns contain the unit. Rotations are
 counter-clockwise. Only `timings` and `aligner_timings` have measured times: all other tables are
@@ -12,13 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import pyarrow as pa
+from pydantic import BaseModel, ValidationError
 
 from experiments.pipeline import tables
+from experiments.pipeline.store import FileEntry, require_unchanged
 from experiments.pipeline.tables import CORRESPONDENCES, ESTIMATES, RIVALS, TRACKS
-from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, schema
+from mapfusion.errors import DamagedFileError, InputError
+from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, read_json, require_version, schema
 
-if TYPE_CHECKING:  # as in `frames`
+if TYPE_CHECKING:
     import pandas as pd
+
 
 # Columns that are not floats.
 _NAMES = {
@@ -73,7 +77,7 @@ _COLUMNS = {
     # Times of the frames of `paths`, from the robot's log.
     "frame_times": "robot iteration time_s",
     # Last smoothed map and path of each robot, compared with FastSLAM's (filter_); see
-    # evaluation/smoothed_robots.py and map_consistency.py. Paths have the true start and no fit.
+    # evaluation/map_errors.py and map_consistency.py. Paths have the true start and no fit.
     # Landmarks are compared after a rigid fit without gross landmarks, which are counted. Their
     # consistency is computed with the gauge removed. observation_dof, offset_dof: estimated degrees
     # of freedom of the Student t distributions of observations and of tracks' offsets.
@@ -103,7 +107,7 @@ _COLUMNS = {
     "fused_map": f"""landmark {_POINT} n_parents robot_a landmark_a robot_b landmark_b
         truth_x_m truth_y_m truth_z_m""",
     # One row per (fuser, iteration): errors of the fused map of the most robots; see
-    # evaluation/fused_map_errors.py and map_consistency.py. landmark_rmse_m: in the frame of the
+    # evaluation/map_errors.py and map_consistency.py. landmark_rmse_m: in the frame of the
     # first robot in the map. fitted: after a rigid fit. Gross landmarks are counted and left out.
     # over_better_parent: error of common landmarks of two robots over the error of the better of
     # their maps that the fuser was given. over_better_filter: likewise for FastSLAM's maps. Each
@@ -176,16 +180,14 @@ _COLUMNS = {
 }
 
 
-def _schema(name: str) -> pa.Schema:
-    types = {column: kind for kind, names in _NAMES.items() for column in names.split()}
-    types |= _OTHER_TYPES.get(name, {})
-    columns = {column: types.get(column, tables.FLOAT) for column in _COLUMNS[name].split()}
-    return schema(f"result.{name}", _VERSIONS.get(name, 1), tables.fields(**columns))
-
-
 ALL = {"estimates": ESTIMATES, "correspondences": CORRESPONDENCES, "rivals": RIVALS}
 ALL |= {"tracks": TRACKS}
-ALL |= {name: _schema(name) for name in _COLUMNS}
+_TYPES = {column: kind for kind, names in _NAMES.items() for column in names.split()}
+for _name, _columns in _COLUMNS.items():
+    _own = dict.fromkeys(_columns.split(), tables.FLOAT)
+    _own |= {column: _TYPES[column] for column in _own if column in _TYPES}
+    _fields = tables.fields(**(_own | _OTHER_TYPES.get(_name, {})))
+    ALL[_name] = schema(f"result.{_name}", _VERSIONS.get(_name, 1), _fields)
 
 
 class Shown(NamedTuple):
@@ -244,3 +246,75 @@ def work_by_stage(timings: pd.DataFrame) -> pd.DataFrame:
     works = timings[timings["name"].str.endswith(":elapsed_s")].drop_duplicates(["stage", "name"])
     stages = works.groupby("stage", sort=False)["elapsed_s"]
     return stages.agg(seconds="sum", tasks="count").reset_index()
+
+
+RESULT_SCHEMA_VERSION = 1
+
+
+class _ResolvedScenario(BaseModel):
+    name: str
+    seed: int
+    description: str = ""
+    expect: dict[str, dict[str, float | None]] = {}
+    merge: dict[str, Any] = {}
+
+
+class _World(BaseModel):
+    walls: list[list[tuple[float, float]]] = []
+    robots: dict[str, tuple[float, float, float]] = {}
+
+
+class _Provenance(BaseModel):
+    stages: dict[str, Any] = {}
+    tables: list[str] = []
+    files: dict[str, FileEntry] = {}  # empty in results of earlier versions
+    libraries: dict[str, str] = {}
+
+
+def read_scenario(path: Path) -> dict[str, Any]:
+    """Return `scenario.json` of a result; raises DamagedFileError."""
+    return _checked(path, "resolved scenario", _ResolvedScenario)
+
+
+def read_world(path: Path) -> dict[str, Any]:
+    """Return `world.json` of a result; raises DamagedFileError."""
+    return _checked(path, "world of a result", _World)
+
+
+def read_provenance(path: Path) -> dict[str, Any]:
+    """Return `provenance.json` of a result; raises DamagedFileError."""
+    return _checked(path, "provenance of a result", _Provenance)
+
+
+def require_tables(result: Path) -> None:
+    """Raise InputError if a table is missing that the run wrote into its result folder.
+
+    Results of earlier versions do not list their tables.
+    """
+    path = result / "provenance.json"
+    written = read_provenance(path).get("tables", ()) if path.is_file() else ()
+    gone = [name for name in written if not table_path(result, name).is_file()]
+    if gone:
+        others = f" (and {len(gone) - 1} more)" if len(gone) > 1 else ""
+        remedy = "put it back, or run the scenario again"
+        missing = table_path(result, gone[0])
+        raise InputError(f"{missing}: is missing{others}, but the run wrote it; {remedy}")
+
+
+def require_as_written(result: Path) -> None:
+    """Raise DamagedFileError if a table, map or JSON file was changed after the run."""
+    path = result / "provenance.json"
+    if path.is_file():
+        require_unchanged(result, _Provenance.model_validate(read_provenance(path)).files)
+
+
+def _checked(path: Path, what: str, model: type[BaseModel]) -> dict[str, Any]:
+    content = read_json(path, what)
+    require_version(path, content, RESULT_SCHEMA_VERSION)
+    try:
+        model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"]))
+        raise DamagedFileError(path, f"{field}: {first['msg']} (expected a {what})") from error
+    return content

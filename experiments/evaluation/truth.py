@@ -1,18 +1,29 @@
 """True poses and points for estimated paths and landmarks; only the evaluation uses this module."""
 
-from collections.abc import Callable, Mapping
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import scipy
 
+from experiments.pipeline.stages.align import alignment_of, correspondences_of, latest_at
+from experiments.pipeline.stages.slam import ROBOTS_KEPT, RobotFolders, stored_maps
+from experiments.pipeline.tables import records
+from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.errors import InputError
+from mapfusion.fusion.fusers import AlignedPair
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import TRUTH_TABLES, RobotLog, RobotTruth, read_truth
+from mapfusion.robot_log import TRUTH_TABLES, RobotLog, RobotTruth, read_log, read_truth
 from mapfusion.tables import table_path
+
+_MAP_PAIR = ["robot_a", "robot_b", "iteration"]
 
 
 def truth_or_unknown(folder: Path, log: RobotLog) -> RobotTruth:
@@ -125,6 +136,137 @@ def degrees_of_freedom(landmarks: LandmarkMap) -> int:
     return 2 if landmarks.planar else 3
 
 
+def motion_errors(T: Float, T_true: Float) -> tuple[Float, Float]:
+    """Return translation errors in m and signed rotation errors in rad of motions (..., 3)."""
+    error = T - T_true
+    return np.hypot(error[..., 0], error[..., 1]), se2.wrap(error[..., 2])
+
+
 def squared_mahalanobis(error: Float, covariance: Float) -> Float:
     """Return squared Mahalanobis lengths of errors (..., D) with covariances (..., D, D)."""
     return np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
+@dataclass(frozen=True)
+class EvaluatedRobot:
+    """Maps of one robot with the truth.
+
+    Attributes:
+        name: name of the robot.
+        maps: maps by iteration.
+        points_world_m: true points of the landmarks of each map, shape (N, 3).
+        path: true path.
+    """
+
+    name: str
+    maps: Mapping[int, LandmarkMap]
+    points_world_m: dict[int, Float]
+    path: PathTruth
+
+    def at(self, iteration: int) -> tuple[LandmarkMap, Float]:
+        """Return map and true points at an iteration; the last ones if the log ended earlier."""
+        return latest_at(self.maps, iteration), latest_at(self.points_world_m, iteration)
+
+    def in_map_frame(self, points_world_m: Float) -> Float:
+        """Transform world points (..., 3) into the frame of this robot's maps."""
+        return se2.transform_points(se2.inverse(self.path.T_world_map), points_world_m)
+
+
+@dataclass(frozen=True)
+class MapPair:
+    """Maps of two robots at one iteration, with correspondences and estimates.
+
+    Attributes:
+        a: first robot.
+        b: second robot.
+        iteration: iteration of the maps.
+        maps: maps of a and b.
+        points_world_m: true points of their landmarks, shapes (N, 3) and (M, 3).
+        offered: correspondences that all aligners were given.
+        estimates: rows of the table `estimates`.
+        rivals: rows of the table `rivals`: other motions that align the maps as well.
+    """
+
+    a: EvaluatedRobot
+    b: EvaluatedRobot
+    iteration: int
+    maps: tuple[LandmarkMap, LandmarkMap]
+    points_world_m: tuple[Float, Float]
+    offered: Correspondences
+    estimates: Sequence[Mapping[str, Any]]
+    rivals: pd.DataFrame
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """Values of the columns that identify this pair of maps."""
+        return dict(zip(_MAP_PAIR, (self.a.name, self.b.name, self.iteration), strict=True))
+
+    def is_true(self, radius_m: float) -> np.ndarray:
+        """Return, shape (N,), True for correspondences of the same world point."""
+        pairs = self.offered
+        return true_pairs(*self.points_world_m, pairs.index_a, pairs.index_b, radius_m)
+
+    def aligned(self, aligner: str, a: int, b: int) -> AlignedPair:
+        """Return the alignment that a merge uses: the first repetition of an aligner.
+
+        Args:
+            aligner: name of the aligner.
+            a: index of the first map among the maps that are merged.
+            b: index of the second map.
+        """
+        rows = (row for row in self.estimates if row["aligner"] == aligner)
+        row = next(row for row in rows if row["repetition"] == 0)
+        alignment = alignment_of(row, len(self.offered))
+        return AlignedPair(a, b, alignment, self.offered, row["log10_false_alarms"])
+
+
+def join_map_pairs(
+    robots: Sequence[EvaluatedRobot],
+    estimates: pd.DataFrame,
+    correspondences: pd.DataFrame,
+    rivals: pd.DataFrame,
+) -> list[MapPair]:
+    """Return all pairs of maps of the tables `estimates`, `correspondences` and `rivals`.
+
+    The order is that of `estimates`.
+    """
+    by_name = {robot.name: robot for robot in robots}
+    offered, rival = (dict(iter(rows.groupby(_MAP_PAIR))) for rows in (correspondences, rivals))
+    estimated: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for row in records(estimates):  # much faster than `groupby` for many small groups
+        estimated.setdefault((row["robot_a"], row["robot_b"], row["iteration"]), []).append(row)
+    map_pairs = []
+    for key, rows in estimated.items():
+        name_a, name_b, iteration = key
+        a, b = by_name[name_a], by_name[name_b]
+        (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
+        pairs = correspondences_of(offered.get(key, correspondences.iloc[:0]))
+        maps, points = (map_a, map_b), (points_a, points_b)
+        others = rival.get(key, rivals.iloc[:0])
+        map_pairs.append(MapPair(a, b, iteration, maps, points, pairs, rows, others))
+    return map_pairs
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def load_robot(folders: RobotFolders, viewing: bool = True) -> EvaluatedRobot:
+    """Load a robot's maps with the true points of their landmarks; NaN where unknown.
+
+    The result stays in memory, as that of `stored_maps`.
+
+    Args:
+        folders: folders of the log and of the maps.
+        viewing: whether to load the viewing evidence of the maps.
+
+    Raises:
+        InputError: the truth and the log differ in their number of rows.
+    """
+    log = read_log(folders.log)
+    truth = truth_or_unknown(folders.log, log)
+    poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
+    for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):
+        if len(true) != len(logged):
+            counts = f"{len(true)} rows, the log has {len(logged)} of them"
+            raise InputError(f"{folders.log / file}.parquet: {counts}")
+    maps = stored_maps(folders, viewing=viewing)
+    points = landmark_truth(truth, maps.associations.at, maps)
+    return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))

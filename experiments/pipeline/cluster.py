@@ -21,8 +21,8 @@ import dask.config
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
-from experiments.pipeline.code_version import library_versions, source_hash, use_kernel_cache
-from experiments.pipeline.workers import blocked_interrupts, describe_defect
+from experiments.pipeline.stage import library_versions, source_hash, use_kernel_cache
+from experiments.pipeline.workers import blocked_interrupts, describe_defect, single_threaded
 from mapfusion.errors import DamagedFileError, InputError
 
 # Tasks use state of their process (the open PyBullet world, OpenCV's threads), so a worker with
@@ -68,15 +68,6 @@ def code_version() -> str:
     return f"{source_hash()} {sorted(library_versions().items())} {platform.machine()}"
 
 
-@functools.cache
-def _prepare() -> None:
-    """Prepare the process once, before the import of modules with kernels."""
-    use_kernel_cache()
-    from experiments.pipeline.workers import single_threaded
-
-    single_threaded()
-
-
 def perform(name: str, task: bytes, terms: SweepTerms, *needs: None) -> object:
     """Run a task.
 
@@ -106,7 +97,8 @@ def perform(name: str, task: bytes, terms: SweepTerms, *needs: None) -> object:
             "install the same version everywhere and start the workers again"
         )
     with _one_at_a_time:
-        _prepare()
+        use_kernel_cache()  # before the import of modules with kernels
+        single_threaded()
         stage = name.partition("/")[0]
         mark = terms.attempts / name.replace("/", "_")
         if mark.exists() and mark.stat().st_size > terms.retries:

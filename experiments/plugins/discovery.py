@@ -19,11 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.plugins.isolated_process import (
-    IsolatedAligner,
-    ProcessFailedError,
-    process_for,
-)
+from experiments.plugins.isolated_process import IsolatedAligner, ProcessFailedError, process_for
 from mapfusion.align.aligners import ALIGNERS, PEERS, construct
 from mapfusion.errors import did_you_mean, not_installed
 from mapfusion.verification.registration import Aligner, as_aligner
@@ -184,16 +180,16 @@ def make_method(name: str, /, **parameters: Any) -> Any:
         ValueError: the name or a parameter is unknown, or a parameter is out of range.
     """
     method = find_method(name)
-    module, _, names = method.target.rpartition(":")
-    if not module.endswith(".py"):
+    own_file = _OWN_FILE.fullmatch(method.target)
+    if own_file is None:
+        module, _, names = method.target.partition(":")
         return construct(name, attrgetter(names)(import_module(module)), parameters)
-    made = _module_of_file(Path(module))
+    file, names = own_file.groups()
+    made = _module_of_file(Path(file))
     if not hasattr(made, names):
         own = [key for key, value in vars(made).items() if _is_class_of(made, value)]
         there = ", ".join(own) or "none"
-        raise ValueError(
-            f"{module}: has no class {names}; there: {there}{did_you_mean(names, own)}"
-        )
+        raise ValueError(f"{file}: has no class {names}; there: {there}{did_you_mean(names, own)}")
     return construct(names, getattr(made, names), parameters)
 
 

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.plugins.answers import (
+from experiments.plugins.discovery import make_method
+from experiments.plugins.isolated_process import (
     InvalidAnswerError,
     alignment_to_json,
     checked_aligner,
     checked_alignment,
 )
-from experiments.plugins.discovery import make_method
 from mapfusion.errors import moved_module_note, one_line
 from mapfusion.verification.registration import Aligner
 

@@ -17,7 +17,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.evaluation import tables
-from experiments.evaluation.checks import CheckedScenario
+from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.pipeline.tables import COVARIANCE, MOTION
 from experiments.reports.formatting import plain

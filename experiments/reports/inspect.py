@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import pyarrow as pa
 
 from experiments.evaluation import tables
-from experiments.evaluation.result_files import require_as_written
+from experiments.evaluation.tables import require_as_written
 from experiments.reports.terminal.layout import Column, print_lines, print_table
 from mapfusion import attitude, landmark_map, robot_log
 from mapfusion.errors import InputError

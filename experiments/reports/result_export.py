@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from experiments.evaluation.criteria import is_used_by_team
 from experiments.evaluation.result import require_result
-from experiments.evaluation.team_errors import is_used_by_team
-from experiments.pipeline.tables import alignment_of
+from experiments.pipeline.stages.align import alignment_of
 from experiments.reports.export import write_text
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.reports.figures.style import FUSED_COLOUR

@@ -12,7 +12,7 @@ import pandas as pd
 
 from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.evaluation.tables import table_path
-from experiments.pipeline.code_version import library_versions
+from experiments.pipeline.stage import library_versions
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, write_rows
 from experiments.plugins.discovery import find_method
 from experiments.reports.export import publish_json, to_markdown, write_tables, write_text

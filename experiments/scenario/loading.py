@@ -100,7 +100,19 @@ def load_scenario(
     data = apply_overrides(_with_absolute_methods(written, folder), overrides)
     if seed is not None:
         data["seed"] = seed
-    scenario = scenario_of(data, str(path), functools.partial(_place, path, overrides))
+
+    def place(location: Location) -> str:
+        """Return the line of the file or the override that gives the value at a location."""
+        for override in reversed(overrides):
+            own = override.partition("=")[0].split(".")
+            beginning = [str(part) for part in location[: len(own)]]
+            if beginning and own[: len(beginning)] == beginning:
+                return f", --set {override}"
+        above = (location[:n] for n in range(len(location), 0, -1))
+        line = next((_lines(path)[each] for each in above if each in _lines(path)), None)
+        return "" if line is None else f", line {line}"
+
+    scenario = scenario_of(data, str(path), place)
     _warn_of_name_clashes(scenario.align)
     if not isinstance(scenario, Recording):
         return scenario
@@ -138,18 +150,6 @@ def _with_absolute_methods(data: dict[str, Any], folder: Path) -> dict[str, Any]
 
 # Each wrong key of a file needs the lines.
 _lines = functools.lru_cache(maxsize=1)(lines_of_keys)
-
-
-def _place(path: Path, overrides: Sequence[str], location: Location) -> str:
-    """Return the line of the file or the override that gives the value at a location."""
-    for override in reversed(overrides):
-        own = override.partition("=")[0].split(".")
-        told = [str(part) for part in location[: len(own)]]
-        if told and own[: len(told)] == told:
-            return f", --set {override}"
-    above = (location[:n] for n in range(len(location), 0, -1))
-    line = next((_lines(path)[each] for each in above if each in _lines(path)), None)
-    return "" if line is None else f", line {line}"
 
 
 def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> AnyScenario:
@@ -314,7 +314,7 @@ def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:
             for name, problem in ((cause.name, cause.problem), *cause.also):
                 yield Problem((*location, *_parts(name)), problem)
         elif isinstance(cause, ContradictingSections):
-            yield from map(_told, cause.problems)
+            yield from map(_problem_of_line, cause.problems)
         elif each["type"] in _UNKNOWN:
             yield Problem(location, _about_unknown(location, _known_keys(kind)))
         elif each["type"] != "value_error" and not isinstance(each["input"], dict):
@@ -338,10 +338,10 @@ def _contradictions(
             if name in data
             else field.get_default(call_default_factory=True)
         )
-    yield from map(_told, broken_rules(kind.RULES, sections))
+    yield from map(_problem_of_line, broken_rules(kind.RULES, sections))
 
 
-def _told(line: str) -> Problem:
+def _problem_of_line(line: str) -> Problem:
     """Split a line of a rule into the key at its beginning and the text."""
     name, _, text = line.partition(": ")
     section, _, metric = name.partition(".")
@@ -419,8 +419,8 @@ def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, A
 
 def _about_unknown(location: tuple[int | str, ...], known: list[tuple[str, ...]]) -> str:
     """Return a message with the known names and the most similar ones."""
-    if told := _RETIRED.get(".".join(map(str, location))):
-        return f"retired; {told}"
+    if replacement := _RETIRED.get(".".join(map(str, location))):
+        return f"retired; {replacement}"
     *above, wrong = location
     beside = [path for path in known if len(path) == len(location)]
     for i, part in enumerate(above):

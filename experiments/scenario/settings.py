@@ -8,6 +8,7 @@ Sections contain the parameter classes of the library (`FrontEndParameters`, `Fa
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -36,6 +37,8 @@ from mapfusion.errors import OutOfRangeError, did_you_mean
 from mapfusion.fusion.fusers import USUAL, MergeParameters
 from mapfusion.geometry.camera import StereoCamera
 from mapfusion.parameters import Range
+from mapfusion.robot_log import TRUTH_TABLES
+from mapfusion.tables import table_path
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters
 from mapfusion.verification.verdict import Verifier
@@ -176,8 +179,8 @@ class Align(Section):
     repetitions: Annotated[int, Range(1, 1000, "repetitions")] = 20
 
     @property
-    def judge(self) -> Verifier:
-        """Return the judge of alignments with these settings."""
+    def verifier(self) -> Verifier:
+        """Verifier of alignments with these settings."""
         return Verifier(self.acceptance, self.evidence, self.refinement)
 
     @model_validator(mode="after")
@@ -359,6 +362,13 @@ class Scenario(Section):
         """Return all settings with defaults as JSON values."""
         return self.model_dump(mode="json")
 
+    def why_no_truth(self) -> str:
+        """Return a text about the first log without truth; empty if all robots have truth.
+
+        Robots are evaluated together, because alignments concern the maps of two robots.
+        """
+        return ""
+
 
 class Recording(Scenario):
     """Experiment on recorded logs.
@@ -368,6 +378,14 @@ class Recording(Scenario):
     """
 
     logs: Annotated[list[str], Field(min_length=1, max_length=MAX_NAMED), AfterValidator(different)]
+
+    def why_no_truth(self) -> str:
+        """Return a text about the first log without truth; empty if all logs have truth."""
+        for log in map(Path, self.logs):
+            lacking = [name for name in TRUTH_TABLES if not table_path(log, name).is_file()]
+            if lacking and log.is_dir():
+                return f"no truth is known: {log} has no {lacking[0]}.parquet or .csv"
+        return ""
 
 
 class SimulatedScenario(Scenario):

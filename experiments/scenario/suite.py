@@ -193,34 +193,35 @@ def entries(folder: Path | None = None) -> list[dict[str, Any]]:
     Raises:
         InputError: the folder has no scenario, or a file is not a mapping.
     """
+    from sim.plan_generator import RouteParameters
+
     files = _files(folder)
     if not files:
         raise InputError(
             f"{folder}: holds no scenario (*.yaml); without a folder the suite is listed"
         )
-    return [_entry(path) for path in files]
-
-
-def _entry(path: Path) -> dict[str, Any]:
-    from sim.plan_generator import RouteParameters
-
-    data = read_mapping(path)
-    sections = (data.get(name) for name in ("generate", "generated", "drive"))
-    generate, generated, drive = (each if isinstance(each, dict) else {} for each in sections)
-    robots, overlap = data.get("logs", data.get("robots")), generated.get("overlap_asked")
-    n_robots = len(robots) if isinstance(robots, list) else None
-    if "generate" in data:
-        n_robots = generate.get("robots", RouteParameters.robots)
-        overlap = generate.get("overlap", RouteParameters.overlap)
-    return {
-        "name": str(data.get("name", path.stem)),
-        "tags": _tags(data),
-        "description": str(data.get("description", "")),
-        "recorded": "logs" in data,
-        "robots": _number(n_robots),
-        "iterations": _number(drive.get("frames")),
-        "overlap": _number(overlap),
-    }
+    rows = []
+    for path in files:
+        data = read_mapping(path)
+        sections = (data.get(name) for name in ("generate", "generated", "drive"))
+        generate, generated, drive = (each if isinstance(each, dict) else {} for each in sections)
+        robots, overlap = data.get("logs", data.get("robots")), generated.get("overlap_asked")
+        n_robots = len(robots) if isinstance(robots, list) else None
+        if "generate" in data:
+            n_robots = generate.get("robots", RouteParameters.robots)
+            overlap = generate.get("overlap", RouteParameters.overlap)
+        rows.append(
+            {
+                "name": str(data.get("name", path.stem)),
+                "tags": _tags(data),
+                "description": str(data.get("description", "")),
+                "recorded": "logs" in data,
+                "robots": _number(n_robots),
+                "iterations": _number(drive.get("frames")),
+                "overlap": _number(overlap),
+            }
+        )
+    return rows
 
 
 def _number(value: Any) -> float | None:

@@ -29,14 +29,14 @@ from experiments.evaluation.criteria import (
     RICH_PAIRS,
     RUN_KEYS,
     is_false_merge,
+    is_used_by_team,
     methods_in,
+    path_rms,
     right_refined,
     setting_columns,
 )
-from experiments.evaluation.fused_map_errors import last_fused
-from experiments.evaluation.path_errors import path_rms
-from experiments.evaluation.result_files import read_scenario
-from experiments.evaluation.team_errors import is_used_by_team
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.tables import read_scenario
 from experiments.studies import intervals
 from experiments.studies.intervals import MAPS_OF_ONE_RUN, RUN
 from experiments.studies.run_tables import RunPath, Runs, find_runs, match_names

@@ -16,18 +16,14 @@ from typing import Any
 import pandas as pd
 
 from experiments.evaluation.alignment_errors import first_shared_iteration
-from experiments.evaluation.checks import why_no_truth
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
 from experiments.evaluation.map_consistency import rmse
-from experiments.evaluation.path_errors import STATISTICS
-from experiments.evaluation.smoothed_robots import SmoothedRobot
+from experiments.evaluation.map_errors import EvaluatedFusion, GivenMap, SmoothedRobot
+from experiments.evaluation.path_errors import STATISTICS, PlacedPath, team_ate_m
 from experiments.evaluation.tables import UNKNOWN
-from experiments.evaluation.team_errors import PlacedPath, team_ate_m
 from experiments.pipeline.stage import Stage
-from experiments.pipeline.stages.aligner import AlignerSettings
+from experiments.pipeline.stages.align import AlignerSettings, MatchSettings
 from experiments.pipeline.stages.fuse import FuseSettings, read_fusions
-from experiments.pipeline.stages.match import MatchSettings
 from experiments.pipeline.stages.slam import SlamSettings
 from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.store import Store, retry_damaged
@@ -255,7 +251,7 @@ def team_of(run: EvaluatedRun, n_robots: int) -> RecordedTeam:
     inherited = {name: value for name, value in scenario if name in Scenario.model_fields}
     logs = [str(run.store.path(robot.log)) for robot in robots]
     recorded = Recording(**inherited | changed, logs=logs)
-    if reason := why_no_truth(recorded):
+    if reason := recorded.why_no_truth():
         raise InputError(f"scenario {scenario.name}: {reason}; its errors are unknown")
     return RecordedTeam(EvaluatedRun.of(recorded, run.store))
 

@@ -20,9 +20,8 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import fuse, smooth
-from experiments.pipeline.stages.aligner import AlignerSettings
+from experiments.pipeline.stages.align import AlignerSettings, latest_at, maps_of_both
 from experiments.pipeline.stages.fuse import FuseSettings
-from experiments.pipeline.stages.match import latest_at, maps_of_both
 from experiments.pipeline.stages.slam import SlamSettings
 from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows

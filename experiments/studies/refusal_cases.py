@@ -15,13 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.checks import load_checked
 from experiments.evaluation.criteria import MERGEABLE_PAIRS
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.pair_evaluation import load_robot
+from experiments.evaluation.metrics import load_checked
 from experiments.evaluation.result import require_result
-from experiments.evaluation.truth import common_landmarks, true_pairs
+from experiments.evaluation.truth import EvaluatedRobot, common_landmarks, load_robot, true_pairs
 from experiments.pipeline.stages.slam import RobotFolders, evaluated_iterations, stored_maps
 from experiments.pipeline.store import Store
 from experiments.plugins.discovery import callable_aligner
@@ -175,7 +173,7 @@ class MappedWorld:
 
     def maps(self, robot: str) -> Mapping[int, LandmarkMap]:
         """Return the maps of one robot by iteration, without the truth."""
-        return stored_maps(self.folders[robot])
+        return stored_maps(self.folders[robot], viewing=True)
 
     def robots(self) -> list[EvaluatedRobot]:
         """Return the maps of all robots with the truth."""

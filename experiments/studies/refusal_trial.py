@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.tables import table_path
-from experiments.pipeline.stages.match import latest_at
+from experiments.pipeline.stages.align import latest_at
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.tasks import OnProgress
 from experiments.pipeline.workers import workers
@@ -299,7 +299,9 @@ def _answers(
     names |= {"world_b": worlds[1].name, "robot_b": case.map_b.name, "iteration": iteration}
     bound = np.log10(settings.acceptance.false_alarms)
     pairs = Pairs(case.map_a, case.map_b, case.pairs)
-    verifier = settings.judge.on(pairs)  # evidence is computed once, for answers that beat chance
+    verifier = settings.verifier.on(
+        pairs
+    )  # evidence is computed once, for answers that beat chance
     rows = []
     for entry in settings.aligners:
         rng = generator(scenario.seed, *map(str, names.values()), entry.name)

@@ -16,7 +16,7 @@ import pyarrow as pa
 
 from experiments.evaluation import tables
 from experiments.evaluation.criteria import RUN_KEYS, setting_columns
-from experiments.evaluation.result_files import read_provenance, read_scenario, require_tables
+from experiments.evaluation.tables import read_provenance, read_scenario, require_tables
 from experiments.studies.sweep_tables import SCHEMA_VERSION
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, require_version, row_groups, text_attributes

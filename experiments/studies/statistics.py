@@ -18,15 +18,15 @@ from experiments.evaluation.criteria import (
     absolute_errors,
     has_common_ground,
     is_false_merge,
+    is_used_by_team,
     right_refined,
     setting_columns,
     summarise_alignments,
     with_common_ground_at_any_time,
 )
 from experiments.evaluation.fused_landmarks import mean_nees_band
-from experiments.evaluation.fused_map_errors import last_fused
+from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.path_errors import STATISTICS
-from experiments.evaluation.team_errors import is_used_by_team
 from experiments.scenario.seeds import generator
 from experiments.studies import intervals
 from experiments.studies.method_comparison import (

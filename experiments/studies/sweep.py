@@ -23,7 +23,7 @@ from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import all_tables, measure_aligners, renderer
 from experiments.pipeline import cluster
 from experiments.pipeline.cluster import dask_client
-from experiments.pipeline.stages.memory import require_memory
+from experiments.pipeline.stages.pipeline import require_memory
 from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded

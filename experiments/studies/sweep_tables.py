@@ -30,9 +30,9 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ValidationError
 
 from experiments.evaluation import tables
-from experiments.evaluation.checks import load_checked
 from experiments.evaluation.criteria import absolute_errors, answerable
-from experiments.pipeline.code_version import library_versions, source_hash
+from experiments.evaluation.metrics import load_checked
+from experiments.pipeline.stage import library_versions, source_hash
 from experiments.pipeline.tables import FLOAT, TEXT, fields
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import DamagedFileError, InputError, StoreRepairWarning

@@ -182,7 +182,7 @@ def repeated_regions(worlds: Sequence[MappedWorld]) -> list[Regions]:
         settings = world.scenario.align
         for _, case in cases_of(world, EVERY):
             pairs = Pairs(case.map_a, case.map_b, case.pairs)
-            evidence = settings.judge.on(pairs).evidence
+            evidence = settings.verifier.on(pairs).evidence
             if case.n_common or evidence is None:
                 continue
             motions = distinct_motions(pairs, N_RIVALS, settings.acceptance, settings.refinement)
@@ -253,7 +253,7 @@ def answers_of(worlds: Sequence[MappedWorld]) -> Answers:
     for world in worlds:
         scenario, settings = world.scenario, world.scenario.align
         for k, case in cases_of(world, _EVERY_IF_REPEATED if world.repeats else 1):
-            verifier = settings.judge.on(Pairs(case.map_a, case.map_b, case.pairs))
+            verifier = settings.verifier.on(Pairs(case.map_a, case.map_b, case.pairs))
             names = (world.name, case.map_a.name, case.map_b.name, k)
             for entry in settings.aligners:
                 rng = generator(scenario.seed, "fit", *names, entry.name)

@@ -58,13 +58,7 @@ def _let_kernels_call_each_other() -> None:
     from numba.extending import typeof_impl
 
     context = cast(Any, cpu_target).typing_context
-
-    def typeof(function: Compiled, _: Any) -> Any:
-        inner = function.inner
-        context.refresh()  # a processor instruction is known from here on
-        return context.resolve_value_type(inner)
-
-    typeof_impl.register(Compiled)(typeof)
+    typeof_impl.register(Compiled)(lambda own, _: context.resolve_value_type(own.inner))
 
 
 def kernel(function: Any = None, **options: Any) -> Any:
@@ -270,9 +264,12 @@ def _instruction(generator: Callable[[Any, Any], Any]) -> Compiled:
     """Make a processor instruction without a Numba function, for use inside kernels only."""
 
     def compiler(python: Any, **_: Any) -> Any:
+        from numba.core.registry import cpu_target
         from numba.extending import intrinsic
 
-        return intrinsic(python)
+        made = intrinsic(python)
+        cast(Any, cpu_target).typing_context.refresh()  # it is known from here on
+        return made
 
     return Compiled(generator, compiler)
 

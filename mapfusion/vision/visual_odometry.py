@@ -38,8 +38,6 @@ _SIZE = 6  # degrees of freedom: translation and rotation
 # Damping, as a share of the diagonal of the normal matrix: unobservable directions (a rotation
 # about the line through all points) keep their value. Rounding errors are far below this share.
 _DAMPING = 1e-10
-# Median of the squared Mahalanobis distances of correct links.
-_MEDIAN_SQUARE = chi_square_bound(0.5, 3)
 
 
 @dataclass(frozen=True)
@@ -108,10 +106,10 @@ def estimate_rigid_motion(
     n_links = int(own.sum())
     if n_links < MIN_LINKS:
         return own, None
-    # The gate lowers the median of the squared distances by less than one percent.
+    # The gate lowers the median of the squared Mahalanobis distances by less than one percent.
     ranked = np.sort(square[best][own])
     median = (ranked[(n_links - 1) // 2] + ranked[n_links // 2]) / 2
-    excess = max(median / _MEDIAN_SQUARE, 1.0)
+    excess = max(median / chi_square_bound(0.5, 3), 1.0)
     covariance = excess * np.linalg.inv(normal[best])
     return own, RigidMotion(T[best], (covariance + covariance.T) / 2, n_links)
 

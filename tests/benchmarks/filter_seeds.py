@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.evaluation.smoothed_robots import path_rmse_m
+from experiments.evaluation.map_errors import path_rmse_m
 from experiments.evaluation.truth import PathTruth
 from experiments.pipeline.stages.pipeline import smoother_parameters
 from experiments.pipeline.stages.smooth import log_until

@@ -17,7 +17,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from scipy.ndimage import map_coordinates
 
-from experiments.pipeline.stages.faces import Walls
+from experiments.pipeline.stages.drive import Walls
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from mapfusion.errors import InputError

@@ -3,7 +3,7 @@
 import importlib
 import sys
 
-from experiments.pipeline.code_version import SOURCE_ROOT
+from experiments.pipeline.stage import SOURCE_ROOT
 from tests.bounds.interpreted import interpret_kernels
 
 

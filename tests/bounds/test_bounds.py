@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 
-from experiments.pipeline.code_version import SOURCE_ROOT
+from experiments.pipeline.stage import SOURCE_ROOT
 
 
 def test_kernels_stay_inside_their_arrays() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import tables
-from experiments.evaluation.result_files import read_provenance
+from experiments.evaluation.tables import read_provenance
 from experiments.pipeline.store import StageFolder, require_undamaged
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.studies.run_tables import find_runs

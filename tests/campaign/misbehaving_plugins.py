@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.pipeline.tables import ESTIMATES, estimate_row, read_rows, write_rows
+from experiments.pipeline.stages.align import estimate_row
+from experiments.pipeline.tables import ESTIMATES, read_rows, write_rows
 from experiments.plugins.discovery import callable_aligner, require_usable
 from experiments.plugins.isolated_process import end_children
 from mapfusion.align.alignment import Status

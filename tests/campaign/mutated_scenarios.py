@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.evaluation.checks import load_checked
+from experiments.evaluation.metrics import load_checked
 from experiments.reports.figures import drawing
 from experiments.scenario.settings import AnyScenario, Simulation
 from experiments.scenario.yaml_files import read_mapping

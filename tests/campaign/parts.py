@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.pipeline.code_version import use_kernel_cache
+from experiments.pipeline.stage import use_kernel_cache
 
 ROOM = 1.1  # of what the bar asks for: shares may fall short of theirs
 

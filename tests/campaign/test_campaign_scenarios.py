@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.evaluation.checks import load_checked
+from experiments.evaluation.metrics import load_checked
 from experiments.scenario.settings import AnyScenario
 from mapfusion.errors import MOST_CHARACTERS, InputError
 from tests.campaign.mutated_scenarios import DRAWN, bomb, complaint, explore

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.plugins.answers import alignment_from_json
+from experiments.plugins.isolated_process import alignment_from_json
 from experiments.plugins.process_main import MethodRunner
 from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences

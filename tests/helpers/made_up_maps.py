@@ -3,8 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.truth import PathTruth
+from experiments.evaluation.truth import EvaluatedRobot, PathTruth
 from experiments.pipeline.tables import RIVALS
 from mapfusion.align.alignment import Status
 from mapfusion.align.correspondences import Correspondences

@@ -10,7 +10,7 @@ import venv
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from experiments.pipeline.code_version import PACKAGES, SOURCE_ROOT
+from experiments.pipeline.stage import PACKAGES, SOURCE_ROOT
 from tests.helpers.waiting import wait_until
 
 # What such a process is told of this one's environment.

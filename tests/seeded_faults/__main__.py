@@ -17,7 +17,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.pipeline.code_version import PACKAGES
+from experiments.pipeline.stage import PACKAGES
 from tests.seeded_faults.faults import ROOT, Fault, all_faults
 
 _COPIED = (*PACKAGES, "tests", "scenarios", "pyproject.toml", "README.md", "CONTRIBUTING.md")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.pipeline.code_version import PACKAGES
+from experiments.pipeline.stage import PACKAGES
 from tests.seeded_faults.faults import ROOT, all_faults
 
 

@@ -1,19 +1,57 @@
-"""Stage: drive all robots in one physical world and write the trajectory."""
+"""Stages `faces` and `drive`: painted walls, and the robots' motion in one physical world."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from experiments.pipeline.stage import Job
-from experiments.pipeline.stages.faces import Walls
+from experiments.pipeline.stage import Job, StageKind
 from experiments.scenario.seeds import generator
 from sim.driver import DriverSettings, Route, drive
+from sim.floorplan import FloorPlan, Wall
+from sim.textures import Texture
 from sim.trajectory import BodySway, Trajectory, write_trajectory
+from sim.world import write_faces
 
-LABEL = "drive the robots"
+Look = tuple[str, bool]  # look of a wall, and True if the wall is mirrored
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Walls as polylines in world metres, all of the same height and thickness."""
+
+    polylines_m: tuple[tuple[tuple[float, float], ...], ...]
+    height_m: float
+    thickness_m: float
+
+    def floor_plan(self, looks: Sequence[Look] | None = None) -> FloorPlan:
+        """Return the simulator's floor plan, with looks if the walls are rendered."""
+        lines = [np.array(line) for line in self.polylines_m]
+        looks = [("", False)] * len(lines) if looks is None else looks
+        size = self.height_m, self.thickness_m
+        each = zip(lines, looks, strict=True)
+        return FloorPlan(tuple(Wall(line, *size, *look) for line, look in each))
+
+
+@dataclass(frozen=True)
+class FacesSettings:
+    """Settings of the painted faces."""
+
+    seed: int
+    walls: Walls
+    looks: tuple[Look, ...]
+    texture: Texture
+
+
+def run_faces(settings: FacesSettings, job: Job) -> None:
+    """Write meshes and textures."""
+    rng = generator(settings.seed, "textures")
+    plan = settings.walls.floor_plan(settings.looks)
+    write_faces(job.output, plan, rng, settings.texture)
+
+
+FACES_STAGE = StageKind("faces", "paint the walls", run_faces)
 TRAJECTORY_FILE = "trajectory.parquet"
-WRITES = (TRAJECTORY_FILE,)
 
 
 @dataclass(frozen=True)
@@ -42,9 +80,12 @@ class DriveSettings:
     body_sway: BodySway
 
 
-def run(settings: DriveSettings, job: Job) -> None:
+def run_drive(settings: DriveSettings, job: Job) -> None:
     """Drive the robots and write the trajectory."""
     write_trajectory(job.output / TRAJECTORY_FILE, drive_robots(settings))
+
+
+DRIVE_STAGE = StageKind("drive", "drive the robots", run_drive, (TRAJECTORY_FILE,))
 
 
 def drive_robots(settings: DriveSettings) -> Trajectory:

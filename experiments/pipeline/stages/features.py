@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
-from experiments.pipeline.stage import Job
+from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.scenario.seeds import generator
 from mapfusion.files import (
@@ -64,7 +64,6 @@ FEATURES = schema(
 _POINT_SLOPE = [f"{name}_per_{axis}" for name in POSITION_FIELDS for axis in "uv"]
 TRUTH = schema("features.truth", 2, float_fields([*POSITION_FIELDS, *_POINT_SLOPE]))
 
-LABEL = "render and find features"
 WRITES = ("truth_{part}.parquet", "features_{part}.parquet")
 
 
@@ -144,6 +143,9 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
     write_table(truth_path, named_columns(TRUTH.names, np.concatenate(truth)), TRUTH)
     write_table(features_path, joined, FEATURES)
     return {"rendering_s": rendering_s}
+
+
+FEATURES_STAGE = StageKind("features", "render and find features", run, WRITES)
 
 
 def render_frame(

@@ -13,8 +13,9 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.pipeline.stage import Job
-from experiments.pipeline.stages import match
+from experiments.pipeline.stage import Job, StageKind
+from experiments.pipeline.stages import align
+from experiments.pipeline.stages.align import alignment_of, correspondences_of
 from experiments.pipeline.stages.slam import RobotFolders, log_as_filtered, stored_maps
 from experiments.pipeline.stages.smooth import (
     log_until,
@@ -29,8 +30,6 @@ from experiments.pipeline.tables import (
     FLOAT,
     INT,
     TEXT,
-    alignment_of,
-    correspondences_of,
     covariances_of,
     fields,
     read_rows,
@@ -55,7 +54,6 @@ from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.smoother.joint_smoothing import AssociatedLog
 from mapfusion.smoother.smooth import SmootherParameters
 
-LABEL = "fuse the maps"
 WRITES = ("landmarks.parquet", "parents.parquet", "motions.parquet", "map.parquet")
 _OF = {"iteration": INT, "component": INT}  # component 1 has the most robots
 LANDMARKS = schema("fuse.landmarks", 1, [*fields(**_OF, count=INT), *point_fields()])
@@ -127,6 +125,9 @@ def run(settings: FuseSettings, job: Job) -> dict[str, float]:
     return times
 
 
+FUSE_STAGE = StageKind("fuse", "fuse the maps", run, WRITES)
+
+
 def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTeam]]:
     """Yield each iteration with the maps to be fused and their alignments."""
     takes_smoothed = make_fuser(settings.fuser).smoothed
@@ -136,7 +137,7 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
     smoothed: dict[str, Mapping[int, LandmarkMap]] = {}
     for name in settings.robots:
         folders = RobotFolders(job.inputs[f"log {name}"], job.inputs[f"slam {name}"])
-        filtered[name] = stored_maps(folders, viewing)
+        filtered[name] = stored_maps(folders, viewing=viewing)
         smoothed[name] = read_smoothed(job.inputs[f"smooth {name}"]) if takes_smoothed else {}
     asked = (name.split(" ") for name in job.inputs)
     alignments = [_Alignments(settings, job, *both) for kind, *both in asked if kind == "aligner"]
@@ -144,27 +145,20 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
         given, recordings = [], list[AssociatedLog | None]()
         for name in settings.robots:
             known = {i: own for i, own in smoothed[name].items() if i <= k}
-            given.append(_at(known or filtered[name], k))
-            recordings.append(_recording(settings, job, name, max(known)) if known else None)
-        maps = [_at(filtered[name], k) for name in settings.robots]
+            given.append(align.latest_at(known or filtered[name], k))
+            if not known:
+                recordings.append(None)
+                continue
+            smooth, slam = (job.inputs[f"{stage} {name}"] for stage in ("smooth", "slam"))
+            log, covariance = log_as_filtered(job.inputs[f"log {name}"], slam)
+            log = log_until(log, max(known), settings.noise_floor_m)
+            landmark = smoothed_owners(smooth, slam, max(known), len(log.observations))
+            path = read_smoothed_path(smooth)[max(known)]
+            smoother = replace(settings.smoother, odometry_covariance=covariance)
+            recordings.append(AssociatedLog(log, landmark, path, smoother))
+        maps = [align.latest_at(filtered[name], k) for name in settings.robots]
         pairs = [pair for each in alignments if (pair := each.at(k)) is not None]
         yield k, GivenTeam(maps, pairs, given, recordings)
-
-
-def _at(maps: Mapping[int, LandmarkMap], iteration: int) -> LandmarkMap:
-    """Return a robot's map at an iteration; its last one if its log ended earlier."""
-    return maps[max(k for k in maps if k <= iteration)]
-
-
-def _recording(settings: FuseSettings, job: Job, name: str, k: int) -> AssociatedLog:
-    """Return the inputs of the smoothed map at iteration k, and the smoothed path."""
-    smooth, slam = (job.inputs[f"{stage} {name}"] for stage in ("smooth", "slam"))
-    log, covariance = log_as_filtered(job.inputs[f"log {name}"], slam)
-    log = log_until(log, k, settings.noise_floor_m)
-    landmark = smoothed_owners(smooth, slam, k, len(log.observations))
-    path = read_smoothed_path(smooth)[k]
-    smoother = replace(settings.smoother, odometry_covariance=covariance)
-    return AssociatedLog(log, landmark, path, smoother)
 
 
 class _Alignments:
@@ -172,8 +166,8 @@ class _Alignments:
 
     def __init__(self, settings: FuseSettings, job: Job, name_a: str, name_b: str) -> None:
         self._a, self._b = (settings.robots.index(name) for name in (name_a, name_b))
-        self._offered = match.read_batches(job.inputs[f"match {name_a} {name_b}"], CORRESPONDENCES)
-        rows = match.read_batches(job.inputs[f"aligner {name_a} {name_b}"], ESTIMATES)
+        self._offered = align.read_batches(job.inputs[f"match {name_a} {name_b}"], CORRESPONDENCES)
+        rows = align.read_batches(job.inputs[f"aligner {name_a} {name_b}"], ESTIMATES)
         self._rows = rows[rows["repetition"] == 0].sort_values("iteration")
 
     def at(self, iteration: int) -> AlignedPair | None:
@@ -232,39 +226,27 @@ def read_fusions(folder: Path, robots: Sequence[str]) -> dict[int, FusedMap]:
     )
     landmarks, *of_robots = (rows[rows["component"] == 1] for rows in tables)
     parents, motions = (rows.assign(robot=rows["robot"].map(place)) for rows in of_robots)
-    found = {}
+    n_robots, found = len(robots), {}
     for k in sorted(motions["iteration"].unique().tolist()):  # a map may have no landmarks
         own, of, moved = (rows[rows["iteration"] == k] for rows in (landmarks, parents, motions))
-        found[k] = _make_fused_map(own, of, moved, len(robots), last)
+        columns = {name: own[name].to_numpy() for name in POSITION_FIELDS + COVARIANCE_FIELDS}
+        origin = np.full(len(own), ABSENT, dtype=np.int64)
+        about = own["count"].to_numpy(np.int32), origin
+        made = LandmarkMap(
+            *points_from(pa.table(columns)), *about, planar=last.planar, name=last.name
+        )
+        parent = np.full((len(own), n_robots), ABSENT)
+        parent[of["landmark"], of["robot"]] = of["parent"]
+        T, covariance = np.full((n_robots, 3), np.nan), np.full((n_robots, 3, 3), np.nan)
+        drift, at = np.full(n_robots, np.nan), moved["robot"].to_numpy()
+        T[at], drift[at] = moved[POSE_FIELDS], moved["drift_sigma_m"]
+        covariance[at] = covariances_of(moved)
+        duplicates, fallback = moved.iloc[0][["duplicate_share", "fallback"]]
+        outcome = float(duplicates), (), str(fallback)
+        found[k] = FusedMap(made, parent, T, covariance, drift, *outcome)
     if found:
         found[k] = replace(found[k], landmarks=last)
     return found
-
-
-def _make_fused_map(
-    landmarks: pd.DataFrame,
-    parents: pd.DataFrame,
-    motions: pd.DataFrame,
-    n_robots: int,
-    last: LandmarkMap,
-) -> FusedMap:
-    """Return the fused map of one iteration from the rows of its tables."""
-    columns = {name: landmarks[name].to_numpy() for name in POSITION_FIELDS + COVARIANCE_FIELDS}
-    origin = np.full(len(landmarks), ABSENT, dtype=np.int64)
-    count = landmarks["count"].to_numpy(np.int32)
-    made = LandmarkMap(
-        *points_from(pa.table(columns)), count, origin, planar=last.planar, name=last.name
-    )
-    of = np.full((len(landmarks), n_robots), ABSENT)
-    of[parents["landmark"], parents["robot"]] = parents["parent"]
-    at = motions["robot"].to_numpy()
-    T, covariance = np.full((n_robots, 3), np.nan), np.full((n_robots, 3, 3), np.nan)
-    drift = np.full(n_robots, np.nan)
-    T[at], drift[at] = motions[POSE_FIELDS], motions["drift_sigma_m"]
-    covariance[at] = covariances_of(motions)
-    said = motions.iloc[0]
-    duplicates, fallback = float(said["duplicate_share"]), str(said["fallback"])
-    return FusedMap(made, of, T, covariance, drift, duplicates, (), fallback)
 
 
 def fused_map_files(folder: Path) -> list[Path]:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from experiments.pipeline.stage import Job
+from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows
 from experiments.scenario.seeds import generator
 from mapfusion.attitude import read_attitude
@@ -36,7 +36,7 @@ from mapfusion.files import (
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance, with_rows
-from mapfusion.viewing import LogSightings, Viewing
+from mapfusion.viewing import LogSightings
 
 _ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))
 _ITERATION = fields(iteration=INT)
@@ -66,7 +66,6 @@ FINDINGS = schema(
 # Path of the most probable particle at each evaluated iteration, from which its map was computed.
 PATHS = schema("slam.paths", 1, [*fields(evaluated=INT), *_ITERATION, *float_fields(POSE_FIELDS)])
 
-LABEL = "FastSLAM"
 WRITES = (
     "snapshots.parquet",
     "associations.parquet",
@@ -108,18 +107,18 @@ def evaluated_iterations(n_frames: int, every: int) -> list[int]:
 def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
     log = read_log(job.inputs["log"])
-    found = check_log(log, settings.filter.motion)
+    checked = check_log(log, settings.filter.motion)
     known = read_odometry_covariance(job.inputs["log"], len(log))
-    log, covariance = without_jumps(log, found.jumps, known)
+    log, covariance = without_jumps(log, checked.jumps, known)
     last = len(log) - 1
     steps = list[dict[str, float]]()
     maps, associations, clouds, paths = _Rows(), _Rows(), _Rows(), _Rows()
     counted = np.empty(0, dtype=np.int64)
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
-    told = covariance, read_attitude(job.inputs["log"], len(log))
+    measured = covariance, read_attitude(job.inputs["log"], len(log))
     filtered = run_log(
-        log, settings.filter, rng, iterations, settings.min_count, *told, viewing=False
+        log, settings.filter, rng, iterations, settings.min_count, *measured, viewing=False
     )
     for frame in filtered:
         k, result = frame.iteration, frame.result
@@ -150,8 +149,11 @@ def run(settings: SlamSettings, job: Job) -> None:
     for file, table_schema, rows in zip(WRITES[:-1], schemas, tables, strict=True):
         write_table(job.output / file, rows, table_schema, evaluated)
     gate = gate_finding(log, counted)
-    findings = [*found.findings, *([] if gate is None else [gate])]
-    write_findings(job.output, findings, found.jumps)
+    findings = [*checked.findings, *([] if gate is None else [gate])]
+    write_findings(job.output, findings, checked.jumps)
+
+
+SLAM_STAGE = StageKind("slam", "FastSLAM", run, WRITES)
 
 
 def write_findings(slam: Path, findings: Sequence[Finding], jumps: Sequence[Jump]) -> None:
@@ -281,7 +283,11 @@ class Snapshots(Mapping[int, LandmarkMap]):
         table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
         about = (column(table, "count"), column(table, "source_observation"))
         self._landmarks = LandmarkMap(*points_from(table), *about)
-        self._rows = _rows(column(table, "iteration"), attributes["iterations"])
+        iteration, evaluated = (
+            column(table, "iteration"),
+            map(int, attributes["iterations"].split(",")),
+        )
+        self._rows = {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in evaluated}
         self._made: dict[int, LandmarkMap] = {}
 
     def __len__(self) -> int:
@@ -294,23 +300,23 @@ class Snapshots(Mapping[int, LandmarkMap]):
         if iteration not in self._made:
             landmarks, log = with_rows(self._landmarks, self._rows[iteration]), self._log
             origin, seen = landmarks.source_observation, log.observations
+            viewing = None
+            if self._viewing:  # along the path from which the map was computed
+                evaluated, poses = self._paths
+                path = poses[slice(*np.searchsorted(evaluated, [iteration, iteration + 1]))]
+                n_seen = int(np.searchsorted(log.iteration, iteration + 1))
+                owner = self.associations.at(iteration, n_seen)
+                viewing = self._sight_lines.viewing(owner, path, origin)
             self._made[iteration] = replace(
                 landmarks,
                 descriptor=None if seen.descriptor is None else seen.descriptor[origin],
                 label=None if seen.label is None else seen.label[origin],
                 planar=log.planar,
                 name=log.robot,
-                viewing=self._viewing_of(iteration, origin) if self._viewing else None,
+                viewing=viewing,
                 calibration=log.calibration,
             )
         return self._made[iteration]
-
-    def _viewing_of(self, iteration: int, origin: np.ndarray) -> Viewing:
-        """Return the viewing evidence along the path from which the map was computed."""
-        evaluated, poses = self._paths
-        log, path = self._log, poses[slice(*np.searchsorted(evaluated, [iteration, iteration + 1]))]
-        n_seen = int(np.searchsorted(log.iteration, iteration + 1))
-        return self._sight_lines.viewing(self.associations.at(iteration, n_seen), path, origin)
 
     @cached_property
     def _sight_lines(self) -> LogSightings:
@@ -327,21 +333,11 @@ class Snapshots(Mapping[int, LandmarkMap]):
         return column(table, "evaluated"), columns(table, POSE_FIELDS)
 
 
-def stored_maps(folders: RobotFolders, viewing: bool = True) -> Snapshots:
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def stored_maps(folders: RobotFolders, *, viewing: bool) -> Snapshots:
     """Return a robot's maps, with or without viewing evidence.
 
     Maps of a few robots stay in memory, because several stages read them. The name of their folder
     depends on the content of the log.
     """
-    return _stored_maps(folders, viewing)
-
-
-@functools.lru_cache(maxsize=ROBOTS_KEPT)
-def _stored_maps(folders: RobotFolders, viewing: bool) -> Snapshots:
     return Snapshots(folders.slam, read_log(folders.log), viewing)
-
-
-def _rows(iteration: np.ndarray, evaluated: str) -> dict[int, slice]:
-    """Return the rows of each evaluated iteration."""
-    known = map(int, evaluated.split(","))
-    return {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in known}

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from experiments.pipeline.stage import Job
+from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages.slam import (
     Associations,
     evaluated_iterations,
@@ -45,7 +45,6 @@ PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIEL
 # Observations whose landmark differs from that of the filter.
 PARTED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
 
-LABEL = "smooth the logs"
 WRITES = ("parted_{part}.parquet", "path_{part}.parquet")
 # Further files of a smoothed log; `PATH` tells if it was smoothed.
 _MAP_FILES = (
@@ -109,6 +108,9 @@ def run(settings: SmoothSettings, job: Job) -> None:
     write_table(_path_path(job.output, job.part), rows, PATH, attributes)
 
 
+SMOOTH_STAGE = StageKind("smooth", "smooth the logs", run, WRITES)
+
+
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:
     """Return a log up to an iteration, with the filter's covariances of observations."""
     part = first_frames(log, iteration + 1)
@@ -137,7 +139,7 @@ def smooth_log(
     If the log cannot be smoothed, the map is None and the path is empty.
     """
     try:
-        found = smooth(log, landmark, path, settings.smoother, settings.max_memory_gb)
+        smoothed_log = smooth(log, landmark, path, settings.smoother, settings.max_memory_gb)
     except MemoryError as error:
         reason = f"smoothing {error}: smooth.max_memory_gb is {settings.max_memory_gb:g}"
     except np.linalg.LinAlgError as error:
@@ -146,10 +148,10 @@ def smooth_log(
             "slam.filter.motion states of its odometry, differ by too many orders of magnitude"
         )
     else:
-        ended = (found.n_steps, *found.tails, found.observation_scale, "")
+        ended = (smoothed_log.n_steps, *smoothed_log.tails, smoothed_log.observation_scale, "")
         try:
-            made = smoothed_map(log, found, attitude=attitude)
-            return made, found.estimate.path, found.landmark, ended
+            made = smoothed_map(log, smoothed_log, attitude=attitude)
+            return made, smoothed_log.estimate.path, smoothed_log.landmark, ended
         except np.linalg.LinAlgError:
             reason = "has a map whose covariance cannot be computed"
     return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, reason)

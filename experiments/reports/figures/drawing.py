@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from experiments.evaluation.tables import table_path
-from experiments.pipeline.code_version import imported_sources, library_versions, source_hash
+from experiments.pipeline.stage import imported_sources, library_versions, source_hash
 from experiments.pipeline.workers import Workers, workers
 from mapfusion.files import read_json, write_json, write_whole
 

@@ -18,7 +18,7 @@ from matplotlib.ticker import (
 )
 
 from experiments.evaluation.criteria import ANSWERABLE_PAIRS, ORACLE
-from experiments.evaluation.fused_map_errors import FILTERED, FUSED, SMOOTHED
+from experiments.evaluation.map_errors import FILTERED, FUSED, SMOOTHED
 from experiments.evaluation.tables import UNKNOWN
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, of_pair
 from experiments.reports.figures.style import (

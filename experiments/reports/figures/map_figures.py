@@ -18,7 +18,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from experiments.evaluation.loop_closures import WINDOW_FRAMES, loop_closures
-from experiments.pipeline.tables import unpacked
+from experiments.pipeline.stages.align import unpacked
 from experiments.reports.figures import floor_plan as plan
 from experiments.reports.figures.result_tables import (
     FusedPairs,

@@ -14,8 +14,7 @@ import pyarrow as pa
 from PIL import Image
 
 from experiments.evaluation.criteria import methods_in
-from experiments.evaluation.result_files import read_scenario, read_world
-from experiments.evaluation.tables import ALL, read, table_path
+from experiments.evaluation.tables import ALL, read, read_scenario, read_world, table_path
 from experiments.reports.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
 from mapfusion.align.alignment import Status
 from mapfusion.errors import DamagedFileError, InputError

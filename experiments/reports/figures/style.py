@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogFormatter
 
 from experiments.evaluation.criteria import ORACLE
-from experiments.evaluation.fused_map_errors import FILTERED, SMOOTHED
+from experiments.evaluation.map_errors import FILTERED, SMOOTHED
 from mapfusion.fusion.fusers import REFERENCE
 
 PAGE_WIDTH_IN = 7.2  # two columns of a journal page

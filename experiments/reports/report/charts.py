@@ -363,7 +363,8 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
         return None
     n_rows = len(curves)  # over the whole width, so that intervals do not overlap
     figure = make_subplots(n_rows, 1, vertical_spacing=0.28 / n_rows)
-    for place, each in enumerate(curves):
+    panel: Any
+    for panel, each in enumerate(curves, start=1):
         bins = np.arange(len(each["bins"]))
         for number, (name, style) in enumerate(styles.items()):
             own = each["aligners"][name]
@@ -380,18 +381,18 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
                 customdata=list(zip(rounded(low), rounded(high), own["n"], strict=True)),
                 name=shown,
                 legendgroup=name,
-                showlegend=place == 0,
+                showlegend=panel == 1,
                 mode="markers",
                 marker={"size": 8, "symbol": style["marker"], "color": style["hex"]},
                 error_y=interval | {"color": faint(style["hex"], 0.6)},
                 hovertemplate=f"{shown}: {hover}%{{customdata[2]}} maps<extra></extra>",
             )
-            figure.add_trace(trace, place + 1, 1)
+            figure.add_trace(trace, panel, 1)
         ticks = {"tickvals": bins.tolist(), "ticktext": each["bins"], "showgrid": False}
         ticks |= {"range": [-0.5, len(bins) - 0.5]}
-        figure.update_xaxes(**ticks, title_text=each["label"], row=place + 1)
+        figure.update_xaxes(**ticks, title_text=each["label"], row=panel)
         for edge in bins[1:] - 0.5:
-            figure.add_vline(edge, line_width=1, line_color=faint(NEUTRAL), row=place + 1)
+            figure.add_vline(edge, line_width=1, line_color=faint(NEUTRAL), row=panel)
     figure.update_yaxes(range=[-3, 103], ticksuffix=" %", title_text="correct")
     return figure.update_layout(height=60 + 270 * n_rows, hovermode="closest")
 

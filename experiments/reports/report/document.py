@@ -15,18 +15,18 @@ from PIL import Image
 from ruamel.yaml import YAML
 
 from experiments.evaluation import criteria, metrics, tables
-from experiments.evaluation.checks import Outcome
 from experiments.evaluation.criteria import (
     methods_in,
+    path_rms,
     setting_columns,
     with_common_ground_at_any_time,
 )
 from experiments.evaluation.evaluated_run import finding_row_lines
-from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.map_consistency import GROSS_M
-from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.metrics import Outcome
 from experiments.evaluation.result import require_result
-from experiments.evaluation.result_files import read_provenance
+from experiments.evaluation.tables import read_provenance
 from experiments.reports import formatting
 from experiments.reports.export import write_text
 from experiments.reports.figures.drawing import FIGURES, caption

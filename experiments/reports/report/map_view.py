@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 
-from experiments.pipeline.tables import unpacked
+from experiments.pipeline.stages.align import unpacked
 from experiments.reports.figures.floor_plan import LEVEL_TEXT, semi_axes
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.reports.figures.style import ORANGE

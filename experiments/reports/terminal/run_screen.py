@@ -12,27 +12,27 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.evaluation import tables
-from experiments.evaluation.checks import CheckedScenario
 from experiments.evaluation.criteria import (
     ANSWERABLE_PAIRS,
     ORACLE,
     answerable,
     at_the_end,
     has_common_ground,
+    is_used_by_team,
     merged_robots,
     methods_in,
+    path_rms,
     right_refined,
     summarise_alignments,
 )
-from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.map_consistency import GROSS_M
-from experiments.evaluation.path_errors import path_rms
+from experiments.evaluation.map_errors import last_fused
+from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.result import renderer
 from experiments.evaluation.result_files import read_provenance
 from experiments.evaluation.run_plan import RunPlan
 from experiments.evaluation.single_steps import MergeResult, final_status
 from experiments.evaluation.tables import SHOWN
-from experiments.evaluation.team_errors import is_used_by_team
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
 from experiments.reports.formatting import listed, metres, percent, radians, two_digits

@@ -16,7 +16,7 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_M,
     RIGHT_WITHIN_RAD,
 )
-from experiments.evaluation.odometry_calibration import filter_settings
+from experiments.evaluation.single_steps import filter_settings
 from experiments.reports.formatting import interval, two_digits
 from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
 from experiments.reports.terminal.layout import (

@@ -113,7 +113,7 @@ def test_ctrl_c_before_the_command_starts(
     def press() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("experiments.pipeline.code_version.use_kernel_cache", press)
+    monkeypatch.setattr("experiments.pipeline.stage.use_kernel_cache", press)
     reply = command(capsys, "scenarios", "--schema")
     assert reply.code == 130
     assert len(reply.err.splitlines()) == 1

@@ -109,8 +109,16 @@ def test_completed_names_are_those_that_commands_take() -> None:
     }
 
 
-def test_help_needs_no_library_that_computes() -> None:
-    slow = "('numpy', 'numba', 'scipy', 'pandas', 'cv2', 'matplotlib', 'pydantic')"
-    code = f"import sys, experiments.cli.main; print([m for m in {slow} if m in sys.modules])"
+@pytest.mark.parametrize(
+    ("module", "slow"),
+    [
+        ("experiments.cli.main", "numpy numba scipy pandas cv2 matplotlib pydantic"),
+        ("experiments.scenario.suite, sim.plan_generator", "numba scipy pandas cv2 pyarrow"),
+        ("experiments.reports.inspect", "numba scipy.linalg pandas cv2 mapfusion.vision"),
+        ("experiments.scenario.loading", "numba scipy.special scipy.linalg pandas matplotlib"),
+    ],
+)
+def test_a_command_imports_no_library_that_it_does_not_use(module: str, slow: str) -> None:
+    code = f"import sys, {module}; print([m for m in {slow.split()} if m in sys.modules])"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == "[]"

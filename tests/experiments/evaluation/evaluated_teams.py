@@ -1,8 +1,7 @@
 """Drawn maps of several robots with their truth, fused and ready to be judged."""
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot
-from experiments.evaluation.fused_map_errors import EvaluatedFusion, GivenMap
-from experiments.evaluation.truth import PathTruth
+from experiments.evaluation.map_errors import EvaluatedFusion, GivenMap
+from experiments.evaluation.truth import EvaluatedRobot, PathTruth
 from mapfusion.fusion.fusers import MergeParameters, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.robot_log import RobotTruth

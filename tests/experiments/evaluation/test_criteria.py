@@ -7,9 +7,8 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation import criteria, tables
-from experiments.evaluation.checks import CheckedScenario, check_all, load_checked
 from experiments.evaluation.criteria import nothing_merged, summarise_alignments
-from experiments.evaluation.metrics import USED_TABLES
+from experiments.evaluation.metrics import USED_TABLES, CheckedScenario, check_all, load_checked
 from mapfusion.errors import InputError
 from tests.helpers.made_up_runs import complete, many_errors
 from tests.helpers.tiny_scenario import TINY, command

@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import chi2
 
 from experiments.evaluation import tables
-from experiments.evaluation.alignment_errors import EvaluatedRobot, MapPair, join_map_pairs
 from experiments.evaluation.fused_landmarks import (
     FusedTeam,
     MergeSettings,
@@ -20,7 +19,8 @@ from experiments.evaluation.fused_landmarks import (
     map_fit_rows,
     mean_nees_band,
 )
-from experiments.pipeline.tables import estimate_row, unpacked
+from experiments.evaluation.truth import EvaluatedRobot, MapPair, join_map_pairs
+from experiments.pipeline.stages.align import estimate_row, unpacked
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.fusion.aligned_landmarks import ABSENT

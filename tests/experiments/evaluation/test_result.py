@@ -43,7 +43,7 @@ def test_maps_of_a_result_tell_from_where_their_landmarks_were_seen(
 ) -> None:
     run = EvaluatedRun.of(tiny, Store.of(tiny_results))
     for robot in run.pipeline.robots:
-        stored = stored_maps(run.robot_folders(robot))[robot.n_frames - 1].viewing
+        stored = stored_maps(run.robot_folders(robot), viewing=True)[robot.n_frames - 1].viewing
         told = read_map(tiny_results / "tiny-3" / "maps" / f"{robot.name}.parquet").viewing
         assert stored is not None
         assert told is not None

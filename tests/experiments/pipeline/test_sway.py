@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.pair_evaluation import load_robot
-from experiments.evaluation.truth import fit_rmse_m
+from experiments.evaluation.truth import fit_rmse_m, load_robot
 from experiments.pipeline.store import Store
 from experiments.scenario.loading import load_scenario
 from mapfusion.attitude import read_attitude

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mapfusion
-from experiments.evaluation.checks import CheckedScenario, Outcome
+from experiments.evaluation.metrics import CheckedScenario, Outcome
 from experiments.reports import export
 from experiments.reports.export import write_junit
 from experiments.scenario.settings import Bound

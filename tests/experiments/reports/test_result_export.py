@@ -16,7 +16,7 @@ from evo.core.metrics import APE, PoseRelation
 from evo.tools.file_interface import read_kitti_poses_file, read_tum_trajectory_file
 
 from experiments.evaluation import tables
-from experiments.pipeline.tables import alignment_of
+from experiments.pipeline.stages.align import alignment_of
 from experiments.reports import result_export
 from experiments.reports.figures.result_tables import ResultTables, of_pair
 from mapfusion.geometry import se2

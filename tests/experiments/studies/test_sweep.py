@@ -199,7 +199,7 @@ def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
     short_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two workers need 0.3 GB each before they begin; other machines have what they have."""
-    monkeypatch.setattr("experiments.pipeline.stages.memory.memory_bytes", lambda: 0.6e9)
+    monkeypatch.setattr("experiments.pipeline.stages.pipeline.memory_bytes", lambda: 0.6e9)
     asked = prepare([short_path], [0], [], tmp_path)
     (reason,) = execute(asked, 2, None, lambda _: None).failed.values()
     assert "in each of 2 processes (--jobs 1 needs least), this machine has 0.6 GB" in reason

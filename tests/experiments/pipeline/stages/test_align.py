@@ -1,9 +1,10 @@
-"""Tests of `experiments.pipeline.tables`."""
+"""Tests of `experiments.pipeline.stages.align`."""
 
 import numpy as np
 import pandas as pd
 
-from experiments.pipeline.tables import at_iteration, evidence_of, rival_rows
+from experiments.pipeline.stages.align import evidence_of, rival_rows
+from experiments.pipeline.tables import at_iteration
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import match
 from mapfusion.verification.verdict import Verifier

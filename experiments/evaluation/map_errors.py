@@ -1,4 +1,4 @@
-"""Errors and coverage of fused maps: the tables `fusers` and `fuser_coverage`.
+"""Errors of smoothed and fused maps: the tables `smoother`, `fusers` and `fuser_coverage`.
 
 The true point of a fused landmark is the mean of the true points of its parents. `map_consistency`
 defines gross landmarks, which are left out, and consistency.
@@ -9,30 +9,156 @@ probability shows an overconfident map, one above it a conservative map.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.alignment_errors import EvaluatedRobot, alignment_nees
+from experiments.evaluation.alignment_errors import alignment_nees
 from experiments.evaluation.fused_landmarks import FusedTeam
 from experiments.evaluation.map_consistency import (
     Consistency,
     FittedMap,
     consistencies,
     fit_to_truth,
+    relative_consistency,
     rmse,
 )
-from experiments.evaluation.smoothed_robots import SmoothedRobot
-from experiments.evaluation.truth import degrees_of_freedom
+from experiments.evaluation.truth import (
+    EvaluatedRobot,
+    degrees_of_freedom,
+    landmark_truth,
+    motion_errors,
+    truth_or_unknown,
+)
+from experiments.pipeline.stages.slam import RobotFolders, final_path
+from experiments.pipeline.stages.smooth import (
+    read_endings,
+    read_smoothed,
+    read_smoothed_path,
+    smoothed_owners,
+)
+from mapfusion.files import POSE_FIELDS, named_columns
 from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import FusedMap, Fusion
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import RobotLog
+
+
+@dataclass(frozen=True)
+class SmoothedRobot:
+    """Smoothed maps and paths of a robot, by iteration, with the truth.
+
+    Attributes:
+        robot: maps of the filter, and true path.
+        filter_path: path of the filter at the end, shape (T, 3).
+        maps: smoothed maps; only the last one has its joint covariance.
+        points_world_m: true points of each map, shape (N, 3), NaN where unknown.
+        paths: smoothed paths until each iteration k, shape (k + 1, 3).
+        ending: convergence of the smoother at the last iteration.
+        not_smoothed: reasons by iteration where smoothing failed.
+    """
+
+    robot: EvaluatedRobot
+    filter_path: Float
+    maps: dict[int, LandmarkMap]
+    points_world_m: dict[int, Float]
+    paths: dict[int, Float]
+    ending: dict[str, Any]
+    not_smoothed: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def last_path(self) -> Float:
+        """Smoothed path of the whole log, shape (T, 3); NaN if smoothing failed."""
+        unknown = np.full_like(self.filter_path, np.nan)
+        return self.paths.get(len(self.filter_path) - 1, unknown)
+
+    def given_at(self, iteration: int) -> tuple[int | None, str]:
+        """Return the iteration of the smoothed map that a fuser is given at an iteration.
+
+        Returns:
+            The iteration of the last smoothed map until then, or None: the fuser is given the
+            filter's map. And the reason if smoothing failed at the iteration; else empty.
+        """
+        at = max((k for k in self.maps if k <= iteration), default=None)
+        lacking = max((k for k in self.not_smoothed if k <= iteration), default=-1)
+        if (at is not None and at > lacking) or lacking < 0:
+            return at, ""
+        instead = "FastSLAM's map" if at is None else f"its map until frame {at}"
+        return at, f"{self.not_smoothed[lacking]}; {instead} stands in"
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of the table `smoother`: last map and whole path."""
+        robot, last = self.robot, len(self.filter_path) - 1
+        path_m, filter_m = (
+            path_rmse_m(path, robot.path.T_map_robot) for path in (self.last_path, self.filter_path)
+        )
+        row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
+        row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | self.ending
+        row["not_smoothed"] = self.given_at(last)[1]
+        of_filter = fit_to_truth(robot.maps[last], robot.points_world_m[last])
+        row |= {
+            "filter_landmark_rmse_m": of_filter.rmse_m,
+            "filter_gross_share": of_filter.gross_share,
+        }
+        if last not in self.maps:
+            return row | {"n_landmarks": 0}
+        landmarks = self.maps[last]
+        fit = fit_to_truth(landmarks, self.points_world_m[last])
+        row |= {"landmark_rmse_m": fit.rmse_m, "gross_share": fit.gross_share}
+        row |= {"n_landmarks": len(landmarks)}
+        consistency = relative_consistency(landmarks, fit)
+        names = ("nees_per_dof", "marginal_nees_per_dof", "coverage_95")
+        return row | {name: getattr(consistency, name) for name in names}
+
+
+def load_smoothed(
+    robot: EvaluatedRobot, folders: RobotFolders, log: RobotLog, smooth: Path
+) -> SmoothedRobot:
+    """Load a robot's smoothed maps and paths with the truth; NaN where unknown.
+
+    Args:
+        robot: maps of the filter, and true path.
+        folders: folders of its log and of the stage `slam`.
+        log: its log.
+        smooth: folder of the stage `smooth`.
+    """
+    truth, maps = truth_or_unknown(folders.log, log), read_smoothed(smooth, last_whole=True)
+    points = landmark_truth(truth, partial(smoothed_owners, smooth, folders.slam), maps)
+    endings = read_endings(smooth)
+    reasons = dict(zip(endings["iteration"].tolist(), endings["not_smoothed"], strict=True))
+    not_smoothed = {k: str(why) for k, why in reasons.items() if why}
+    ending = {str(name): value for name, value in endings.to_dict("records")[-1].items()}
+    path, paths = final_path(folders.slam), read_smoothed_path(smooth)
+    return SmoothedRobot(robot, path, maps, points, paths, ending, not_smoothed)
+
+
+def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
+    """Return the rows of the table `smoothed_paths`."""
+    rows = [
+        pd.DataFrame(named_columns(POSE_FIELDS, path)).assign(
+            robot=each.robot.name, iteration=k, frame=np.arange(len(path))
+        )
+        for each in smoothed
+        for k, path in each.paths.items()
+    ]
+    return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
+
+
+def path_rmse_m(path: Float, truth: Float) -> float:
+    """Return the RMS position error without a fit; NaN if no pose is known in both paths."""
+    known = np.isfinite(path).all(axis=1) & np.isfinite(truth).all(axis=1)
+    if not known.any():
+        return np.nan
+    error_m = np.linalg.norm(path[known, :2] - truth[known, :2], axis=1)
+    return float(np.sqrt(np.mean(error_m**2)))
+
 
 _MOTION_FIGURES = ("alignment_error_m", "alignment_error_rad")
 _MOTION_FIGURES += ("alignment_sigma_m", "alignment_sigma_rad", "alignment_nees_per_dof")
@@ -192,17 +318,13 @@ class EvaluatedFusion:
     def _motion_errors(self) -> dict[str, float]:
         """Return median errors, standard deviations and NEES of the motions of the robots' maps."""
         first, *others = self.fusion.members
-        errors = []
+        T_world_first, errors = self.given[first].robot.path.T_world_map, []
         for k in others:
-            T_true = se2.between(
-                self.given[first].robot.path.T_world_map, self.given[k].robot.path.T_world_map
-            )
-            error = self.fusion.T_first_map[k] - T_true
-            error[2] = se2.wrap(error[2])
-            covariance = self.fusion.motion_covariance[k]
-            nees = alignment_nees(self.fusion.T_first_map[k], covariance, T_true)
-            sigma = se2.motion_sigma(covariance)
-            errors.append([np.hypot(error[0], error[1]), abs(error[2]), *sigma, nees / 3])
+            T_true = se2.between(T_world_first, self.given[k].robot.path.T_world_map)
+            T, covariance = self.fusion.T_first_map[k], self.fusion.motion_covariance[k]
+            error_m, error_rad = motion_errors(T, T_true)
+            nees = alignment_nees(T, covariance, T_true)
+            errors.append([error_m, abs(error_rad), *se2.motion_sigma(covariance), nees / 3])
         medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
         return dict(zip(_MOTION_FIGURES, medians.tolist(), strict=True))
 
