@@ -233,15 +233,12 @@ def _lead(of: TablesOfRun) -> float:
     return _ratio(min(others), of.errors_of("ransac").median())
 
 
-def _by_iteration(of: TablesOfRun, aligner: str, column: str = "translation_error_m") -> pd.Series:
-    """Return the median over robot pairs at each iteration; pairs without answer are infinite."""
-    rows = of.maps[of.maps["aligner"] == aligner]
-    return rows.assign(error=rows[column].abs()).groupby("iteration")["error"].median()
-
-
 def _change(aligner: str, first: int, last: int) -> Measure:
+    """Return the error at the last iteration over that at the first, medians over robot pairs."""
+
     def of_run(of: TablesOfRun) -> float:
-        errors = _by_iteration(of, aligner)
+        rows = of.maps[of.maps["aligner"] == aligner]
+        errors = rows.groupby("iteration")["translation_error_m"].median()
         before, after = (errors.iloc[int(np.argmin(abs(errors.index - k)))] for k in (first, last))
         return _ratio(float(after), float(before))
 
