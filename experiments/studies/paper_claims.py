@@ -30,8 +30,8 @@ from experiments.evaluation.criteria import (
     right_refined,
     summarise_alignments,
 )
-from experiments.evaluation.fused_map_errors import last_fused
 from experiments.evaluation.loop_closures import WINDOW_FRAMES, LoopClosure, loop_closures
+from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import repetition_spread_m
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields
 from experiments.scenario.seeds import generator
