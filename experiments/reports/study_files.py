@@ -373,7 +373,8 @@ def claims_table(values: pd.DataFrame) -> pd.DataFrame:
     for _, own in values.groupby("name", sort=False):
         first = own.iloc[0]
         row = {"claim": f"{first['claim']} ({first['where']})", "measure": first["measure"]}
-        for of in own.to_dict("records"):
+        records: Any = own.to_dict("records")
+        for of in records:
             row[f"{of['scenario']}, {of['renderer']}"] = claim_text(of)
         rows.append(row | {"why": first["why"]})
     return pd.DataFrame(rows)

@@ -130,6 +130,11 @@ def _ratio(over: float, under: float) -> float:
     return over / under
 
 
+def _known_median(values: Sequence[float]) -> float:
+    """Return the median of the values that are not NaN; NaN if there are none."""
+    return float(pd.Series(values, dtype=np.float64).median())
+
+
 def _rank_correlation(x: pd.Series, y: pd.Series) -> float:
     """Return Spearman's rank correlation; NaN if one of the two is constant."""
     a, b = x.rank().to_numpy(), y.rank().to_numpy()
@@ -164,12 +169,11 @@ def _growth(of: TablesOfRun) -> float:
         end = first_of.get(str(robot), int(k.max()))
         later = spread[(k > _FIRST_FRAMES) & (k < end)].median()
         ratios.append(_ratio(later, spread[k.between(1, _FIRST_FRAMES)].median()))
-    return float(np.nanmedian(ratios))
+    return _known_median(ratios)
 
 
 def _fall(of: TablesOfRun) -> float:
-    falls = [_ratio(each.after_m, each.before_m) for each in _closures(of)]
-    return float(np.nanmedian(falls)) if falls else math.nan
+    return _known_median([_ratio(each.after_m, each.before_m) for each in _closures(of)])
 
 
 def _effective_particles(of: TablesOfRun) -> float:
@@ -178,7 +182,7 @@ def _effective_particles(of: TablesOfRun) -> float:
 
 def _sigma_m(rows: pd.DataFrame) -> pd.Series:
     """Return the root of the trace of the landmarks' covariances."""
-    return np.sqrt(rows[["cov_xx_m2", "cov_yy_m2", "cov_zz_m2"]].sum(axis=1))
+    return rows[["cov_xx_m2", "cov_yy_m2", "cov_zz_m2"]].sum(axis="columns").pow(0.5)
 
 
 def _sigma_by_sightings(of: TablesOfRun) -> float:
@@ -229,17 +233,14 @@ def _lead(of: TablesOfRun) -> float:
     return _ratio(min(others), of.errors_of("ransac").median())
 
 
-def _by_iteration(of: TablesOfRun, aligner: str, column: str = "translation_error_m") -> pd.Series:
-    """Return the median over robot pairs at each iteration; pairs without answer are infinite."""
-    rows = of.maps[of.maps["aligner"] == aligner]
-    return rows.assign(error=rows[column].abs()).groupby("iteration")["error"].median()
-
-
 def _change(aligner: str, first: int, last: int) -> Measure:
+    """Return the error at the last iteration over that at the first, medians over robot pairs."""
+
     def of_run(of: TablesOfRun) -> float:
-        errors = _by_iteration(of, aligner)
-        at = [errors.index[np.argmin(np.abs(errors.index.to_numpy() - k))] for k in (first, last)]
-        return _ratio(float(errors[at[1]]), float(errors[at[0]]))
+        rows = of.maps[of.maps["aligner"] == aligner]
+        errors = rows.groupby("iteration")["translation_error_m"].median()
+        before, after = (errors.iloc[int(np.argmin(abs(errors.index - k)))] for k in (first, last))
+        return _ratio(float(after), float(before))
 
     return of_run
 

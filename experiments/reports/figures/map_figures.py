@@ -376,10 +376,10 @@ def draw_aligned_maps(data: ResultTables) -> Figure:
     overview.plot(*middle, "o", markeredgewidth=1.2, **ring)
     inward = np.sign([(low_x + high_x) / 2, (low_y + high_y) / 2] - middle)
     box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "linewidth": 0.6}
-    label: dict[str, Any] = {"xytext": tuple(28 * inward), "textcoords": "offset points"}
-    label |= {"ha": "center", "va": "center", "bbox": box, "zorder": 7}
+    beside: dict[str, Any] = {"xytext": tuple(28 * inward), "textcoords": "offset points"}
+    beside |= {"ha": "center", "va": "center", "bbox": box, "zorder": 7}
     line = {"arrowstyle": "-", "linewidth": 0.8, "shrinkB": 6}
-    overview.annotate("enlarged", xy=(middle[0], middle[1]), arrowprops=line, **label)
+    overview.annotate("enlarged", xy=(middle[0], middle[1]), arrowprops=line, **beside)
     overview.set_title(f"{len(fused)} landmarks in both maps, aligned")
     cut = f", without {part.n_cut} on its rim" if part.n_cut else ""
     zoom.set_title(f"{part.whole.sum()} of them, enlarged: a square of {100 * side:.2g} cm{cut}")
