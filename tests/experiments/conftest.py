@@ -94,4 +94,4 @@ def quick_save(monkeypatch: pytest.MonkeyPatch) -> None:
         Image.new("L", (1, 1)).save(one_pixel, "png")
         return one_pixel.getvalue()
 
-    monkeypatch.setattr(drawing, "_picture", picture)
+    monkeypatch.setattr(drawing, "_rendered", picture)

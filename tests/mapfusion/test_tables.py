@@ -55,7 +55,7 @@ def test_without_heights_a_map_is_planar(tmp_path, rng):
     assert not landmarks.position_m[:, 2].any()
     assert read_map(write(frame.assign(z_score=1.0), tmp_path / "m.parquet")).planar
     write(frame.assign(z_m=0.0), tmp_path / "m.parquet")
-    with pytest.raises(InputError, match=r"no column cov_xz_m2, .*, cov_zz_m2; .*formats\.md"):
+    with pytest.raises(InputError, match=r"no column cov_xz_m2, .*, cov_zz_m2; .*docs formats"):
         read_map(tmp_path / "m.parquet")
 
 

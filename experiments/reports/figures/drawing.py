@@ -332,6 +332,13 @@ def caption(name: str, folder: Path) -> str:
     return own or _REGISTRY[name].caption
 
 
+def _rendered(figure: Figure, kind: str) -> bytes:
+    """Return the bytes of a figure as "png" or "svg"; tests replace this slow step."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format=kind, dpi=_DPI[kind], **_SAVED[kind])
+    return stream.getvalue()
+
+
 def save_figure(
     folder: Path, name: str, draw: Callable[..., Figure], *data: Any, caption: str = ""
 ) -> list[Path]:
@@ -369,8 +376,6 @@ def save_figure(
         with matplotlib.rc_context({"figure.constrained_layout.use": False}):
             figure.set_layout_engine(None)
             for file, kind in zip(files, _DPI, strict=True):
-                stream = io.BytesIO()
-                figure.savefig(stream, format=kind, dpi=_DPI[kind], **_SAVED[kind])
-                picture = stream.getvalue()
+                picture = _rendered(figure, kind)
                 write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
     return files

@@ -53,8 +53,12 @@ def test_an_option_means_the_same_everywhere() -> None:
         for parameter in each.params:
             if isinstance(parameter, typer.core.TyperOption) and name != "sweep":
                 helps.setdefault(parameter.opts[0], set()).add(parameter.help or "")
-    # what is written differs, that it is written does not; pairs are counted in both
-    assert {name for name, texts in helps.items() if len(texts) > 1} <= {"--output", "--pairs"}
+    # what is written differs, that it is written does not; pairs and trials are counted
+    assert {name for name, texts in helps.items() if len(texts) > 1} <= {
+        "--output",
+        "--pairs",
+        "--trials",
+    }
     for name in ("run", "check", "sweep"):
         options = {option for each in all_commands()[name].params for option in each.opts}
         assert {"--results", "--set", "--jobs", "--output", "-o"} <= options

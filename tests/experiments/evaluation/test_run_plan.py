@@ -47,6 +47,6 @@ def test_work_grows_with_frames_and_processes_share_it(tiny_path: Path, tmp_path
 
 
 def test_too_much_memory_is_refused(tiny_path: Path, tmp_path: Path) -> None:
-    greedy = load_scenario(tiny_path, ["slam.filter.n_particles=100000"])
+    greedy = load_scenario(tiny_path, ["slam.filter.n_particles=10000"])
     with pytest.raises(InputError, match="machine has"):
         plan_run(greedy, tmp_path, 4000)

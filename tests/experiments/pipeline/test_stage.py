@@ -281,6 +281,8 @@ BUILDS_ON = {
     "impicp": {"icp"},
     "ransac": {"ransac_mahalanobis"},
     "clique": set(OWN_METHODS),
+    "opencv": {"kiss_matcher"},  # one module of methods of other libraries
+    "kiss_matcher": {"opencv"},
 }
 
 

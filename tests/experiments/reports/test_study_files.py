@@ -46,7 +46,9 @@ def test_screen_files_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert {f"{name}.csv", f"{name}.md", f"{name}.tex"} <= names
     picture = matplotlib.image.imread(tmp_path / "out/figures/fig04_translation_error.png")
     assert picture.std() > 0.05
-    assert len(list((tmp_path / "out/figures").iterdir())) == 6
+    assert (
+        len(list((tmp_path / "out/figures").iterdir())) == 9
+    )  # three figures, each as PNG, SVG and caption
 
 
 def test_eighty_columns_hold_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

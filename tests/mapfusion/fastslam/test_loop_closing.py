@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
+from mapfusion.fastslam.landmarks import slots_near
 from mapfusion.fastslam.loop_closing import (
     KNOT_SPACING,
     DriftModel,
@@ -315,7 +316,7 @@ def test_landmarks_of_all_particles_move_and_are_found_where_they_are_now(settle
         for s, old, new in zip(which, own, known.mean_m, strict=True):
             np.testing.assert_allclose(new, transform_points(T[s], old[None])[0], atol=1e-12)
             box = np.array([*new[:2], *new[:2]])
-            assert s in maps.near(box)
+            assert s in slots_near(maps.slots, box)
     assert len(slots) == n
 
 

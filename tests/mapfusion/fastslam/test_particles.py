@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.landmarks import BLOCK, FREE, allocate
+from mapfusion.fastslam.landmarks import BLOCK, FREE, allocate, slots_near
 from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
 from mapfusion.fastslam.particles import ParticleMaps, PathHistory
 from mapfusion.fastslam.resampling import MEMORY
@@ -88,7 +88,7 @@ def test_near_finds_the_gates_that_touch_a_box_and_no_freed_slot():
             corner = rng.uniform(-25, 25, 2)
             box = np.concatenate([corner, corner + 10.0 ** rng.uniform(-3, 1.5, 2)])
             touches = np.all((low <= box[2:]) & (high >= box[:2]), axis=1)
-            assert maps.near(box).tolist() == sorted(slots[touches & held].tolist())
+            assert slots_near(maps.slots, box).tolist() == sorted(slots[touches & held].tolist())
 
     assert_found(np.ones(n, dtype=bool))
     maps.resample(np.array([0, 0], dtype=np.int32))
@@ -127,7 +127,7 @@ def test_what_all_particles_have_from_one_ancestor_is_kept_once_and_comes_back()
 
     assert_known(0)
     box = np.array([*seen.point_m[7, 2, :2], *seen.point_m[7, 2, :2]])
-    assert slots[7] in maps.near(box)
+    assert slots[7] in slots_near(maps.slots, box)
     assert maps.bring_up_to_date(slots[::2]).all()
     assert maps.n_rows == n // 2
     assert_known(1)
@@ -143,4 +143,4 @@ def test_a_landmark_takes_a_row_of_76_bytes_a_particle_and_less_than_500_once():
 
 
 def test_without_landmarks_nothing_is_near():
-    assert len(ParticleMaps(2, 9.0).near(np.array([-1.0, -1, 1, 1]))) == 0
+    assert len(slots_near(ParticleMaps(2, 9.0).slots, np.array([-1.0, -1, 1, 1]))) == 0

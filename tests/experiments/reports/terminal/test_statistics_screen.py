@@ -95,7 +95,8 @@ def test_what_got_worse_comes_first_and_all_is_counted(capsys: pytest.CaptureFix
         ("path RMSE, m", "", "ratio", 0.1, 0.2, 2.0, 1.5, 2.5, 0.002, "worse"),
         ("true pairs", "oracle", "ratio", 40.0, 40.0, 1.0, 1.0, 1.0, np.nan, "identical"),
     ]
-    found = VersionComparison(pd.DataFrame(rows, columns=pd.Index(columns)), "run", 9, ("a note",))
+    table = pd.DataFrame(rows, columns=pd.Index(columns)).assign(n_better=[9, 4, 0, 0], n_units=9)
+    found = VersionComparison(table, "run", 9, ("a note",))
     print_comparison(found, show_all=False, written=None)
     lines = said(capsys)
     shown = [line for line in lines if line.startswith(("path RMSE", "icp"))]
