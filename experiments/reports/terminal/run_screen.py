@@ -288,6 +288,7 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
     print_lines(f"  {line}" for line in (*team, *edge_lines(table("team_edges"))))
     drawn = [] if skipped_figures is None else [f"Figures: {result / 'figures'}"]
     print_lines(["   ".join([*drawn, f"Tables: {result / 'tables'}"])])
+    print_lines([f"Images of the cameras: {image_source(result)}"])
     print_skipped(skipped_figures or ())
 
 

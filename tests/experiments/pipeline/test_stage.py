@@ -280,6 +280,7 @@ BUILDS_ON = {
     "icp": {"impicp"},
     "impicp": {"icp"},
     "ransac": {"ransac_mahalanobis"},
+    "ransac_mahalanobis": {"ransac"},
     "clique": set(OWN_METHODS),
     "opencv": {"kiss_matcher"},  # one module of methods of other libraries
     "kiss_matcher": {"opencv"},

@@ -101,8 +101,8 @@ def test_what_got_worse_comes_first_and_all_is_counted(capsys: pytest.CaptureFix
     lines = said(capsys)
     shown = [line for line in lines if line.startswith(("path RMSE", "icp"))]
     assert shown == [
-        "path RMSE, m 0.1 0.2 2.00 (1.50–2.50) worse",
-        "icp success refined 50% 90% +40% (+30 to +50) better",
+        "path RMSE, m 0.1 0.2 2.00 (1.50–2.50) 0 of 9 worse",
+        "icp success refined 50% 90% +40% (+30 to +50) 9 of 9 better",
     ]
     ways = "1 worse, 1 better, 1 no difference beyond noise, 1 identical"
     assert lines[-2:] == [f"9 runs compared in 4 ways: {ways}", "a note"]
