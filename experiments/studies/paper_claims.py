@@ -239,7 +239,8 @@ def _change(aligner: str, first: int, last: int) -> Measure:
     def of_run(of: TablesOfRun) -> float:
         rows = of.maps[of.maps["aligner"] == aligner]
         errors = rows.groupby("iteration")["translation_error_m"].median()
-        before, after = (errors.iloc[int(np.argmin(abs(errors.index - k)))] for k in (first, last))
+        iterations = errors.index.to_numpy()
+        before, after = (errors.iloc[int(np.argmin(np.abs(iterations - k)))] for k in (first, last))
         return _ratio(float(after), float(before))
 
     return of_run

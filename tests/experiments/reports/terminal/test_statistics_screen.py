@@ -108,7 +108,7 @@ def test_what_got_worse_comes_first_and_all_is_counted(capsys: pytest.CaptureFix
     assert lines[-2:] == [f"9 runs compared in 4 ways: {ways}", "a note"]
     assert any("5 % over 3 tests" in line for line in lines)
     print_comparison(found, show_all=True, written=None)
-    assert "oracle true pairs 40 40 same" in said(capsys)
+    assert "oracle true pairs 40 40 0 of 9 same" in said(capsys)
 
 
 def test_many_runs_in_few_worlds_are_a_caveat(capsys: pytest.CaptureFixture[str]) -> None:
