@@ -131,7 +131,7 @@ def read_kitti(folder: Path, settings: KittiSettings, _: ReadYaml) -> StereoReco
             line.
     """
     time_file = folder / "times.txt"
-    taken_ns, *_ = read_time_series(time_file, "times of a KITTI sequence", "time", NS)
+    taken_ns = read_time_series(time_file, "times of a KITTI sequence", "time", NS)[0]
     first = 0 if settings.cameras == "grey" else 2
     folders = [folder / f"image_{camera}" for camera in (first, first + 1)]
     left, right = (numbered_shots(f, _DIGITS, f.name, taken_ns, time_file) for f in folders)
