@@ -1,4 +1,4 @@
-"""What holds for all tests, in which order files are tested, and by which worker."""
+"""Order of test files, and their distribution to workers."""
 
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ _COMPILE = (("mapfusion/align",), ("mapfusion/fastslam", "mapfusion/vision", "si
 
 
 def _place(path: Path) -> int:
-    """Which of these packages a file tests; those of none come last."""
+    """Return the index of the package that a file tests; files of no package come last."""
     for place, packages in enumerate(_COMPILE):
         if any(path.is_relative_to(_TESTS / package) for package in packages):
             return place
@@ -51,5 +51,5 @@ class _Scheduling(LoadFileScheduling):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduling:
-    """What `-n 2` hands out tests by."""
+    """Return the key by which `-n 2` distributes tests."""
     return _Scheduling(config, log)

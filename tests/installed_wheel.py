@@ -123,7 +123,7 @@ def installed(
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What this checkout has simulated: a result, logs, and a recording of pictures."""
+    """Return a result, logs and a recording of pictures that this checkout simulates."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "tiny.yaml").write_text(TINY)
     settings = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -37,7 +37,7 @@ class Values:
         return digest.hexdigest()
 
     def difference(self, other: "Values") -> str | None:
-        """Where the other first differs in words, or None."""
+        """Return the first difference in words, or None."""
         found = [
             f"column {name} only {side}"
             for side, these, those in (("before", self, other), ("after", other, self))

@@ -31,7 +31,7 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 def off_m(asked: tuple[str, Path, int]) -> tuple[float, float]:
-    """Of one filter seed's path, and of what the smoother makes of it if it is the first."""
+    """Return the path errors of one filter seed; of the smoother too for the first seed."""
     name, folder, seed = asked
     scenario = load_scenario(REPOSITORY / "scenarios" / f"{name}.yaml")
     slam, log, rng = scenario.slam, read_log(folder), np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""What the stages could not do without: the least that a robot's frame costs each of them.
+"""Lower bounds of the stages' time per frame, from the work that they cannot avoid.
 
 Each figure is that of the barest work that any implementation has to do, done by a library or a
 loop with nothing around it. A stage at twice its floor has little left to be won; one at a hundred
@@ -42,7 +42,7 @@ def seconds_of(work: Callable[[], object]) -> float:
 
 
 def floors_ms() -> dict[str, float]:
-    """Of a robot's frame, by stage, in ms; of the others no such work can be named."""
+    """Return the lower bound of each stage in ms per frame."""
     return {
         "drive": 1e3 * _physics_s(),
         "rendering": 1e3 * _looking_up_s(),

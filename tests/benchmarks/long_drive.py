@@ -71,7 +71,7 @@ class House:
 
 
 def log_of(house: House, n_frames: int, looks: bool, rng: np.random.Generator) -> RobotLog:
-    """What the robot measures; descriptors are left out where they are not asked for."""
+    """Return the robot's observations, without descriptors unless they are asked for."""
     motion = true_motions(n_frames)
     motion[0] = 0
     pose, rows, position = np.array([0, 0, 0.0]), [], []

@@ -46,7 +46,7 @@ def truth_of(landmarks: LandmarkMap, places: dict[int, Float]) -> Float:
 
 
 def rmse_m(landmarks: LandmarkMap, places: dict[int, Float]) -> float:
-    """Of all landmarks after the best rigid fit: none is left out."""
+    """Return the RMSE of all landmarks after the best rigid fit; none is left out."""
     truth, everyone = truth_of(landmarks, places), np.arange(len(landmarks))
     moved = transform_points(np.array(fit_rigid(landmarks.position_m, truth, everyone)), truth)
     off = (landmarks.position_m - moved)[:, :2]

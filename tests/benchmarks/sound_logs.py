@@ -21,7 +21,7 @@ from mapfusion.robot_log import read_log
 
 
 def findings_of(folder: Path) -> list[Finding]:
-    """What a log says against itself, and what its truth contradicts."""
+    """Return the contradictions inside a log, and between the log and its truth."""
     log, noise = read_log(folder), MotionNoise()
     findings = list(check_log(log, noise).findings)
     truth = finding_of_truth(log, truth_or_unknown(folder, log).T_world_robot, noise, not findings)

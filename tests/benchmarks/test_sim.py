@@ -1,4 +1,4 @@
-"""What simulation costs beside pictures: sensor noise, physics, a painted world."""
+"""Time of the simulation without rendering: sensor noise, physics, a painted world."""
 
 from pathlib import Path
 

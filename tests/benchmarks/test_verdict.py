@@ -36,7 +36,7 @@ def test_verdict(benchmark, n):
     steps = itertools.count(1)
 
     def verdict():
-        """Of a motion that was not asked about before: what must be seen under one is kept."""
+        """Return the verdict on a new motion; visibility under known motions is cached."""
         T_a_b = alignment.T_a_b + next(steps) * 1e-12
         return judge.verify(replace(alignment, T_a_b=T_a_b))
 

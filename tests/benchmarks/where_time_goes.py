@@ -42,7 +42,7 @@ _NAMES = {
 
 
 def times(result: Path) -> pd.DataFrame:
-    """What stages took, in all runs of a folder; columns stage, figure, seconds."""
+    """Return the time of stages in all runs of a folder; columns stage, figure, seconds."""
     if (sweep := result / "run_times").is_dir():
         return pd.read_parquet(sweep)
     rows = pd.read_parquet(result / "tables" / "timings.parquet")
@@ -56,7 +56,7 @@ def robots(result: Path) -> pd.DataFrame:
 
 
 def n_runs(results: list[Path]) -> int:
-    """How many runs the folders hold."""
+    """Return the number of runs in the folders."""
     rows = (robots(result) for result in results)
     return sum(each["run_id"].nunique() if "run_id" in each else 1 for each in rows)
 

@@ -153,7 +153,7 @@ def _of_the_store(folder: Path, rng: np.random.Generator) -> list[Door]:
 
 
 def same(before: Any, after: Any) -> bool:
-    """Whether two answers of a door hold the same values, NaN equal to NaN."""
+    """Return True if two answers hold the same values; NaN equals NaN."""
     if type(before) is not type(after):
         return False
     if isinstance(before, pd.DataFrame):

@@ -37,7 +37,7 @@ def explore(seed: str, count: int, folder: Path) -> Found:
 
 
 def _start_of_footer(data: bytes) -> int:
-    """Where Parquet begins to tell names, types and places."""
+    """Return the offset of the Parquet footer, which holds names, types and offsets."""
     return len(data) - _TAIL - int.from_bytes(data[-_TAIL:][:4], "little")
 
 

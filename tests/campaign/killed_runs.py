@@ -133,7 +133,7 @@ class Story:
             self.faults.append(f"ended with {ended.code}, expected {codes}: {said[-2000:]!r}")
 
     def _nothing_is_lost(self) -> None:
-        """What was once finished stays, and is not written again."""
+        """Check that finished parts stay and are not written again."""
         now = {path: path.stat().st_mtime_ns for path in _finished(self._results)}
         for path, before in self._finished.items():
             if now.get(path) != before:
@@ -142,12 +142,12 @@ class Story:
 
 
 def _finished(results: Path) -> Iterator[Path]:
-    """What says that a stage's part is finished."""
+    """Return the files that mark a stage's part as finished."""
     yield from results.glob("store/*/*/done*.json")
 
 
 def _files(results: Path) -> Iterator[tuple[Path, bytes]]:
-    """All that must be the same in every run: names below the folder, and bytes."""
+    """Return the files that must be equal in every run: paths in the folder, and bytes."""
     for path in sorted(results.rglob("*")):
         name = path.relative_to(results)
         timed = _DIFFER & {path.stem, path.parent.name}

@@ -50,7 +50,7 @@ def install_all(folder: Path) -> None:
 
 
 def what_got_past(name: str, folder: Path) -> str:
-    """What went wrong where the plug-in did this; empty where it was a recorded failure.
+    """Return the fault after a plug-in's misbehaviour; empty if it became a recorded failure.
 
     Registrations are written as rows of `estimates` into the folder and read again.
     """

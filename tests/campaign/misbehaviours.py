@@ -1,4 +1,4 @@
-"""What a plug-in may do wrong, as sources of small plug-ins: bodies of its methods."""
+"""Misbehaving plug-ins: bodies of their methods as source text."""
 
 HEAD = """
 import builtins, ctypes, faulthandler, json, os, pickle, resource, signal, socket

@@ -132,7 +132,7 @@ def bomb(rng: random.Random) -> str:
 
 
 def complaint(load: Callable[[], AnyScenario]) -> tuple[str, AnyScenario | None]:
-    """What is wrong with how a file is refused, empty where nothing is; the scenario, if any."""
+    """Return the fault in a file's refusal (empty if none), and the scenario if it was read."""
     try:
         return "", load()
     except InputError as error:
@@ -146,7 +146,7 @@ def complaint(load: Callable[[], AnyScenario]) -> tuple[str, AnyScenario | None]
 
 
 def small_enough(scenario: AnyScenario) -> bool:
-    """Whether a run ends within seconds: the cap on what the campaign runs."""
+    """Return True if a run ends within seconds; the campaign runs no others."""
     if not isinstance(scenario, Simulation):
         return True  # its logs are not there
     camera, align = scenario.camera, scenario.align
@@ -161,7 +161,7 @@ def small_enough(scenario: AnyScenario) -> bool:
 
 
 def run_fault(path: Path, results: Path, figures: Sequence[str]) -> str:
-    """What is wrong with how a run ended that draws these figures, empty where nothing is."""
+    """Return the fault in the end of a run with these figures; empty if there is none."""
     screen = results.with_suffix(".txt")
     process = _FRESH.Process(target=_run, args=(path, results, figures, screen))
     process.start()

@@ -48,7 +48,7 @@ sys.addaudithook(ask)
 
 
 class Ended(NamedTuple):
-    """How the command ended, and what it wrote on stdout and stderr."""
+    """Exit code of a command and its output on stdout and stderr."""
 
     code: int
     out: str
@@ -200,7 +200,7 @@ def _read(path: Path) -> bytes:
 
 
 def same_rows(sweep: Path, other: Path, seed: int) -> bool:
-    """Whether the tables of two sweeps, times apart, hold the same of the runs of one seed."""
+    """Return True if two sweeps agree on the runs of one seed, except for times."""
     timed = {"run_times", "aligner_timings"}
     names = [{path.parent.name for path in each.glob("*/*.parquet")} for each in (sweep, other)]
     both = (

@@ -1,4 +1,4 @@
-"""What is dear to make and is only read, made once for all processes that test."""
+"""Expensive read-only fixtures, made once for all test processes."""
 
 import fcntl
 import os

@@ -51,7 +51,7 @@ TIMED = ("timings", "aligner_timings")  # the only tables that may differ betwee
 
 
 class Reply(NamedTuple):
-    """What a command answered."""
+    """Exit code and output of a command."""
 
     code: int
     out: str

@@ -8,7 +8,7 @@ PATIENCE_S = 900  # kernels may have to be compiled; nothing that is right takes
 
 
 def wait_until(happened: Callable[[], bool]) -> bool:
-    """Whether it happened before patience ended."""
+    """Return True if the condition became true before the time limit."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not happened():
         if time.monotonic() > deadline_s:
@@ -18,5 +18,5 @@ def wait_until(happened: Callable[[], bool]) -> bool:
 
 
 def has_ended(pid: int) -> bool:
-    """Whether there is no such process any more."""
+    """Return True if the process does not exist any more."""
     return not Path(f"/proc/{pid}").exists()

@@ -49,7 +49,7 @@ def test_it_reaches_as_far_as_landmarks_were_seen() -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 7, 200, 3001])
 def test_a_field_of_view_ends_at_quantiles(n: int) -> None:
-    """Of range, bearing, and height at each step of range, by NumPy's own, to the last bit."""
+    """Ranges, bearings and heights equal NumPy's to the last bit."""
     rng, stray = np.random.default_rng(n), (0.005, 1 - 0.005)
     position = rng.normal(size=(n, 3)) * [3, 2, 0.5] + [9, 0, 0]
     observations = Observations(position, np.tile(np.eye(3), (n, 1, 1)))

@@ -56,7 +56,7 @@ def run_tests(folder: Path, tests: Sequence[str]) -> tuple[int, str]:
 
 
 def verdict(folder: Path, fault: Fault, sound: set[tuple[str, ...]]) -> str:
-    """Whether the fault's tests notice it; `sound` are those that pass without any fault."""
+    """Return True if the fault's tests notice it; `sound` are those that pass without any fault."""
     if fault.tests not in sound:
         code, said = run_tests(folder, fault.tests)
         if code != _PASSED:

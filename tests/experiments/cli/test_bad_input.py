@@ -121,7 +121,7 @@ def test_not_utf8(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_integers_are_those_of_63_bits() -> None:
-    """What tables can hold; also of values that are no setting of ours, as of a plug-in."""
+    """Return values that tables can hold, and values that are no setting."""
     for value in (2**63 - 1, 1 - 2**63):
         assert parse_value(str(value), "x") == value
     for value in (2**63, -(2**63), 2**64, 10**400):

@@ -1,4 +1,4 @@
-"""What `--json` prints: one document and nothing else; what was refused is null, with a reason."""
+"""`--json` prints one document only; refused values are null with a reason."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What any command offers: its version, `python -m`, completion in the shell, and the manual."""
+"""Version, `python -m`, shell completion and manual."""
 
 import os
 import re
@@ -28,7 +28,7 @@ PAGES = sorted((ROOT / "experiments" / "docs").glob("*.md"))
 
 
 def asked(*arguments: str, **settings: str) -> str:
-    """What `python -m experiments` answers, started in the root."""
+    """Run `python -m experiments` in the project's root."""
     started = [sys.executable, "-m", "experiments", *arguments]
     environment = os.environ | settings
     told = subprocess.run(started, cwd=ROOT, env=environment, capture_output=True, text=True)
@@ -77,7 +77,7 @@ def test_the_citation_is_of_this_version() -> None:
 
 
 def completed(line: str) -> list[str]:
-    """What the shell offers at the end of a line."""
+    """Return the shell's completions of a command line."""
     words = len(line.split(" ")) - 1
     shell = {"COMP_WORDS": line, "COMP_CWORD": f"{words}", "_MAPFUSION_COMPLETE": "complete_bash"}
     return asked(**shell).split()

@@ -1,4 +1,4 @@
-"""What a result holds, and when: whoever is told that a part is written finds it there."""
+"""Contents of a result: a part is complete before it is announced."""
 
 import shutil
 from pathlib import Path

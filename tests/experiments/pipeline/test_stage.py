@@ -218,7 +218,7 @@ def _settings(stage: Stage) -> Any:
 
 
 def work(settings: Any, job: Job) -> None:
-    """Of made-up stages."""
+    """Do the work of the made-up stages: none."""
 
 
 work.__module__ = "experiments.pipeline.stage"  # a key covers the source of the harness alone
@@ -321,7 +321,7 @@ def test_a_method_s_sources_are_what_its_module_imports(name: str) -> None:
 
 
 def test_one_method_s_source_is_not_in_another_s_key(resolved: dict[str, Any]) -> None:
-    """Of the aligner stages, and of the match stage; but for the one that finds rivals."""
+    """The source of a method is in the keys of its own stages and of the match stage only."""
     data = copy.deepcopy(resolved)
     data["align"]["aligners"] = [{"name": name, "method": name} for name in OWN_METHODS]
     scenario = scenario_of(data, "tiny")

@@ -193,7 +193,7 @@ def test_a_scenario_with_the_example_and_peers(
 
 
 def assert_judged_as(estimates: pd.DataFrame, theirs: str, own: str) -> None:
-    """Where both are refined to one motion, both get one verdict: status, probability, reason."""
+    """Methods that are refined to one motion get one verdict: status, probability, reason."""
     first = estimates[estimates["repetition"] == 0].set_index("iteration")
     two = [first[first["aligner"] == name] for name in (theirs, own)]
     motion = ["refined_tx_m", "refined_ty_m", "refined_theta_rad"]

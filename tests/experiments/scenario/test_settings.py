@@ -1,4 +1,4 @@
-"""What a scenario makes of its file."""
+"""Settings of a scenario, as read from its file."""
 
 import pytest
 

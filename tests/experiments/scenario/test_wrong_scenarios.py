@@ -1,4 +1,4 @@
-"""All that is wrong with a scenario is told at once: the line of the file, the key, the remedy."""
+"""All errors of a scenario are reported at once, with line, key and remedy."""
 
 import json
 import os

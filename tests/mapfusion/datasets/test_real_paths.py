@@ -42,7 +42,7 @@ def by_opencv(work: StereoImport) -> list[np.ndarray]:
 
 
 def errors_of(motions: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Of motions in the plane: median error in metres and degrees, drift as a share of the way."""
+    """Return the median errors of planar motions in m and degrees, and the drift per distance."""
     planar, wanted = se3.planar(motions), se3.planar(true)
     off = planar - wanted
     end = se2.between(dead_reckoned(wanted)[-1], dead_reckoned(planar)[-1])

@@ -127,7 +127,7 @@ def test_paths_are_the_members_in_the_fused_frame(members: tuple[int, ...]) -> N
 
 @pytest.mark.parametrize("planar", [False, True])
 def test_errors_obey_the_covariances(planar: bool) -> None:
-    """Of motions, and of all landmarks together; joint fusion says nearly the same."""
+    """Errors of motions and landmarks obey them; joint fusion states nearly the same."""
     seeds, d = range(20), 2 + (not planar)
     total, dof, motions, apart, larger = 0.0, 0, [], [], []
     for seed in seeds:

@@ -41,6 +41,6 @@ def test_who_is_first_makes_no_difference() -> None:
 
 
 def test_errors_that_are_the_same_are_not_halved() -> None:
-    """Where a Kalman filter is sure by a factor of two in variance too much."""
+    """A Kalman filter underestimates this variance by a factor of two."""
     p, S, _, _ = _pairs()
     np.testing.assert_allclose(intersect_covariances(p, S, p, S)[1], S, rtol=1e-9)

@@ -86,7 +86,7 @@ def test_equals_a_general_solver_that_knows_the_weights(planar: bool) -> None:
 
 
 def test_errors_obey_the_joint_covariance() -> None:
-    """Of motions and of all landmarks together, the gauge is the first map's frame."""
+    """Errors of motions and landmarks obey it, in the frame of the first map."""
     seeds, squares, motions, inside = range(30), [], [], []
     for seed in seeds:
         team = DrawnTeam(OPPOSITE, seed)

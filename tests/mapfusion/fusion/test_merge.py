@@ -30,7 +30,7 @@ def test_every_landmark_once():
 
 
 def test_each_map_has_half_of_its_alignments_drift_and_the_first_their_mean():
-    """Of variances: 0.06 and 0.08 m between two maps are 0.042 and 0.057 m of one, 0.05 m of a."""
+    """Each map has half the variance of a pair: 0.06 m between two maps is 0.042 m of one."""
     robots = Robots([slice(0, 30)] * 3)
     for k, drift_m in enumerate((0.06, 0.08)):
         robots.alignments[k] = replace(robots.alignments[k], drift_sigma_m=drift_m)

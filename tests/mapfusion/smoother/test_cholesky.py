@@ -22,7 +22,7 @@ def entries_seen(A: np.ndarray) -> Envelope:
 
 
 def factor_of(A: np.ndarray) -> Factor:
-    """Of the lower half of a matrix in its own envelope."""
+    """Return the lower half of a matrix in its own envelope."""
     envelope = entries_seen(A)
     return factor_in_envelope(envelope.of(A), envelope)
 
@@ -158,7 +158,7 @@ def test_while_nothing_is_seen_again_the_order_of_time_stays(reach):
 
 
 def test_a_factor_costs_less_than_in_other_orders():
-    """Of drives that come back to five places, each at some other time; costs beside the least."""
+    """Drives that return to five places at different times cost little more than the least."""
     n, costs = 300, []
     for seed in range(8):
         rng = np.random.default_rng(seed)

@@ -164,7 +164,7 @@ def dense_covariance(common: Float, own_m2: Float, d: int) -> Float:
 @pytest.mark.parametrize("planar", [False, True])
 @pytest.mark.parametrize("tracks", [False, True])
 def test_errors_of_the_path_are_those_of_their_large_matrix(planar: bool, tracks: bool) -> None:
-    """What is asked of Y without it, against Y as landmarks' covariances say that it is."""
+    """Products with Y agree with the joint covariance of the landmarks."""
     log, obs, weights, _, _ = solved_densely(planar, tracks)
     information = odometry_information(log.odometry, NOISE)
     path = dead_reckoned(log)

@@ -35,7 +35,7 @@ def test_gaussian_draws_keep_their_weights() -> None:
 
 
 def test_weights_are_the_slope_of_the_cost() -> None:
-    """What reweighted least squares needs: d cost / d square = weight."""
+    """The derivative of the cost by the square is the weight, as reweighted least squares needs."""
     for square in (0.1, 2.0, 30.0):
         about = [student_cost(np.array([square + h]), 4.0, 3) for h in (-1e-5, 1e-5)]
         slope = (about[1] - about[0]) / 2e-5

@@ -105,7 +105,7 @@ def test_a_gross_error_does_not_move_the_map() -> None:
 
 
 def as_given(log: RobotLog, start: Smoothed) -> OptimizerState:
-    """What the equations say where each track stays with the landmark that it is given to."""
+    """Solve the equations with each track at its labelled landmark."""
     label = log.observations.label
     assert label is not None
     parameters = SmootherParameters(stray_m=STRAY_M)

@@ -291,7 +291,7 @@ def test_equal_fits_are_one_answer_and_others_are_not():
 
 
 def test_the_height_gate_and_needs_of_each_method_are_its_own():
-    """Of the same pairs one method is given all, another those of one height, a third none."""
+    """Methods get all pairs, the pairs of equal height, or none."""
     pair = given_pairs(np.random.default_rng(3), 50, 1.0, 0.01)
     raised = replace(pair.map_b, position_m=pair.map_b.position_m + np.array([0, 0, 5.0]))
     pairs, everyone = Pairs(pair.map_a, raised, pair.correspondences), np.ones(50, bool)

@@ -117,7 +117,7 @@ def test_repetition_is_ambiguous() -> None:
 
 
 def test_what_only_the_left_camera_sees_is_one_sided() -> None:
-    """Of two like patches on the left, one is on the right: the worse one is not believed."""
+    """If two similar patches on the left match one on the right, the worse match is refused."""
     left, right = pair(10.0)
     rng = np.random.default_rng(5)
     patch = left[90:131, 180:221].copy()
@@ -204,7 +204,7 @@ def test_a_narrow_strip_of_another_surface_is_told() -> None:
 
 
 def test_planes_are_bent_at_the_stated_rate() -> None:
-    """Of noise alone, in whole grey levels; deviations and rows that are tolerated leave fewer."""
+    """Plane patches with rounded noise are BENT at the stated rate; larger tolerances give fewer."""
     noise, share = 3.0, 0.1
     stated = replace(
         PARAMETERS,

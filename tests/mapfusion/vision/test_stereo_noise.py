@@ -49,7 +49,7 @@ def test_pictures_without_corners_tell_nothing() -> None:
 
 @pytest.mark.parametrize("probability", [0.5, 0.95])
 def test_true_surfaces_keep_the_limits_at_the_stated_rate(probability: float) -> None:
-    """Of a thousand corners, with noise and rows that are off by other amounts in each picture."""
+    """The limits keep the stated share of true matches, with noise and row offsets."""
     rng, kept = np.random.default_rng(0), []
     uv = grid(step=14)
     noise = NoiseModel(2.0, 0.0, 0.3, np.ones((50, 3)) * [1600.0, 100.0, 100.0])

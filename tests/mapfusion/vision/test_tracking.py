@@ -31,7 +31,7 @@ def on_wall(
     start: tuple[float, float] = START,
     end: tuple[float, float] = END,
 ) -> np.ndarray:
-    """Where rays through pixels (N, 2) meet the wall's plane."""
+    """Intersect rays through pixels (N, 2) with the wall's plane."""
     eye = transform_points(pose, CAMERA.p_robot_left[None])[0]
     ray = transform_points(pose, CAMERA.back_project(uv, np.ones(len(uv)))) - eye
     normal = np.array([end[1] - start[1], start[0] - end[0], 0.0])
@@ -97,7 +97,7 @@ def test_a_window_bends_as_the_homography_of_its_plane(seed: int) -> None:
     base, step = 0.12, np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.05, 0.05), 0.6])
 
     def later(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where what lies at uv + x, (N, 2), lies later, and with which disparity."""
+        """Return the later positions and disparities of the points at uv + x, (N, 2)."""
         disparity = d + x @ slope
         depth = f * base / disparity
         ray = np.column_stack([(uv + x) / f, np.ones(len(x))])

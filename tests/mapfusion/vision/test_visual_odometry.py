@@ -190,7 +190,7 @@ def test_any_motion_of_space_keeps_its_links_and_is_found() -> None:
 
 
 def test_errors_of_the_motion_obey_its_covariance() -> None:
-    """Of 300 motions the mean squared error, over six degrees of freedom, is 1 to a tenth."""
+    """The mean squared normalised error is 1 per degree of freedom within a tenth."""
     rng = np.random.default_rng(7)
     squares = []
     for _ in range(300):

@@ -12,7 +12,7 @@ from tests.mapfusion.verification.two_rooms import Wall, mapped
 
 
 def test_evidence_comes_back_from_the_rows_of_rivals() -> None:
-    """Of a wall that hangs twice: there are motions, and what they lay on their like."""
+    """The evidence of a wall with repeated structure is read back from its rows."""
     wall = Wall(16, seed=1, copies=[(0.0, 8.0, 8.0)])
     maps = mapped(wall, 0, 16, seed=2, name="A"), mapped(wall, 2, 14, seed=3, name="B")
     judge = Verifier()

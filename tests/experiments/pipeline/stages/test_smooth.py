@@ -38,7 +38,7 @@ N_FRAMES, CHANGED_AT = 40, 20
 
 
 def owners(log: RobotLog) -> np.ndarray:
-    """Of each observation the first of its landmark."""
+    """Return the first observation of the landmark of each observation."""
     assert log.observations.label is not None
     _, first, inverse = np.unique(log.observations.label, return_index=True, return_inverse=True)
     return first[inverse]
