@@ -1,4 +1,4 @@
-"""What a run takes with the ray caster and with TinyRenderer, side by side, again and again.
+"""Time of a run with the ray caster and with TinyRenderer, in alternation.
 
     python -m tests.benchmarks.run_ratios quick --repetitions 5
     python -m tests.benchmarks.run_ratios quick --repetitions 5 --anew

@@ -1,4 +1,4 @@
-"""What one process and two take for the same sweep, side by side, again and again.
+"""Time of a sweep with one process and with two, in alternation.
 
     python -m tests.benchmarks.two_workers full --seeds 0..9 --repetitions 1
 

@@ -1,4 +1,4 @@
-"""Where the time of runs goes, stage by stage, beside that of others.
+"""Time of each stage in two groups of runs, side by side.
 
 `python -m tests.benchmarks.where_time_goes results/sweeps/full --before old/sweeps/full`; of single
 runs the folders of their results.

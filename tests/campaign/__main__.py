@@ -1,4 +1,4 @@
-"""All that the project must stand, at random: `python -m tests.campaign --seed 0`.
+"""Random misuse: broken files, scenarios and plug-ins: `python -m tests.campaign --seed 0`.
 
 Broken scenarios, damaged files, flipped bits, plug-ins that misbehave, kills, results that lack
 tables, outputs that are inputs, environments that libraries trip over. Says of each part how much

@@ -111,7 +111,7 @@ def over_odometry(one: Imported, first: int) -> tuple[float, float]:
 
 
 def test_kitti_paths_are_no_worse_than_their_odometry(work: StereoImport) -> None:
-    """Of each cut where the truth was measured; with what was not, in the mean of the cuts.
+    """Path errors do not exceed those of the odometry: each measured cut, and the mean of all.
 
     Where the first pose's heading is a hundredth of a radian off, a path that is better turned may
     lie farther away.

@@ -204,7 +204,7 @@ def test_a_narrow_strip_of_another_surface_is_told() -> None:
 
 
 def test_planes_are_bent_at_the_stated_rate() -> None:
-    """Plane patches with rounded noise are BENT at the stated rate; larger tolerances give fewer."""
+    """Noisy plane patches are BENT at the stated rate; larger tolerances give fewer."""
     noise, share = 3.0, 0.1
     stated = replace(
         PARAMETERS,
