@@ -6,7 +6,11 @@ from functools import partial
 
 
 def plain(text: str) -> str:
-    """Replace control and unprintable characters by their escapes in Python."""
+    """Replace control and unprintable characters by their escapes in Python.
+
+    A no-break space, which Python does not count as printable, becomes a space.
+    """
+    text = text.replace(_SPACE, " ")
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
 
 

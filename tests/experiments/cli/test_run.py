@@ -404,4 +404,5 @@ def test_a_run_without_figures_leaves_none_and_ends_with_advice(
     *_, images, advice, opens = reply.out.strip().splitlines()
     assert images == "Images of the cameras: PyBullet's TinyRenderer"
     assert advice.startswith("Method to use: ")
+    assert "xa0" not in advice
     assert opens == f"Open the report: mapfusion report {tiny_results_copy / 'tiny-3'} --open"
