@@ -60,6 +60,8 @@ _OWN_FIELDS = [f"own_{name}" for name in COVARIANCE_FIELDS]
 # much smaller.
 _MARGINAL_TOLERANCE = 1e-4
 _KIND = "joint_covariance"
+# Attribute of the file: the map's covariances are "marginal", or "conditional" on the path.
+_GIVEN = "map_covariance"
 
 
 def joint_schema(rank: int) -> pa.Schema:
@@ -78,7 +80,9 @@ def joint_path(map_path: Path) -> Path:
     return map_path.with_suffix(".joint.parquet")
 
 
-def joint_writes(map_path: Path, joint: JointCovariance | None) -> dict[Path, Write]:
+def joint_writes(
+    map_path: Path, joint: JointCovariance | None, covariance_m2: Float
+) -> dict[Path, Write]:
     """Return the writes of the file beside a map's file; None removes this file."""
     path = joint_path(map_path)
     if joint is None:
@@ -88,7 +92,14 @@ def joint_writes(map_path: Path, joint: JointCovariance | None) -> dict[Path, Wr
     common[:, : joint.rank] = joint.common_m
     columns = covariance_columns(_OWN_FIELDS, joint.own_m2)
     columns |= {"common_m": common.reshape(-1, 3 * rank)}
-    return {path: table_write(columns, joint_schema(rank))}
+    given = "conditional" if len(_other_marginals(joint, covariance_m2)) else "marginal"
+    return {path: table_write(columns, joint_schema(rank), {_GIVEN: given})}
+
+
+def _other_marginals(joint: JointCovariance, covariance_m2: Float) -> np.ndarray:
+    """Return the rows of a map whose covariances (N, 3, 3) are not the marginals."""
+    off = np.abs(joint.marginal_m2 - covariance_m2).max(axis=(1, 2), initial=0.0)
+    return np.flatnonzero(off > _MARGINAL_TOLERANCE * np.trace(covariance_m2, axis1=1, axis2=2))
 
 
 def read_joint(map_path: Path, covariance_m2: Float) -> JointCovariance | None:
@@ -108,7 +119,8 @@ def read_joint(map_path: Path, covariance_m2: Float) -> JointCovariance | None:
     known = "common_m" in table.column_names
     cell = table.schema.field("common_m").type if known else pa.null()
     rank = cell.list_size // 3 if pa.types.is_fixed_size_list(cell) else 1
-    require_kind(path, table, text_attributes(path, table), joint_schema(rank))
+    attributes = text_attributes(path, table)
+    require_kind(path, table, attributes, joint_schema(rank))
     try:
         common = column(table, "common_m").astype(np.float64).reshape(table.num_rows, rank, 3)
         joint = JointCovariance(covariances_from(table, _OWN_FIELDS), common)
@@ -117,9 +129,8 @@ def read_joint(map_path: Path, covariance_m2: Float) -> JointCovariance | None:
     if len(joint) != len(covariance_m2):
         own = f"of {len(joint)} landmarks, {map_path.name} has {len(covariance_m2)}"
         raise InputError(f"{path}: {own}; remove it, or give the map that it belongs to")
-    off = np.abs(joint.marginal_m2 - covariance_m2).max(axis=(1, 2), initial=0.0)
-    wrong = np.flatnonzero(off > _MARGINAL_TOLERANCE * np.trace(covariance_m2, axis1=1, axis2=2))
-    if len(wrong):
+    wrong = _other_marginals(joint, covariance_m2)
+    if len(wrong) and attributes.get(_GIVEN) != "conditional":
         other = f"another covariance than {map_path.name} in row {wrong[0]}"
         raise InputError(f"{path}: {other}; remove it, or give the map that it belongs to")
     return joint
@@ -154,7 +165,8 @@ class LandmarkMap:
         label: (N,) int32, or None.
         planar: z is 0 and carries no information (2 degrees of freedom).
         name: name of the map.
-        joint: joint covariance of the landmarks' errors, or None; its marginals are covariance_m2.
+        joint: joint covariance of the landmarks' errors, or None. Its marginals are covariance_m2,
+            or larger if covariance_m2 is conditional on the path (a map of the filter).
         viewing: viewing evidence, or None.
         calibration: error of the camera calibration, which all landmarks share; neither covariance
             includes it.
@@ -244,7 +256,7 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
     attributes |= landmarks.calibration.attributes()
     return {
         path: table_write(columns, LANDMARKS, attributes),
-        **joint_writes(path, landmarks.joint),
+        **joint_writes(path, landmarks.joint, landmarks.covariance_m2),
         **viewing_writes(path, landmarks.viewing),
     }
 

@@ -25,7 +25,7 @@ from experiments.pipeline.stages.align import (
     estimate_row,
     evidence_of,
 )
-from experiments.pipeline.stages.slam import folders_of_both
+from experiments.pipeline.stages.robot_maps import folders_of_both
 from experiments.pipeline.tables import MOTION
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Oracle

@@ -42,7 +42,8 @@ from experiments.pipeline.stages.pipeline import (
     build_pipeline,
     require_memory,
 )
-from experiments.pipeline.stages.slam import RobotFolders, read_findings, stored_maps
+from experiments.pipeline.stages.robot_maps import RobotFolders, stored_maps
+from experiments.pipeline.stages.slam import read_findings
 from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
@@ -162,6 +163,7 @@ class EvaluatedRun:
         for pair in () if no_truth else pipeline.pairs:
             before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
             before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
+            before |= {"smooth_a": pair.a.smooth, "smooth_b": pair.b.smooth}
             evaluations.append(
                 Stage(kind.name, kind.label, settings, kind.work, kind.writes, before)
             )

@@ -35,7 +35,8 @@ from experiments.evaluation.truth import (
     motion_errors,
     truth_or_unknown,
 )
-from experiments.pipeline.stages.slam import RobotFolders, final_path
+from experiments.pipeline.stages.robot_maps import RobotFolders
+from experiments.pipeline.stages.slam import final_path
 from experiments.pipeline.stages.smooth import (
     read_endings,
     read_smoothed,

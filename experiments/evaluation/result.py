@@ -44,7 +44,7 @@ from experiments.evaluation.truth import EvaluatedRobot
 from experiments.pipeline.stage import library_versions
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
-from experiments.pipeline.stages.slam import stored_maps
+from experiments.pipeline.stages.robot_maps import stored_maps
 from experiments.pipeline.stages.smooth import map_files, read_smoothed_path
 from experiments.pipeline.store import (
     Store,

@@ -32,7 +32,7 @@ _NAMES = {
     tables.INT: """component count degrees_of_freedom frame iteration landmark landmark_a landmark_b
         n n_common n_confirmed n_contradicted n_correspondences n_inliers n_landmarks n_parents
         n_new n_observed n_returned n_robots n_steps n_team n_tracked n_true particle repetition""",
-    tables.BOOL: "accepted resampled true_pair",
+    tables.BOOL: "accepted lower_bound resampled true_pair",
 }
 # Columns of a floor plan, for figures: single precision takes half the space.
 _PLAN = ("x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
@@ -41,7 +41,7 @@ _OTHER_TYPES = {
     "fused_history": dict.fromkeys(_PLAN, pa.float32()),
     "true_pairs": {"true_pair": pa.binary()},
 }
-_VERSIONS = {"errors": 4}  # of the others: 1
+_VERSIONS = {"errors": 5}  # of the others: 1
 UNKNOWN = -1  # a count that needs the truth, without truth
 _POINT = " ".join(POSITION_FIELDS + COVARIANCE_FIELDS)
 _COLUMNS = {
@@ -51,13 +51,14 @@ _COLUMNS = {
     # alignment (mapfusion/verification). oracle_distance: distance of the refined alignment from
     # the oracle's. n_true: true pairs among the correspondences. n_common: common landmarks of the
     # maps. precision, recall: of the refined inliers. alignment_nees: NEES of the refined
-    # alignment, 3 degrees of freedom.
+    # alignment, 3 degrees of freedom. lower_bound: its covariance excludes errors that the
+    # landmarks of a map share.
     "errors": """robot_a robot_b iteration aligner repetition status reason
         translation_error_m rotation_error_rad
         refined_status refined_reason refined_translation_error_m refined_rotation_error_rad
         verdict accepted log10_false_alarms log10_evidence n_confirmed n_contradicted
         probability acceptance_reason oracle_distance_m oracle_distance_rad
-        n_correspondences n_true n_common n_inliers precision recall alignment_nees""",
+        n_correspondences n_true n_common n_inliers precision recall alignment_nees lower_bound""",
     # One row per (robot, iteration): online path of the best particle and odometry, both from the
     # true start without a fit. spread_m: root of the trace of the particles' weighted position
     # covariance. n_landmarks: all landmarks of the best particle, also those that were seen less

@@ -11,7 +11,7 @@ import pandas as pd
 import scipy
 
 from experiments.pipeline.stages.align import alignment_of, correspondences_of, latest_at
-from experiments.pipeline.stages.slam import ROBOTS_KEPT, RobotFolders, stored_maps
+from experiments.pipeline.stages.robot_maps import ROBOTS_KEPT, RobotFolders, stored_maps
 from experiments.pipeline.tables import records
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid

@@ -65,7 +65,7 @@ _ANSWER = {"status": TEXT, "reason": TEXT} | dict.fromkeys(MOTION, FLOAT)
 # Estimates of the aligners, written by the align stage.
 ESTIMATES = schema(
     "result.estimates",
-    3,
+    4,
     fields(
         **_MAPS,
         aligner=TEXT,
@@ -85,6 +85,7 @@ ESTIMATES = schema(
         drift_sigma_m=FLOAT,
         # upper triangle of the refined alignment's covariance
         **dict.fromkeys(COVARIANCE, FLOAT),
+        lower_bound=BOOL,  # a map does not state the errors that its landmarks share
         # one bit per correspondence, most significant first (numpy.packbits)
         inliers=pa.binary(),
         refined_inliers=pa.binary(),

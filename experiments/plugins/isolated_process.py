@@ -120,8 +120,9 @@ def checked_alignment(answer: Any, n_correspondences: int, elapsed_s: float) -> 
         _require(asymmetry <= _MAX_ASYMMETRY * largest, "covariance is not symmetric")
         smallest = np.linalg.eigvalsh((covariance + covariance.T) / 2)[0]
         _require(smallest >= _MIN_EIGENVALUE * largest, "covariance has a negative variance")
-    reason = one_line(str(reason))
-    return Alignment(T_a_b, covariance, inlier, elapsed_s, status, reason, drift_sigma_m)
+    reason, lower_bound = one_line(str(reason)), bool(answer.lower_bound)
+    outcome = (status, reason, drift_sigma_m, lower_bound)
+    return Alignment(T_a_b, covariance, inlier, elapsed_s, *outcome)
 
 
 def alignment_to_json(alignment: Alignment) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.metrics import load_checked
 from experiments.evaluation.result import require_result
 from experiments.evaluation.truth import EvaluatedRobot, common_landmarks, load_robot, true_pairs
-from experiments.pipeline.stages.slam import RobotFolders, evaluated_iterations, stored_maps
+from experiments.pipeline.stages.robot_maps import RobotFolders, stored_maps
+from experiments.pipeline.stages.slam import evaluated_iterations
 from experiments.pipeline.store import Store
 from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import parse_seeds

@@ -40,10 +40,7 @@ class Alignment:
 
     Attributes:
         T_a_b: tx_m, ty_m, theta_rad (counter-clockwise), shape (3,); NaN if degenerate.
-        covariance: covariance of T_a_b, shape (3, 3); NaN if degenerate. It includes independent
-            residuals, s_drift and the errors of the camera calibration. It excludes drift that is
-            common to a whole map and leaves no residual, so that actual errors are larger; the
-            evaluation reports the NEES (normalised estimation error squared).
+        covariance: covariance of T_a_b, shape (3, 3); NaN if degenerate (`align.covariance`).
         inlier: supporting correspondences, bool, shape (N,).
         elapsed_s: time of the estimation.
         status: outcome. A method accepts, refuses or reports degenerate data; the verification sets
@@ -51,6 +48,8 @@ class Alignment:
         reason: explanation for a user; empty if accepted.
         drift_sigma_m: s_drift, the standard deviation per axis of the residuals beyond the
             landmarks' covariances (both maps together); NaN if degenerate.
+        lower_bound: True if the covariance is a lower bound, because a map does not state the
+            errors that its landmarks share.
     """
 
     T_a_b: Float
@@ -60,6 +59,7 @@ class Alignment:
     status: Status
     reason: str = ""
     drift_sigma_m: float = float("nan")
+    lower_bound: bool = True
 
     @property
     def ok(self) -> bool:

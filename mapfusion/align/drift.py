@@ -1,4 +1,4 @@
-"""Drift of two maps beyond their landmarks' covariances, and its effect on an alignment.
+"""Drift of two maps beyond their landmarks' covariances.
 
 The covariance of a landmark in the map of the best particle is conditional on the path of this
 particle. Residuals of true pairs of two maps therefore have the covariance
@@ -9,11 +9,8 @@ import math
 
 import numpy as np
 
-from mapfusion.align.alignment import Pairs
 from mapfusion.align.mahalanobis_gate import DRIFT_FLOOR_M
-from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.geometry.se2 import rotation
 
 _TOLERANCE = 1e-9  # relative step of s_drift^2 that ends the search
 _MAX_STEPS = 100  # a dozen are the rule
@@ -108,51 +105,3 @@ def estimate_drift_m(residual_m: Float, covariance_m2: Float, gate_m: float = ma
         return DRIFT_FLOOR_M
     start = max(float(np.mean(residual_m**2)), DRIFT_FLOOR_M**2)
     return math.sqrt(_drift_fixed_point(residual_m, covariance_m2, start, gate_m))
-
-
-def whole_map_covariance(
-    T_a_b: Float, covariance: Float, drift_sigma_m: float, p_a: Float
-) -> Float:
-    """Return the covariance (3, 3) of an alignment with the drift that is common to a whole map.
-
-    Common drift leaves no residual, and the alignment's own covariance treats residuals as
-    independent. The pairs, at p_a (n, 2) in frame a, are assumed to shift together by s_drift, and
-    to turn about their centroid by the corresponding angle.
-    """
-    if drift_sigma_m == 0 or not len(p_a):
-        return covariance
-    middle = p_a.mean(axis=0)
-    arm_m2 = np.sum((p_a - middle) ** 2, axis=1).mean()
-    turn = np.array([middle[1] - T_a_b[1], T_a_b[0] - middle[0], 1.0])  # about the centroid
-    common = np.diag([1.0, 1.0, 0.0]) + np.outer(turn, turn) / max(arm_m2, drift_sigma_m**2)
-    return covariance + drift_sigma_m**2 * common
-
-
-def calibration_covariance(T_a_b: Float, pairs: Pairs, drift_sigma_m: float) -> Float:
-    """Return the covariance (3, 3) of T_a_b from errors of the camera calibration.
-
-    To first order, an error that moves all points of a map moves the weighted least squares of the
-    residuals p_a - T p_b, with weights (S_a + R S_b R^T + s_drift^2 I)^-1, by the sum of their
-    gains. The errors of two maps are independent unless both maps are from one camera.
-
-    Args:
-        T_a_b: motion, shape (3,).
-        pairs: fitted pairs, not all on one point; the result is 0 for fewer than two.
-        drift_sigma_m: s_drift.
-    """
-    of_maps = pairs.map_a.calibration, pairs.map_b.calibration
-    if all(each.is_none for each in of_maps) or len(pairs) < 2:
-        return np.zeros((3, 3))
-    S = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
-    W = np.linalg.inv(S + drift_sigma_m**2 * np.eye(2))
-    J = motion_jacobian(T_a_b, pairs.p_b)
-    weighted = np.swapaxes(J, 1, 2) @ W
-    gain = np.linalg.solve(np.sum(weighted @ J, axis=0), weighted)
-    by_a, by_b = (
-        own.moves_m(p)[:, :, :2] for own, p in zip(of_maps, (pairs.p_a, pairs.p_b), strict=True)
-    )
-    by_b = -by_b @ rotation(T_a_b[2]).T
-    alike = of_maps[0].is_of_one_camera(of_maps[1])
-    moved = by_a + by_b if alike else np.concatenate([by_a, by_b], axis=1)
-    by = np.einsum("nij,nkj->ik", gain, moved)
-    return by @ by.T

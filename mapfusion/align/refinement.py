@@ -20,14 +20,15 @@ from mapfusion.align.alignment import (
     why_too_few,
 )
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.drift import calibration_covariance, drift_step
+from mapfusion.align.covariance import alignment_covariance
+from mapfusion.align.drift import drift_step
 from mapfusion.align.mahalanobis_gate import (
     PlanarPairs,
     highest_leverage_pair,
     is_outlier_to_others,
     why_rests_on_one_pair,
 )
-from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.align.rigid_motion import fit_rigid, motion_jacobian, residual_covariances
 from mapfusion.geometry.numerics import Float, invert, kernel
 from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points, wrap
 from mapfusion.parameters import Range, require_in_range, require_shape
@@ -125,7 +126,13 @@ class Refinement:
             reason = why_rests_on_one_pair(
                 T_a_b, T_without if solved else None, planar, truth, may_move_m
             )
-        covariance = covariance + calibration_covariance(T_a_b, pairs[inlier], math.sqrt(variance))
+        drift_m, lower_bound, used = math.sqrt(variance), True, pairs[inlier]
+        if len(used) >= 2:
+            # derivative of the solution of the weighted normal equations by each residual
+            S = residual_covariances(T_a_b, used.covariance_a, used.covariance_b)
+            W = truth[truth > 0.5, None, None] * np.linalg.inv(S + variance * np.eye(2))
+            gain = covariance @ np.swapaxes(motion_jacobian(T_a_b, used.p_b), 1, 2) @ W
+            covariance, lower_bound = alignment_covariance(T_a_b, used, gain, drift_m)
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
             T_a_b,
@@ -134,7 +141,8 @@ class Refinement:
             time.perf_counter() - started_s,
             Status.REFUSED if reason else Status.ACCEPTED,
             reason,
-            math.sqrt(variance),
+            drift_m,
+            lower_bound,
         )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapfusion.align.alignment import Status
-from mapfusion.align.drift import whole_map_covariance
+from mapfusion.align.covariance import with_common_motion
 from mapfusion.fusion.fusers import (
     AlignedPair,
     Component,
@@ -134,12 +134,7 @@ def _alignment_edges(
 ) -> AlignmentEdges:
     """Return the alignments as edges between the ranks of their maps."""
     covariance = [
-        whole_map_covariance(
-            pair.alignment.T_a_b,
-            pair.alignment.covariance,
-            pair.alignment.drift_sigma_m,
-            maps[pair.a].position_m[pair.inliers.index_a, :2],
-        )
+        with_common_motion(pair.alignment, maps[pair.a].position_m[pair.inliers.index_a, :2])
         for pair in pairs
     ]
     return AlignmentEdges(

@@ -19,6 +19,8 @@ from mapfusion.parameters import require_finite, require_shape
 # Number of shared variables that are kept. A log has three per frame, but their variances fall
 # fast; the remainder is added to the landmarks' own covariances.
 RANK = 100
+# Number of shared variables that dominate a map: shift, turn and bends of the path.
+LEADING = 20
 # Oversampling and iterations of the subspace iteration. In each iteration the unwanted directions
 # shrink by the ratio of their variance to the wanted ones.
 _OVERSAMPLING, _ITERATIONS = 20, 3
@@ -64,6 +66,12 @@ class JointCovariance:
     def marginal_m2(self) -> Float:
         """Marginal covariance of each landmark, shape (N, 3, 3)."""
         return self.own_m2 + _squares(self.common_m)
+
+    @cached_property
+    def leading(self) -> "JointCovariance":
+        """The joint covariance with `LEADING` shared variables, for computations that need few."""
+        flat = self.common_m.transpose(1, 0, 2).reshape(self.rank, 3 * len(self))
+        return reduce_rank(self.own_m2, flat, LEADING)
 
     def dense_m2(self) -> Float:
         """Return the dense covariance, shape (3N, 3N), for small maps."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
+import scipy
 
 from mapfusion.attitude import Attitude, attitude_height_errors
 from mapfusion.fastslam.motion import MotionNoise
@@ -419,6 +420,36 @@ def smoothed_map(
     )
     viewing = viewing_of_log(log, landmark, smoothed.estimate.path, source)
     return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
+
+
+def with_path_errors(filtered: LandmarkMap, smoothed: LandmarkMap) -> LandmarkMap:
+    """Add the joint covariance of its errors to a map of the filter.
+
+    The covariances of the filter are conditional on the path of one particle. The errors of its map
+    are those of the smoothed map, of known joint covariance, plus the difference of the two maps.
+    The difference counts as one more shared displacement of one sigma. A landmark that the smoothed
+    map lacks has the shared errors of the nearest landmark, and its own covariance.
+
+    Args:
+        filtered: map of the filter.
+        smoothed: smoothed map of the same log in the same frame, with a joint covariance.
+    """
+    assert smoothed.joint is not None
+    order = np.argsort(smoothed.source_observation, kind="stable")
+    sources = smoothed.source_observation[order]
+    place = np.searchsorted(sources, filtered.source_observation) % max(len(sources), 1)
+    known = np.flatnonzero(sources[place] == filtered.source_observation) if len(sources) else []
+    if not len(known):
+        return filtered
+    twin = order[place[known]]
+    difference_m = filtered.position_m[known] - smoothed.position_m[twin]
+    shared = np.concatenate([smoothed.joint.common_m[twin], difference_m[:, None]], axis=1)
+    tree = scipy.spatial.KDTree(filtered.position_m[known, :2])
+    nearest = tree.query(filtered.position_m[:, :2])[1]
+    nearest[known] = np.arange(len(known))
+    own_m2 = filtered.covariance_m2.copy()
+    own_m2[known] = smoothed.joint.own_m2[twin]
+    return replace(filtered, joint=JointCovariance(own_m2, shared[nearest]))
 
 
 @one_blas_thread

@@ -21,11 +21,11 @@ from mapfusion.align.alignment import (
     why_too_few,
 )
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.drift import calibration_covariance, estimate_drift_m
+from mapfusion.align.covariance import alignment_covariance
+from mapfusion.align.drift import estimate_drift_m
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (
     least_squares_gain,
-    motion_covariance,
     residual_covariances,
     residuals,
 )
@@ -71,7 +71,13 @@ class VerifiedRefinement:
                 self._refined[known] = found
             refined = self._refined[known]
         arrays = (array.tobytes() for array in (refined.T_a_b, refined.covariance, refined.inlier))
-        known = (*arrays, refined.drift_sigma_m, refined.status, refined.reason)
+        known = (
+            *arrays,
+            refined.drift_sigma_m,
+            refined.lower_bound,
+            refined.status,
+            refined.reason,
+        )
         if known not in self._verdicts:
             self._verdicts[known] = (
                 Verdict(refined.status, np.nan, refined.reason)
@@ -203,7 +209,7 @@ def alignment_of_fit(
     refusal, n_inliers = found.refusal, int(np.count_nonzero(inlier))
     if n_inliers < MIN_PAIRS and not refusal:
         refusal = f"{n_inliers} correspondences agree, at least {MIN_PAIRS} are needed"
-    covariance, drift = np.full((3, 3), np.nan), np.nan
+    covariance, drift, lower_bound = np.full((3, 3), np.nan), np.nan, True
     if len(fitted) >= 2:
         gain = found.gain
         if gain is None:
@@ -211,8 +217,7 @@ def alignment_of_fit(
         own = residual_covariances(found.T_a_b, fitted.covariance_a, fitted.covariance_b)
         e = residuals(found.T_a_b, fitted.p_a, fitted.p_b)
         drift = estimate_drift_m(e, own, found.gate_m)
-        covariance = motion_covariance(gain, own + drift**2 * np.eye(2))
-        covariance = covariance + calibration_covariance(found.T_a_b, fitted, drift)
+        covariance, lower_bound = alignment_covariance(found.T_a_b, fitted, gain, drift)
     return Alignment(
         found.T_a_b,
         covariance,
@@ -221,6 +226,7 @@ def alignment_of_fit(
         Status.REFUSED if refusal else Status.ACCEPTED,
         refusal,
         drift,
+        lower_bound,
     )
 
 

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from mapfusion.align.alignment import Alignment, Pairs, Status
-from mapfusion.align.drift import whole_map_covariance
+from mapfusion.align.covariance import with_common_motion
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import transform_points
@@ -31,6 +31,7 @@ from mapfusion.verification.rivals import (
     BETWEEN,
     DISTINCT_M,
     RepeatedLandmarks,
+    SupportedMotion,
     distinct_motions,
     longest_patch_side_m,
     repeated_under_others,
@@ -59,6 +60,9 @@ def landmark_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
 
 
 N_RIVALS, N_SELF_MOTIONS = 4, 3  # motions searched between two maps, and of each map onto itself
+# Share of the support of an alignment (log10 of the NFA) from which on a rival is comparable: with
+# half as many independent supporters.
+_COMPARABLE = 0.5
 _PATCH_REACH_M = 0.7  # largest distance between neighbouring corners of one texture
 _LEAST_OF_PATCH = 5  # landmarks
 # Beta priors of the shares of regions that a wrong motion confirms, as (confirmed, all) regions:
@@ -312,7 +316,14 @@ class PairVerifier:
                 reason = f"right with probability {p:.2g} alone, by all that speaks for and against"
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
-            reason = f"no evidence to the contrary could be sought: {why}"
+            if rival := self._comparable_rival(alignment, by_chance.log10_false_alarms):
+                status, n = Status.AMBIGUOUS, np.count_nonzero(alignment.inlier)
+                reason = (
+                    f"{n} correspondences support it, {np.count_nonzero(rival.inlier)} support "
+                    f"{_motion_text(rival.T_a_b)}; nothing tells which one is right: {why}"
+                )
+            else:
+                reason = f"no evidence to the contrary could be sought: {why}"
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
             status, reason = Status.TOO_UNCERTAIN, unsure
         return Verdict(status, by_chance.log10_false_alarms, reason, **told)
@@ -320,13 +331,39 @@ class PairVerifier:
     def rivals_of(self, alignment: Alignment) -> list[Alignment]:
         """Return the other motions that the maps support, refined, with the status ambiguous.
 
-        The list is empty without evidence.
+        The list is empty for maps with labels.
         """
-        if self.evidence is None:
-            return []
-        others = self._others(alignment.T_a_b, self.evidence)
-        refined = (self._settings.refinement.refine(self._pairs, each.T_a_b) for each in others)
+        if self.evidence is not None:
+            others = [each.T_a_b for each in self._others(alignment.T_a_b, self.evidence)]
+        else:
+            others = [each.T_a_b for each in self._other_motions(alignment.T_a_b)]
+        refined = (self._settings.refinement.refine(self._pairs, each) for each in others)
         return [replace(each, status=Status.AMBIGUOUS) for each in refined if each.ok]
+
+    @cached_property
+    def _motions(self) -> list[SupportedMotion]:
+        """Best distinct motions between maps without labels, found at first use."""
+        own = self._settings
+        if self._pairs.by_name:
+            return []
+        return distinct_motions(self._pairs, N_RIVALS, own.acceptance, own.refinement)
+
+    def _other_motions(self, T_a_b: Float) -> list[SupportedMotion]:
+        """Return the motions of maps without evidence that differ from a motion."""
+        p_b = self._pairs.map_b.position_m[:, :2]
+        return [m for m in self._motions if rms_distance_m(T_a_b, m.T_a_b, p_b) >= DISTINCT_M]
+
+    def _comparable_rival(
+        self, alignment: Alignment, log10_false_alarms: float
+    ) -> SupportedMotion | None:
+        """Return the motion beyond chance with the most support beside an alignment.
+
+        log10 of the NFA grows in proportion to the number of independent supporters.
+        """
+        others = self._other_motions(alignment.T_a_b)
+        rival = min(others, key=lambda each: each.log10_false_alarms, default=None)
+        most = min(self._bound, _COMPARABLE * log10_false_alarms)
+        return rival if rival is not None and rival.log10_false_alarms <= most else None
 
     def features(self, alignment: Alignment) -> EvidenceFeatures | None:
         """Return the features of an alignment; None if the maps carry no evidence."""
@@ -421,9 +458,9 @@ class PairVerifier:
     def _why_unsure(self, alignment: Alignment) -> str:
         """Return why the covariance of an alignment is too large; empty if it is not."""
         settings, p_a = self._settings.evidence, self._pairs.p_a[alignment.inlier, :2]
-        # Labelled landmarks are few and far apart, so that their drift is independent.
-        drift_m = 0.0 if self._pairs.by_name else alignment.drift_sigma_m
-        stated = whole_map_covariance(alignment.T_a_b, alignment.covariance, drift_m, p_a)
+        # labelled landmarks are few and far apart, so that their drift is independent
+        by_name = self._pairs.by_name
+        stated = alignment.covariance if by_name else with_common_motion(alignment, p_a)
         p_b = self._pairs.map_b.position_m[:, :2]
         sigma_m, sigma_rad = landmark_sigma_m(alignment.T_a_b, stated, p_b), math.sqrt(stated[2, 2])
         if sigma_m <= settings.max_sigma_m and sigma_rad <= settings.max_sigma_rad:
@@ -432,8 +469,12 @@ class PairVerifier:
         return f"{found}; {settings.max_sigma_m:g} m, {settings.max_sigma_rad:g} rad are allowed"
 
 
+def _motion_text(T_a_b: Float) -> str:
+    x_m, y_m, theta_rad = T_a_b
+    return f"T_a_b = ({x_m:.2f} m, {y_m:.2f} m, {theta_rad:.2f} rad)"
+
+
 def _named(rival: RivalMotion) -> str:
     """Return a rival motion in words, with its transform."""
-    x_m, y_m, theta_rad = rival.T_a_b
-    T = f"T_a_b = ({x_m:.2f} m, {y_m:.2f} m, {theta_rad:.2f} rad)"
+    T = _motion_text(rival.T_a_b)
     return f"{rival.n_confirmed} of {rival.n_regions} under {T} with {rival.n_support} pairs"

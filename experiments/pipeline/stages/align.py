@@ -14,7 +14,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.pipeline.stage import Job, StageKind
-from experiments.pipeline.stages.slam import (
+from experiments.pipeline.stages.robot_maps import (
     ROBOTS_KEPT,
     RobotFolders,
     Snapshots,
@@ -153,6 +153,7 @@ def estimate_row(
         "acceptance_reason": verdict.reason,
         "drift_sigma_m": refined.drift_sigma_m,
         **dict(zip(COVARIANCE, refined.covariance[_UPPER], strict=True)),
+        "lower_bound": refined.lower_bound,
     }
     for prefix, found in (("", estimated), ("refined_", refined)):
         row |= {f"{prefix}status": str(found.status), f"{prefix}reason": found.reason}
@@ -175,6 +176,7 @@ def alignment_of(row: Mapping[Any, Any], n_correspondences: int) -> Alignment:
     T_a_b = np.array([row[f"refined_{name}"] for name in MOTION])
     inlier = unpacked(row["refined_inliers"], n_correspondences)
     outcome = (Status(row["refined_status"]), row["refined_reason"], row["drift_sigma_m"])
+    outcome += (bool(row["lower_bound"]),)
     return verdict.applied_to(Alignment(T_a_b, covariance, inlier, np.nan, *outcome))
 
 

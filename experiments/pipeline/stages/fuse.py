@@ -16,7 +16,8 @@ import pyarrow as pa
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages import align
 from experiments.pipeline.stages.align import alignment_of, correspondences_of
-from experiments.pipeline.stages.slam import RobotFolders, log_as_filtered, stored_maps
+from experiments.pipeline.stages.robot_maps import RobotFolders, stored_maps
+from experiments.pipeline.stages.slam import log_as_filtered
 from experiments.pipeline.stages.smooth import (
     log_until,
     read_smoothed,

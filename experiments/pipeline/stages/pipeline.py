@@ -246,7 +246,9 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
     n_frames = max(a.n_frames, b.n_frames)
     iterations = tuple(slam.evaluated_iterations(n_frames, scenario.evaluate.every))
     parts = align.batches(iterations)
-    maps = {"log_a": a.log, "slam_a": a.slam, "log_b": b.log, "slam_b": b.slam}
+    maps: dict[str, Stage | RecordedLog] = {}
+    for side, robot in (("a", a), ("b", b)):
+        maps |= {f"log_{side}": robot.log, f"slam_{side}": robot.slam}
     own = {"iterations": iterations}
     # a robot's maps are shared by several pairs, and the matches of a pair by all aligners
     matched = _stage(
@@ -259,7 +261,7 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
             align.ALIGNER_STAGE,
             *(scenario, scenario.align, entry),
             own=own | {"origin": method.origin()},
-            before=maps | {"match": matched},
+            before=maps | {"smooth_a": a.smooth, "smooth_b": b.smooth, "match": matched},
             parts=parts,
             loads=(method.own_module,),
             # fusing waits for the merging aligner only

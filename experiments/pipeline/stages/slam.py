@@ -1,11 +1,8 @@
 """Stage: FastSLAM of one robot over its log, with its map at each evaluated iteration."""
 
-import functools
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -28,15 +25,12 @@ from mapfusion.files import (
     named_columns,
     point_columns,
     point_fields,
-    points_from,
     read_table,
     schema,
     write_table,
 )
 from mapfusion.geometry.numerics import Float
-from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance, with_rows
-from mapfusion.viewing import LogSightings
+from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance
 
 _ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))
 _ITERATION = fields(iteration=INT)
@@ -85,18 +79,6 @@ class SlamSettings:
     min_count: int
     every: int
     clouds_every: int
-
-
-class RobotFolders(NamedTuple):
-    """Folders of a robot's log (with its truth) and of its SLAM result."""
-
-    log: Path
-    slam: Path
-
-
-def folders_of_both(job: Job) -> list[RobotFolders]:
-    """Return the folders of the two robots of a pair's job."""
-    return [RobotFolders(job.inputs[f"log_{side}"], job.inputs[f"slam_{side}"]) for side in "ab"]
 
 
 def evaluated_iterations(n_frames: int, every: int) -> list[int]:
@@ -232,9 +214,6 @@ def final_path(slam: Path) -> Float:
     return read_rows(slam / "poses.parquet", POSES)[_FINAL].to_numpy(np.float64)
 
 
-ROBOTS_KEPT = 4  # robots whose maps a process keeps; tens of megabytes for minutes of driving
-
-
 class Associations:
     """Landmark of each observation, as C changes between evaluated iterations.
 
@@ -265,79 +244,3 @@ class Associations:
         # the last change of an observation applies
         counts_for[self.observation[so_far]] = self.source[so_far]
         return counts_for
-
-
-class Snapshots(Mapping[int, LandmarkMap]):
-    """Map of a robot at each evaluated iteration, created at the first access.
-
-    Descriptors, labels and viewing evidence of the landmarks are taken from the log.
-
-    Args:
-        slam: folder of the stage.
-        log: the filter's input log.
-        viewing: True if maps have viewing evidence, which depends on the whole log up to then.
-    """
-
-    def __init__(self, slam: Path, log: RobotLog, viewing: bool = True) -> None:
-        self._slam, self._log, self._viewing = slam, log, viewing
-        table, attributes = read_table(slam / "snapshots.parquet", SNAPSHOTS)
-        about = (column(table, "count"), column(table, "source_observation"))
-        self._landmarks = LandmarkMap(*points_from(table), *about)
-        iteration, evaluated = (
-            column(table, "iteration"),
-            map(int, attributes["iterations"].split(",")),
-        )
-        self._rows = {k: slice(*np.searchsorted(iteration, [k, k + 1])) for k in evaluated}
-        self._made: dict[int, LandmarkMap] = {}
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(self._rows)
-
-    def __getitem__(self, iteration: int) -> LandmarkMap:
-        if iteration not in self._made:
-            landmarks, log = with_rows(self._landmarks, self._rows[iteration]), self._log
-            origin, seen = landmarks.source_observation, log.observations
-            viewing = None
-            if self._viewing:  # along the path from which the map was computed
-                evaluated, poses = self._paths
-                path = poses[slice(*np.searchsorted(evaluated, [iteration, iteration + 1]))]
-                n_seen = int(np.searchsorted(log.iteration, iteration + 1))
-                owner = self.associations.at(iteration, n_seen)
-                viewing = self._sight_lines.viewing(owner, path, origin)
-            self._made[iteration] = replace(
-                landmarks,
-                descriptor=None if seen.descriptor is None else seen.descriptor[origin],
-                label=None if seen.label is None else seen.label[origin],
-                planar=log.planar,
-                name=log.robot,
-                viewing=viewing,
-                calibration=log.calibration,
-            )
-        return self._made[iteration]
-
-    @cached_property
-    def _sight_lines(self) -> LogSightings:
-        return LogSightings.of(self._log)
-
-    @cached_property
-    def associations(self) -> Associations:
-        """Landmark of each of the log's observations."""
-        return Associations.read(self._slam)
-
-    @cached_property
-    def _paths(self) -> tuple[np.ndarray, Float]:
-        table, _ = read_table(self._slam / "paths.parquet", PATHS)
-        return column(table, "evaluated"), columns(table, POSE_FIELDS)
-
-
-@functools.lru_cache(maxsize=ROBOTS_KEPT)
-def stored_maps(folders: RobotFolders, *, viewing: bool) -> Snapshots:
-    """Return a robot's maps, with or without viewing evidence.
-
-    Maps of a few robots stay in memory, because several stages read them. The name of their folder
-    depends on the content of the log.
-    """
-    return Snapshots(folders.slam, read_log(folders.log), viewing)

@@ -1,0 +1,148 @@
+"""Covariance of an alignment, from the errors of both maps.
+
+To first order the error of T_a_b is the sum of gains G_i times the errors of the residuals
+e_i = p_a,i - T p_b,i, whichever method found the motion. The errors of a map with a joint
+covariance are shared displacements C_i by independent standard normal variables, and independent
+errors with covariances S_i (`joint_covariance`). So the covariance of T_a_b is
+
+    f sum G_i (S_a,i + R S_b,i R') G_i' + A A' + B B',
+    A = sum G_i C_a,i,   B = sum G_i R C_b,i,
+
+the sandwich form, which holds for any weights of the pairs (Huber 1967, White 1980). Independent
+errors may exceed the stated ones, as those of false pairs do. The factor f >= 1 is the ratio of the
+sandwich with the observed residuals r_i in place of the stated covariances, after the shared errors
+were fitted to all residuals with Student-t weights.
+
+A map without a joint covariance states nothing of the errors that its landmarks share. They leave
+no residuals if they move the whole map. The covariance is then a lower bound, by independent errors
+of the covariance S_a,i + R S_b,i R' + s_drift^2 I. Decisions add a common motion of all pairs by
+s_drift (`with_common_motion`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.align.alignment import Alignment, Pairs
+from mapfusion.align.mahalanobis_gate import DRIFT_FLOOR_M
+from mapfusion.align.rigid_motion import (
+    motion_covariance,
+    motion_jacobian,
+    residual_covariances,
+    residuals,
+)
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import rotation
+
+
+class MotionCovariance(NamedTuple):
+    """Covariance of T_a_b.
+
+    Attributes:
+        covariance: shape (3, 3).
+        lower_bound: True if a map does not state the errors that its landmarks share.
+    """
+
+    covariance: Float
+    lower_bound: bool
+
+
+def alignment_covariance(
+    T_a_b: Float, pairs: Pairs, gain: Float, drift_sigma_m: float
+) -> MotionCovariance:
+    """Return the covariance of a motion that was fitted to pairs.
+
+    Args:
+        T_a_b: motion, shape (3,).
+        pairs: the n fitted pairs, not all on one point.
+        gain: derivatives of the motion by each residual, shape (n, 3, 2).
+        drift_sigma_m: s_drift of the residuals.
+    """
+    by_calibration = calibration_covariance(T_a_b, pairs, gain)
+    a, b = pairs.map_a.joint, pairs.map_b.joint
+    if a is None or b is None:
+        own = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
+        covariance = motion_covariance(gain, own + drift_sigma_m**2 * np.eye(2))
+        return MotionCovariance(covariance + by_calibration, True)
+    R = rotation(T_a_b[2])
+    by_shared = np.zeros((3, 3))
+    for joint, index, turn in ((a, pairs.index_a, np.eye(2)), (b, pairs.index_b, R)):
+        moved = np.tensordot(gain @ turn, joint.common_m[index][:, :, :2], axes=((0, 2), (0, 2)))
+        by_shared += moved @ moved.T
+    own = residual_covariances(T_a_b, a.own_m2[pairs.index_a], b.own_m2[pairs.index_b])
+    by_own = motion_covariance(gain, own + DRIFT_FLOOR_M**2 * np.eye(2))
+    factor = _residual_factor(T_a_b, pairs, gain, by_own)
+    return MotionCovariance(factor * by_own + by_shared + by_calibration, False)
+
+
+# Degrees of freedom of the Student-t weights of residuals, the usual choice for data with outliers
+# (Lange, Little and Taylor 1989), and the number of reweighted least squares.
+_DOF, _ROUNDS = 4.0, 5
+
+
+def _residual_factor(T_a_b: Float, pairs: Pairs, gain: Float, stated: Float) -> float:
+    """Return the factor f, at least 1, on the covariance of the motion by independent errors.
+
+    `stated` (3, 3) is this covariance for f = 1. Only the largest shared errors are fitted; the
+    effect of the others counts as independent.
+    """
+    assert pairs.map_a.joint is not None
+    assert pairs.map_b.joint is not None
+    a = pairs.map_a.joint.leading[pairs.index_a]
+    b = pairs.map_b.joint.leading[pairs.index_b]
+    e = residuals(T_a_b, pairs.p_a, pairs.p_b)
+    own = residual_covariances(T_a_b, a.own_m2, b.own_m2) + DRIFT_FLOOR_M**2 * np.eye(2)
+    by_a = np.swapaxes(a.common_m[:, :, :2], 1, 2)
+    by_b = -rotation(T_a_b[2]) @ np.swapaxes(b.common_m[:, :, :2], 1, 2)
+    # e = X u + error, where u are the shared variables of both maps and the error of the motion
+    X = np.concatenate([by_a, by_b, motion_jacobian(T_a_b, pairs.p_b)], axis=2)
+    n_shared = a.rank + b.rank
+    prior = np.diag(np.concatenate([np.ones(n_shared), np.zeros(X.shape[2] - n_shared)]))
+    whiten = np.linalg.inv(np.linalg.cholesky(own))
+    X_white, e_white = whiten @ X, np.einsum("nij,nj->ni", whiten, e)
+    weight, left, r = np.ones(len(e)), prior, e_white
+    for _ in range(_ROUNDS):
+        weighted = (weight[:, None, None] * X_white).reshape(-1, X.shape[2])
+        left = weighted.T @ X_white.reshape(weighted.shape) + prior
+        r = e_white - X_white @ np.linalg.solve(left, weighted.T @ e_white.ravel())
+        weight = (_DOF + 2) / (_DOF + np.sum(r**2, axis=1))
+    fitted = X.shape[2] - np.trace(np.linalg.solve(left, prior))  # effective number of unknowns
+    moved = np.einsum("nij,nj->ni", gain @ np.linalg.inv(whiten), r)
+    n_numbers = 2 * len(e)
+    observed = moved.T @ moved * n_numbers / max(n_numbers - fitted, 1.0)
+    return max(1.0, float(np.trace(np.linalg.solve(stated, observed))) / 3)
+
+
+def with_common_motion(alignment: Alignment, p_a: Float) -> Float:
+    """Return the covariance (3, 3) of an alignment, with a common motion if it is a lower bound.
+
+    The supporting pairs, at p_a (n, 2) in frame a, shift together by s_drift, and turn about their
+    centroid by the corresponding angle.
+    """
+    T_a_b, drift_sigma_m = alignment.T_a_b, alignment.drift_sigma_m
+    if not alignment.lower_bound or drift_sigma_m == 0 or not len(p_a):
+        return alignment.covariance
+    middle = p_a.mean(axis=0)
+    arm_m2 = np.sum((p_a - middle) ** 2, axis=1).mean()
+    turn = np.array([middle[1] - T_a_b[1], T_a_b[0] - middle[0], 1.0])  # about the centroid
+    common = np.diag([1.0, 1.0, 0.0]) + np.outer(turn, turn) / max(arm_m2, drift_sigma_m**2)
+    return alignment.covariance + drift_sigma_m**2 * common
+
+
+def calibration_covariance(T_a_b: Float, pairs: Pairs, gain: Float) -> Float:
+    """Return the covariance (3, 3) of a motion from errors of the camera calibration.
+
+    An error of the calibration moves all points of a map. The errors of two maps are independent
+    unless both maps are from one camera. For the arguments see `alignment_covariance`.
+    """
+    of_maps = pairs.map_a.calibration, pairs.map_b.calibration
+    if all(each.is_none for each in of_maps):
+        return np.zeros((3, 3))
+    by_a, by_b = (
+        own.moves_m(p)[:, :, :2] for own, p in zip(of_maps, (pairs.p_a, pairs.p_b), strict=True)
+    )
+    by_b = -by_b @ rotation(T_a_b[2]).T
+    alike = of_maps[0].is_of_one_camera(of_maps[1])
+    moved = by_a + by_b if alike else np.concatenate([by_a, by_b], axis=1)
+    by = np.einsum("nij,nkj->ik", gain, moved)
+    return by @ by.T

@@ -1,0 +1,217 @@
+"""Tests of `mapfusion.align.covariance`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mapfusion.align.aligners import make_aligner
+from mapfusion.align.alignment import Alignment, Pairs, Status
+from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.covariance import (
+    alignment_covariance,
+    calibration_covariance,
+    with_common_motion,
+)
+from mapfusion.align.refinement import Refinement
+from mapfusion.align.rigid_motion import fit_rigid, least_squares_gain
+from mapfusion.fusion.fusers import AlignedPair, make_fuser
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry import se2
+from mapfusion.geometry.camera import EXACT, CalibrationError
+from mapfusion.geometry.joint_covariance import JointCovariance
+from mapfusion.geometry.numerics import Float
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.verification.registration import Registration
+from tests.mapfusion.align.map_pairs import MapPair, given_pairs, stretched
+
+T_A_B = np.array([3.0, -2.0, 0.7])
+N = 60
+
+
+def noisy_pairs(rng: np.random.Generator, stated: float = 1.0, false: int = 0) -> Pairs:
+    """Return two maps of the same points with shared errors, and independent ones of 1 cm.
+
+    The covariances of independent errors are `stated` times the true ones. The first `false`
+    landmarks of map b are displaced by 0.2 m in random directions.
+    """
+    truth_b = np.zeros((N, 3))
+    truth_b[:, :2] = rng.uniform(-5, 5, (N, 2))
+    truth_a = truth_b.copy()
+    truth_a[:, :2] = se2.transform_points(T_A_B, truth_b[:, :2])
+    maps = []
+    for truth in (truth_a, truth_b):
+        shared = np.zeros((N, 3, 3))  # a shift in y, a turn about the origin, and a bend
+        shared[:, 0, 1] = 0.03
+        shared[:, 1, 0], shared[:, 1, 1] = -0.01 * truth[:, 1], 0.01 * truth[:, 0]
+        shared[:, 2, 0] = 0.02 * np.sin(truth[:, 0])
+        own_m2 = 0.01**2 * np.diag([1.0, 1.0, 1.0])
+        position = truth + np.einsum("nrd,r->nd", shared, rng.normal(size=3))
+        position += 0.01 * rng.normal(size=(N, 3))
+        joint = JointCovariance(np.tile(stated * own_m2, (N, 1, 1)), shared)
+        about = np.ones(N, np.int32), np.arange(N, dtype=np.int64)
+        maps.append(LandmarkMap(position, joint.marginal_m2, *about, joint=joint))
+    angle = rng.uniform(-np.pi, np.pi, false)
+    maps[1].position_m[:false, 0] += 0.2 * np.cos(angle)
+    maps[1].position_m[:false, 1] += 0.2 * np.sin(angle)
+    rows = np.arange(N)
+    return Pairs(*maps, Correspondences(rows, rows, np.zeros(N)))
+
+
+def nees(T: Float, covariance: Float) -> float:
+    error = T - T_A_B
+    error[2] = se2.wrap(error[2])
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+@pytest.mark.parametrize(("stated", "false"), [(1.0, 0), (1e-2, 0), (1.0, 12)])
+@pytest.mark.parametrize("refine", [True, False])
+def test_errors_obey_the_covariance(stated: float, false: int, refine: bool) -> None:
+    """The NEES is chi-square with 3 degrees of freedom, also for understated noise and outliers."""
+    found = []
+    for seed in range(200):
+        pairs = noisy_pairs(np.random.default_rng(seed), stated, false)
+        if refine:
+            refined = Refinement().refine(pairs, T_A_B)
+            assert not refined.lower_bound
+            found.append(nees(refined.T_a_b, refined.covariance))
+        else:
+            T = np.array(fit_rigid(pairs.p_a, pairs.p_b, np.arange(N)))
+            gain = least_squares_gain(T, pairs.p_b)
+            found.append(nees(T, alignment_covariance(T, pairs, gain, 0.0).covariance))
+    assert np.mean(found) == pytest.approx(3, abs=4 * np.sqrt(6 / 200))
+    assert np.mean(np.array(found) < chi2.ppf(0.9, 3)) == pytest.approx(0.9, abs=0.07)
+
+
+def test_without_shared_errors_it_is_a_lower_bound() -> None:
+    pairs = noisy_pairs(np.random.default_rng(0))
+    alone = Pairs(replace(pairs.map_a, joint=None), pairs.map_b, pairs.correspondences)
+    found = Refinement().refine(alone, T_A_B)
+    assert found.lower_bound
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+
+
+def test_does_not_depend_on_the_order_of_the_maps() -> None:
+    pairs = noisy_pairs(np.random.default_rng(5))
+    T = np.array(fit_rigid(pairs.p_a, pairs.p_b, np.arange(N)))
+    there = alignment_covariance(T, pairs, least_squares_gain(T, pairs.p_b), 0.0).covariance
+    turned = Pairs(pairs.map_b, pairs.map_a, pairs.correspondences)
+    back_T = se2.inverse(T)
+    gain = least_squares_gain(back_T, turned.p_b)
+    back = alignment_covariance(back_T, turned, gain, 0.0).covariance
+    cos, sin = np.cos(back_T[2]), np.sin(back_T[2])
+    J = np.array([[-cos, sin, back_T[1]], [-sin, -cos, -back_T[0]], [0, 0, -1]])
+    np.testing.assert_allclose(back, J @ there @ J.T, rtol=0.01, atol=1e-6)
+
+
+def test_a_bent_map_shifts_and_turns_as_a_whole() -> None:
+    """Compare with the spread of maps shifted by s and turned about their middle by s / r."""
+    rng, drift_m, n = np.random.default_rng(1), 0.01, 100_000
+    p_a = rng.uniform([5.0, -4.0], [9.0, -1.0], (40, 2))
+    middle = p_a.mean(axis=0)
+    arm_m = np.sqrt(np.sum((p_a - middle) ** 2, axis=1).mean())
+    shift, turn = drift_m * rng.normal(size=(n, 2)), drift_m / arm_m * rng.normal(size=n)
+    about = np.column_stack([np.tile(middle, (n, 1)), turn])
+    moved = se2.compose(se2.compose(about, np.array([*-middle, 0.0])), T_A_B)
+    C = np.diag([1e-4, 2e-4, 1e-6])
+    expected = C + np.cov((moved + np.column_stack([shift, 0 * turn]) - T_A_B).T)
+    inlier = np.ones(40, dtype=bool)
+    given = Alignment(T_A_B, C, inlier, 0.0, Status.ACCEPTED, drift_sigma_m=drift_m)
+    found = with_common_motion(given, p_a)
+    np.testing.assert_allclose(found, expected, rtol=0.03, atol=0.03 * drift_m**2)
+    for other in (replace(given, drift_sigma_m=0.0), replace(given, lower_bound=False)):
+        np.testing.assert_array_equal(with_common_motion(other, p_a), C)
+
+
+OF_A, OF_B = CalibrationError(0.002, 0.003), CalibrationError(0.001, 0.004)
+
+
+@pytest.fixture(scope="module")
+def pair() -> MapPair:
+    rng = np.random.default_rng(3)
+    found = given_pairs(rng, 60, sigma_m=0.02)
+    map_a = replace(found.map_a, covariance_m2=found.map_b.covariance_m2)
+    return replace(found, map_a=stretched(rng, map_a), map_b=stretched(rng, found.map_b))
+
+
+def with_errors(pair: MapPair, of_a: CalibrationError, of_b: CalibrationError) -> MapPair:
+    made = replace(pair.map_a, calibration=of_a), replace(pair.map_b, calibration=of_b)
+    return replace(pair, map_a=made[0], map_b=made[1])
+
+
+def refined(pair: MapPair):
+    pairs = Pairs(pair.map_a, pair.map_b, pair.correspondences)
+    return Refinement(least_drift_m=0.0).refine(pairs, pair.T_a_b)
+
+
+def by_calibration(T_a_b: Float, pairs: Pairs) -> Float:
+    return calibration_covariance(T_a_b, pairs, least_squares_gain(T_a_b, pairs.p_b))
+
+
+def spoiled(landmarks: LandmarkMap, row: int, by: CalibrationError, share: float) -> LandmarkMap:
+    moved = landmarks.position_m + share * by.moves_m(landmarks.position_m)[:, row]
+    return replace(landmarks, position_m=moved)
+
+
+@pytest.mark.parametrize("camera", ["", "one"])
+def test_equals_solving_again_with_spoiled_maps(pair: MapPair, camera: str) -> None:
+    """Each calibration error is a hundredth of its sigma; the refinement ignores them."""
+    share, columns = 0.01, []
+    of_both = {"map_a": replace(OF_A, camera=camera), "map_b": replace(OF_B, camera=camera)}
+    together = [["map_a", "map_b"]] if camera else [["map_a"], ["map_b"]]
+    for row in (0, 1):
+        for names in together:
+            ends = []
+            for s in (share, -share):
+                parts = {n: spoiled(getattr(pair, n), row, of_both[n], s) for n in names}
+                ends.append(refined(replace(pair, **parts)).T_a_b)
+            columns.append((ends[0] - ends[1]) / (2 * share))
+    by = np.array(columns).T
+    before, after = refined(pair), refined(with_errors(pair, *of_both.values()))
+    added = after.covariance - before.covariance
+    sigma = np.sqrt(np.diag(by @ by.T))
+    # which pairs are true, and s_drift, are judged anew by whoever solves again
+    np.testing.assert_allclose((added - by @ by.T) / np.outer(sigma, sigma), 0, atol=0.03)
+    np.testing.assert_array_equal(before.T_a_b, after.T_a_b)
+
+
+def test_headings_alone_turn_one_map_about_either_beginning(pair: MapPair) -> None:
+    a, b = CalibrationError(0.002), CalibrationError(0.001)
+    own = with_errors(pair, a, b)
+    found = by_calibration(pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences))
+    x, y, _ = pair.T_a_b
+    by = np.array([[-y, x, 1.0], [0.0, 0.0, -1.0]]).T * [0.002, 0.001]
+    # the maps' noise leaves residuals, which turn with neither
+    np.testing.assert_allclose(found, by @ by.T, atol=2e-3 * 0.002**2 * (1 + x * x + y * y))
+
+
+def test_fused_motions_are_no_surer_than_the_cameras(pair: MapPair) -> None:
+    """The joint fuser agrees: headings are ambiguous, common extent determines the scale."""
+    a, b = CalibrationError(0.01), CalibrationError(0.02)
+
+    def motion_covariance(pair: MapPair) -> np.ndarray:
+        maps, c = (pair.map_a, pair.map_b), pair.correspondences
+        aligned = Registration(make_aligner("ransac"), verifier=None).on(*maps, c)
+        found = aligned.register(np.random.default_rng(0)).refined
+        fused = merge(maps, [AlignedPair(0, 1, found, c)], fuser=make_fuser()).fused[0]
+        return fused.motion_covariance[1]
+
+    added = motion_covariance(with_errors(pair, a, b)) - motion_covariance(pair)
+    assert added[2, 2] == pytest.approx(0.01**2 + 0.02**2, rel=0.02)
+    only_scale = motion_covariance(with_errors(pair, CalibrationError(0, 0.1), EXACT))
+    least, most = np.linalg.eigvalsh(only_scale)[[0, -1]]
+    assert 0 < least < most < 0.05**2  # a tenth of 10 m would be a metre
+
+
+def test_inverse_alignments_are_equally_sure(pair: MapPair) -> None:
+    own = with_errors(pair, OF_A, OF_B)
+    there = by_calibration(pair.T_a_b, Pairs(own.map_a, own.map_b, own.correspondences))
+    c = own.correspondences
+    turned = type(c)(c.index_b, c.index_a, c.distance)
+    T = se2.inverse(pair.T_a_b)
+    back = by_calibration(T, Pairs(own.map_b, own.map_a, turned))
+    cos, sin = np.cos(T[2]), np.sin(T[2])
+    J = np.array([[-cos, sin, T[1]], [-sin, -cos, -T[0]], [0, 0, -1]])  # d inverse / dT
+    sigma = np.sqrt(np.diag(back))
+    np.testing.assert_allclose((back - J @ there @ J.T) / np.outer(sigma, sigma), 0, atol=0.01)
