@@ -19,6 +19,7 @@ import pandas as pd
 from experiments.evaluation import tables
 from experiments.evaluation.tables import SHOWN
 from mapfusion.fusion.team_graph import EdgeStatus
+from mapfusion.geometry.numerics import chi_square_bound
 
 ORACLE = "oracle"  # the aligner that is given the true correspondences
 # An alignment is right if the refinement can correct it: the limit is the default gate of the
@@ -87,6 +88,23 @@ def mergeable(rows: pd.DataFrame) -> pd.DataFrame:
 def rich(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with enough true pairs for a ratio to the oracle's error."""
     return rows[rows["n_true"] >= RICH_PAIRS]
+
+
+CONSISTENCY_COLUMNS = ("aligner", "repetition", "accepted", "lower_bound", "alignment_nees")
+_MOTION_DOF, _INSIDE = 3, 0.9  # degrees of freedom of T_a_b; probability of the ellipsoid
+
+
+def alignment_consistency(errors: pd.DataFrame) -> pd.DataFrame:
+    """Return the consistency of accepted alignments, one row per pair of maps and aligner.
+
+    Alignments whose covariance is a lower bound do not count. Columns are added: `nees_per_dof`, 1
+    on average if the covariance is right, and `inside`, whether the true motion lies in the 90 %
+    ellipsoid.
+    """
+    rows = errors[errors["accepted"] & ~errors["lower_bound"] & (errors["repetition"] == 0)]
+    nees = rows["alignment_nees"]
+    inside = nees <= chi_square_bound(_INSIDE, _MOTION_DOF)
+    return rows.assign(nees_per_dof=nees / _MOTION_DOF, inside=inside)[nees.notna()]
 
 
 def at_the_end(rows: pd.DataFrame) -> pd.DataFrame:

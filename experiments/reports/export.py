@@ -125,7 +125,7 @@ def alignment_document(
         accepted, estimated = status is Status.ACCEPTED, row["status"] == Status.ACCEPTED
         refined = {name: row[f"refined_{name}"] for name in MOTION}
         refined |= _covariance([row[name] for name in COVARIANCE])
-        refined |= {"drift_sigma_m": row["drift_sigma_m"]}
+        refined |= {name: row[name] for name in ("drift_sigma_m", "lower_bound")}
         answer = {"aligner": row["aligner"], "status": status, "reason": reason or None}
         answer |= {"estimated": _motion([row[name] for name in MOTION]) if estimated else None}
         answer |= {"estimated_status": row["status"], "estimated_reason": row["reason"] or None}

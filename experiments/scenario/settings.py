@@ -85,6 +85,8 @@ ALIGNER_METRICS = (
     "estimated_over_oracle",
     "estimated_translation_m",
     "largest_translation_m",
+    "nees_per_dof",
+    "coverage_90",
     "lead_over_others",
     "scatter_m",
     "false_merges",

@@ -212,6 +212,24 @@ def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
     return nees_of_maps(known.assign(n_landmarks=1, share_in_gate=np.nan), rng)
 
 
+def alignment_nees(errors: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """Summarise the consistency of accepted alignments (`criteria.alignment_consistency`).
+
+    Returns:
+        One row per aligner: aligner, n_runs, n_maps, nees_per_dof (median) and coverage_90 (share
+        of true motions in the 90 % ellipsoid) with intervals over runs.
+    """
+    rows = []
+    known = criteria.alignment_consistency(errors)
+    for aligner, own in known.groupby("aligner", sort=False):
+        runs, inside = intervals.clusters_of(own), own["inside"].to_numpy(dtype=np.float64)
+        row = {"aligner": aligner, "n_runs": runs.n, "n_maps": len(own)}
+        row |= _medians(own, ("nees_per_dof",), rng)
+        share = intervals.weighted_mean_interval(inside, np.ones(len(own)), runs, rng)
+        rows.append(row | share.columns("coverage_90"))
+    return pd.DataFrame(rows)
+
+
 def smoother_summary(smoother: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """Summarise the batch smoother beside the filter (table `smoother`): medians over robots.
 
@@ -324,6 +342,7 @@ _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "smoother": (SMOOTHER_COLUMNS, "smoother", smoother_summary, "smoother"),
     "fusers": (FUSER_COLUMNS, "fusers", fuser_summary, "fusers"),
     "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
+    "errors": (criteria.CONSISTENCY_COLUMNS, "alignment_nees", alignment_nees, "alignment_nees"),
 }
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 
 from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.covariance import with_common_motion
@@ -32,6 +33,7 @@ from mapfusion.verification.rivals import (
     DISTINCT_M,
     RepeatedLandmarks,
     SupportedMotion,
+    count_exclusive,
     distinct_motions,
     longest_patch_side_m,
     repeated_under_others,
@@ -60,9 +62,8 @@ def landmark_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
 
 
 N_RIVALS, N_SELF_MOTIONS = 4, 3  # motions searched between two maps, and of each map onto itself
-# Share of the support of an alignment (log10 of the NFA) from which on a rival is comparable: with
-# half as many independent supporters.
-_COMPARABLE = 0.5
+# Significance of the test that an alignment has more supporters of its own than a rival.
+_EQUAL = 0.01
 _PATCH_REACH_M = 0.7  # largest distance between neighbouring corners of one texture
 _LEAST_OF_PATCH = 5  # landmarks
 # Beta priors of the shares of regions that a wrong motion confirms, as (confirmed, all) regions:
@@ -316,7 +317,7 @@ class PairVerifier:
                 reason = f"right with probability {p:.2g} alone, by all that speaks for and against"
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
-            if rival := self._comparable_rival(alignment, by_chance.log10_false_alarms):
+            if rival := self._equal_rival(alignment):
                 status, n = Status.AMBIGUOUS, np.count_nonzero(alignment.inlier)
                 reason = (
                     f"{n} correspondences support it, {np.count_nonzero(rival.inlier)} support "
@@ -353,17 +354,21 @@ class PairVerifier:
         p_b = self._pairs.map_b.position_m[:, :2]
         return [m for m in self._motions if rms_distance_m(T_a_b, m.T_a_b, p_b) >= DISTINCT_M]
 
-    def _comparable_rival(
-        self, alignment: Alignment, log10_false_alarms: float
-    ) -> SupportedMotion | None:
-        """Return the motion beyond chance with the most support beside an alignment.
+    def _equal_rival(self, alignment: Alignment) -> SupportedMotion | None:
+        """Return a motion beyond chance that the alignment does not outdo; None without one.
 
-        log10 of the NFA grows in proportion to the number of independent supporters.
+        Supporters that have a twin under the other motion tell nothing. Of the others either motion
+        has as many if nothing but the repeated structure is common to the maps (sign test).
         """
-        others = self._other_motions(alignment.T_a_b)
-        rival = min(others, key=lambda each: each.log10_false_alarms, default=None)
-        most = min(self._bound, _COMPARABLE * log10_false_alarms)
-        return rival if rival is not None and rival.log10_false_alarms <= most else None
+        gate_m = max(self._settings.acceptance.gates_m)
+        for rival in self._other_motions(alignment.T_a_b):
+            if rival.log10_false_alarms > self._bound:
+                continue
+            own = count_exclusive(self._pairs, alignment.inlier, rival.T_a_b, gate_m)
+            its = count_exclusive(self._pairs, rival.inlier, alignment.T_a_b, gate_m)
+            if scipy.special.bdtrc(own - 1, own + its, 0.5) > _EQUAL:  # P(X >= own)
+                return rival
+        return None
 
     def features(self, alignment: Alignment) -> EvidenceFeatures | None:
         """Return the features of an alignment; None if the maps carry no evidence."""

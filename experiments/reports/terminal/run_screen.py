@@ -2,7 +2,7 @@
 
 import math
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -336,7 +336,7 @@ _MOTIONS |= columns(".3f", tx_m="estim.\ntx, m", ty_m="\nty, m")
 _MOTIONS |= columns(".4f", theta_rad="\ntheta, rad")
 _MOTIONS |= columns(".3f", refined_tx_m="refined\ntx, m", refined_ty_m="\nty, m")
 _MOTIONS |= columns(".4f", refined_theta_rad="\ntheta, rad")
-_MOTIONS |= columns(".3f", sigma_m="sigma\nm") | columns(".4f", sigma_rad="\nrad")
+_MOTIONS |= columns(">", sigma_m="sigma\nm", sigma_rad="\nrad")
 _VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
 _VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
 _VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
@@ -354,8 +354,17 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Print the estimates of all aligners on two maps, and the verdicts on them."""
     found = pd.DataFrame(rows)
     sigma_m, sigma_rad = motion_sigma(covariances_of(found))
-    stated = found.assign(sigma_m=sigma_m, sigma_rad=sigma_rad)
+    bounds = ["≥ " if each else "" for each in found["lower_bound"]]
+
+    def texts(sigma: Iterable[float], form: str) -> list[str]:
+        both = zip(bounds, sigma, strict=True)
+        return ["–" if math.isnan(x) else f"{bound}{x:{form}}" for bound, x in both]
+
+    stated = found.assign(sigma_m=texts(sigma_m, ".3f"), sigma_rad=texts(sigma_rad, ".4f"))
     note = "sigma: stated for the refined estimate, of distance and angle"
+    if found["lower_bound"].any():
+        note += "; ≥: a lower bound,\n"
+        note += "because a map does not state the errors that its landmarks share"
     print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
     inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
     verdicts = [str(final_status(row)[0]) for row in rows]

@@ -61,6 +61,8 @@ _TEAM_PAIRS |= columns(".3g", alone_m="alone, m", team_m="in the team, m")
 _NEES = columns("", landmarks="landmarks") | columns("d", n_landmarks="n")
 _NEES |= columns(".3g", nees_per_dof="NEES") | columns(">", band="chi-square")
 _NEES |= columns(".0%", share_in_gate="in gate")
+_ALIGNMENT_NEES = _METHOD | columns("d", n_maps="maps") | columns(".2g", nees_per_dof="NEES / dof")
+_ALIGNMENT_NEES |= columns(".0%", coverage_90="in 90 %")
 
 
 def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]) -> None:
@@ -111,6 +113,12 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
     note += "errors of T_a_b, medians over pairs in one map; (95 %, Wilson, bootstrap)"
     title = "Alignments between robots at the end"
     _print(_rows(summary, "team_pairs"), _TEAM_PAIRS, title, note)
+    note = (
+        "accepted alignments of maps with joint covariances; in 90 %: true motions in the stated\n"
+    )
+    note += "90 % ellipsoid; (95 %, bootstrap)"
+    title = "Covariances of T_a_b: median NEES per degree of freedom"
+    _print(_rows(summary, "alignment_nees"), _ALIGNMENT_NEES, title, note)
     nees = _rows(summary, "nees")
     if len(nees):
         low, high = (nees[name].map("{:.2f}".format) for name in ("band_low", "band_high"))

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.clique import Clique
-from mapfusion.align.correspondences import match
+from mapfusion.align.correspondences import Correspondences, match
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification import verdict as verdict_module
@@ -245,3 +246,51 @@ def test_where_the_frames_have_their_origins_does_not_matter() -> None:
     J[:2, 2] = sin * shift[0] + cos * shift[1], -cos * shift[0] + sin * shift[1]
     there = landmark_sigma_m(T - [*moved, 0.0], J @ COVARIANCE @ J.T, P_B + shift)
     assert there == pytest.approx(landmark_sigma_m(T, COVARIANCE, P_B), rel=1e-9)
+
+
+def symmetric_rooms(rng: np.random.Generator, n_alike: int, n_other: int) -> Pairs:
+    """Return two maps of a room of which most landmarks have a twin after half a turn.
+
+    Twins look alike, so that half of their correspondences belong to the wrong one.
+    """
+    p = rng.uniform(-4, 4, (n_alike // 2, 2))
+    others = rng.uniform(-4, 4, (n_other, 2))
+    points = np.zeros((n_alike + n_other, 3))
+    points[:, :2] = np.concatenate([p, -p, others])
+    n = len(points)
+    index_b = np.arange(n)
+    swapped = rng.random(n_alike // 2) < 0.5
+    first = np.flatnonzero(swapped)
+    index_b[first], index_b[first + n_alike // 2] = first + n_alike // 2, first
+    about = np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.ones(n, np.int32), np.arange(n)
+    T_b_a = se2.inverse(TRUE)
+    moved = points.copy()
+    moved[:, :2] = se2.transform_points(T_b_a, points[:, :2])
+    maps = [LandmarkMap(own + rng.normal(0, 0.01, (n, 3)), *about) for own in (points, moved)]
+    return Pairs(*maps, Correspondences(np.arange(n), index_b, rng.uniform(0, 0.3, n)))
+
+
+TRUE = np.array([2.0, -1.0, 0.4])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_symmetric_room_is_ambiguous_without_viewing_evidence(seed: int) -> None:
+    pairs = symmetric_rooms(np.random.default_rng(seed), 40, 0)
+    done = Registration(Clique()).register(pairs.map_a, pairs.map_b, pairs.correspondences, None)
+    assert done.verdict.status is Status.AMBIGUOUS
+    rival = re.search(r"T_a_b = \((.*) m, (.*) m, (.*) rad\)", done.verdict.reason)
+    assert rival is not None
+    motions = np.array([done.refined.T_a_b, np.array(rival.groups(), float)])
+    turned = se2.compose(np.array([0.0, 0.0, np.pi]), TRUE)
+    for expected in (TRUE, turned):
+        off = motions - expected
+        off[:, 2] = se2.wrap(off[:, 2])
+        assert np.abs(off).max(axis=1).min() < 0.05
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_room_with_few_twins_is_accepted_without_viewing_evidence(seed: int) -> None:
+    pairs = symmetric_rooms(np.random.default_rng(seed), 20, 40)
+    done = Registration(Clique()).register(pairs.map_a, pairs.map_b, pairs.correspondences, None)
+    assert done.verdict.accepted
+    assert np.abs(done.refined.T_a_b - TRUE).max() < 0.05
