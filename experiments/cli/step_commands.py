@@ -51,11 +51,16 @@ def slam(
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth/--no-smooth", help="Write the smoothed map, too.")
+    ] = True,
     as_json: options.AsJson = False,
 ) -> None:
     """Build one robot's map from its log: `mapfusion slam logs/R1 -o R1.parquet`.
 
-    Exit code 1 if the map is empty or most of the log's observations contradict it.
+    The map of the filter is R1.parquet. The smoothed map, R1.smoothed.parquet, is the better one to
+    align and merge. Exit code 1 if the map is empty or most of the log's observations contradict
+    it.
     """
     from experiments.cli.options import require_map_file
     from experiments.evaluation import single_steps as single
@@ -66,13 +71,18 @@ def slam(
     require_map_file(output, [log, scenario])
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
-        made = single.slam(log, settings, show)
+        made = single.slam(log, settings, show, smooth)
     landmarks = made.landmarks
-    single.save_map(output, landmarks)
-    told = export.map_document(output, log, settings.seed, landmarks, made.findings)
+    paths = single.save_maps(output, made)
+    told = export.map_document(paths, log, settings.seed, landmarks, made.findings)
     export.publish_json("slam", told, as_json)
     if not as_json:
-        layout.print_lines([f"{len(landmarks)} landmarks of {landmarks.name} in {output}"])
+        lines = [f"{len(landmarks)} landmarks of {landmarks.name} in {output}"]
+        if made.smoothed is not None:
+            lines.append(f"{len(made.smoothed)} landmarks, smoothed, in {paths[-1]}")
+        layout.print_lines(lines)
+    if made.not_smoothed:
+        options.print_to_stderr(f"warning: {log}: not smoothed: {made.not_smoothed}")
     for finding in made.findings:
         if finding.kind != "gate":  # this finding makes the map unusable, see below
             options.print_to_stderr(f"warning: {log}: {finding.text}")

@@ -203,8 +203,11 @@ class EvaluatedRun:
         return [load_robot(each, viewing=False) for each in folders]
 
     def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
-        """Return the stored maps of all robots at an iteration, by robot."""
-        folders = {robot.name: self.robot_folders(robot) for robot in self.pipeline.robots}
+        """Return the stored maps of all robots at an iteration, with the errors of smoothed logs."""
+        folders = {
+            robot.name: self.robot_folders(robot)._replace(smooth=self.store.path(robot.smooth))
+            for robot in self.pipeline.robots
+        }
         return {
             name: latest_at(stored_maps(each, viewing=True), iteration)
             for name, each in folders.items()

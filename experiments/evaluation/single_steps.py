@@ -3,7 +3,7 @@
 import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +15,8 @@ from experiments.pipeline.stages.align import estimate_row
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.pipeline.stages.features import render_frame
 from experiments.pipeline.stages.log import measured_odometry, measured_tilt
-from experiments.pipeline.stages.pipeline import SimulatedRobotStages
+from experiments.pipeline.stages.pipeline import SimulatedRobotStages, smoother_parameters
+from experiments.pipeline.stages.smooth import SmoothSettings, log_until, smooth_log
 from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import callable_aligner
@@ -45,7 +46,7 @@ from mapfusion.robot_log import (
 )
 from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
 from mapfusion.smoother.odometry_calibration import Calibration, calibrate
-from mapfusion.smoother.smooth import SmootherParameters
+from mapfusion.smoother.smooth import SmootherParameters, with_path_errors
 from mapfusion.tables import NO_LABEL
 from mapfusion.verification.registration import Registration
 from sim.rendering.frame_source import FrameSource
@@ -80,12 +81,17 @@ class SlamResult(NamedTuple):
     """Map of one robot's log.
 
     Attributes:
-        landmarks: map of the most probable particle at the end.
+        landmarks: map of the most probable particle at the end; with the joint covariance of its
+            errors if the log was smoothed.
         findings: contradictions in the log.
+        smoothed: map of the batch smoother; None if the log was not smoothed.
+        not_smoothed: reason why the log could not be smoothed; else empty.
     """
 
     landmarks: LandmarkMap
     findings: tuple[Finding, ...]
+    smoothed: LandmarkMap | None = None
+    not_smoothed: str = ""
 
     @property
     def unusable(self) -> str:
@@ -96,8 +102,16 @@ class SlamResult(NamedTuple):
         return f"the map does not describe its log: {gate[0]}" if gate else ""
 
 
-def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> SlamResult:
-    """Map the log of a robot with the `slam` section and the seed of a scenario.
+def slam(
+    log: Path, settings: Scenario, on_progress: OnProgress, smoothing: bool = True
+) -> SlamResult:
+    """Map the log of a robot with the sections `slam` and `smooth` and the seed of a scenario.
+
+    Args:
+        log: folder of the log.
+        settings: the scenario.
+        on_progress: called with the number of finished frames.
+        smoothing: also smooth the log.
 
     Raises:
         InputError: the log cannot be read or has no frame.
@@ -124,12 +138,42 @@ def slam(log: Path, settings: Scenario, on_progress: OnProgress) -> SlamResult:
         sound = not any(finding.kind == "odometry" for finding in findings)
         truth = finding_of_truth(robot_log, poses, settings.slam.filter.motion, sound)
         findings += [] if truth is None else [truth]
-    return SlamResult(last.landmarks, tuple(findings))
+    if not smoothing or not len(last.landmarks):
+        return SlamResult(last.landmarks, tuple(findings))
+    assert last.path is not None
+    own = SmoothSettings(
+        replace(smoother_parameters(settings), odometry_covariance=covariance),
+        parameters.noise_floor_m,
+        (n_frames - 1,),
+        settings.smooth.max_memory_gb,
+    )
+    given = log_until(used_log, n_frames - 1, parameters.noise_floor_m)
+    on_progress("smooth the log", 0, 1)
+    smoothed, *_, ended = smooth_log(own, given, last.associations, last.path, attitude)
+    on_progress("smooth the log", 1, 1)
+    landmarks = last.landmarks
+    if smoothed is not None:
+        landmarks = with_path_errors(landmarks, smoothed)
+    return SlamResult(landmarks, tuple(findings), smoothed, str(ended[-1]))
 
 
-def save_map(path: Path, landmarks: LandmarkMap) -> None:
-    """Write a map; raise InputError if that is impossible."""
-    _save(path, map_writes(path, landmarks))
+def smoothed_path(path: Path) -> Path:
+    """Return the path of the smoothed map beside that of a filter's map."""
+    return path.with_name(f"{path.stem}.smoothed{path.suffix}")
+
+
+def save_maps(path: Path, made: SlamResult) -> list[Path]:
+    """Write the filter's map and, beside it, the smoothed map; return the paths.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    paths, writes = [path], map_writes(path, made.landmarks)
+    if made.smoothed is not None:
+        paths.append(smoothed_path(path))
+        writes |= map_writes(paths[-1], made.smoothed)
+    _save(path, writes)
+    return paths
 
 
 def _save(path: Path, writes: Mapping[Path, Write]) -> None:

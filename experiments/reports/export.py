@@ -137,9 +137,16 @@ def alignment_document(
 
 
 def map_document(
-    path: Path, log: Path, seed: int, landmarks: LandmarkMap, findings: Sequence[Finding] = ()
+    paths: Sequence[Path],
+    log: Path,
+    seed: int,
+    landmarks: LandmarkMap,
+    findings: Sequence[Finding] = (),
 ) -> dict[str, Any]:
-    """Return the document of `slam`: the map and the findings about the log."""
+    """Return the document of `slam`: the maps and the findings about the log.
+
+    `paths` are those of the filter's map and, if there is one, of the smoothed map.
+    """
     observed = [
         {
             "check": finding.kind,
@@ -149,7 +156,8 @@ def map_document(
         for finding in findings
     ]
     found = {"robot": landmarks.name, "n_landmarks": len(landmarks), "findings": observed}
-    return {"log": log, "seed": seed, "map": path} | found
+    smoothed = paths[1] if len(paths) > 1 else None
+    return {"log": log, "seed": seed, "map": paths[0], "smoothed_map": smoothed} | found
 
 
 def fusion_document(
