@@ -15,7 +15,7 @@ DEVELOPING := $(VENV)/.developing
 # Where this is set, each of the many processes that tests and runs start would compile our source anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: wheel-test browser-test clean-kernels lock demo test campaign seeded-faults lint check bench paper \
+.PHONY: wheel-test browser-test clean-kernels lock demo test campaign seeded-faults lint check check-fresh bench paper \
     install clean
 
 install: $(DEVELOPING)
@@ -72,6 +72,10 @@ lint: $(DEVELOPING)
 
 check: $(INSTALLED)
 	$(BIN)/mapfusion check scenarios/quick.yaml --seeds 0 --junit results/junit.xml
+
+# Two runs without common ground, on scenarios and seeds of today.
+check-fresh: $(INSTALLED)
+	$(BIN)/python -m tests.fresh_seeds
 
 bench: $(DEVELOPING)
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-only --benchmark-columns=min,median,max,rounds

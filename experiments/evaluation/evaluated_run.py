@@ -203,7 +203,7 @@ class EvaluatedRun:
         return [load_robot(each, viewing=False) for each in folders]
 
     def last_maps(self, iteration: int) -> dict[str, LandmarkMap]:
-        """Return the stored maps of all robots at an iteration, with the errors of smoothed logs."""
+        """Return all robots' maps at an iteration; smoothed logs determine their errors."""
         folders = {
             robot.name: self.robot_folders(robot)._replace(smooth=self.store.path(robot.smooth))
             for robot in self.pipeline.robots

@@ -266,6 +266,13 @@ def repetition_spread_m(rows: pd.DataFrame) -> float:
     return float((groups.quantile(0.9) - groups.quantile(0.1)).median())
 
 
+@metric(false_merges="")
+def _all_false_merges(tables: Tables, which: str) -> float:
+    """Return the share of false merges among all alignments of all aligners."""
+    errors = tables["errors"]
+    return criteria.is_false_merge(errors[errors["aligner"] != ORACLE]).mean()
+
+
 @metric()
 def false_merges(tables: Tables, aligner: str) -> float:
     """Return the share of false merges among all alignments of an aligner."""

@@ -57,7 +57,7 @@ RUN_METRICS += tuple(
         *("nees_per_dof", "coverage_95"),
     )
 )
-RUN_METRICS += ("oracle_translation_m", "oracle_rotation_rad", "true_pairs_at_end")
+RUN_METRICS += ("oracle_translation_m", "oracle_rotation_rad", "true_pairs_at_end", "false_merges")
 RUN_METRICS += (
     "fused_over_parents",
     "fused_nees_with_drift",
