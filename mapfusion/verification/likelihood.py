@@ -37,6 +37,11 @@ class BetaRate(NamedTuple):
         """Mean of the distribution."""
         return self.seen / (self.seen + self.missed)
 
+    def with_mean(self, mean: float) -> "BetaRate":
+        """Return the distribution with another mean and the same number of observations."""
+        n = self.seen + self.missed
+        return BetaRate(mean * n, (1 - mean) * n)
+
     def in_part(self) -> "BetaRate":
         """Return the beta distribution with the mean and variance of this rate times U(0, 1)."""
         n = self.seen + self.missed
@@ -48,8 +53,6 @@ class BetaRate(NamedTuple):
 Rates = tuple[BetaRate, BetaRate]  # of landmarks that must be seen, and that may be seen
 RIGHT: Rates = (BetaRate(*fitted_rates.RIGHT[0]), BetaRate(*fitted_rates.RIGHT[1]))
 WRONG: Rates = (BetaRate(*fitted_rates.WRONG[0]), BetaRate(*fitted_rates.WRONG[1]))
-# Rates of a region that is a copy in part, as at the edge of a repeated texture.
-PART: Rates = (RIGHT[0].in_part(), RIGHT[1].in_part())
 # Probability that a region under a right motion looks as under a wrong one: a moved object, changed
 # light, drift of one map. It limits the evidence of one region against a motion. It depends on the
 # world and cannot be estimated from the maps. It is below 1 / `most_against`, so that one missing
@@ -88,12 +91,37 @@ def log_likelihood(k: np.ndarray, n: np.ndarray, rates: Rates) -> Float:
     return np.sum(by_class, axis=0)
 
 
-def log10_against_chance(k: np.ndarray, n: np.ndarray) -> Float:
+_ROUNDS = 5  # of expectation maximisation; the rates of a right motion converge in three
+
+
+def rates_of_maps(k: np.ndarray, n: np.ndarray) -> Rates:
+    """Estimate the rates of two maps under a motion, from k of n (R, 2) in R regions.
+
+    Light, noise, resolution and the detector change the share of landmarks that a robot sees again,
+    in all regions alike. Expectation maximisation (Dempster et al. 1977) of a mixture of regions
+    with the rates of a right motion and with those of chance gives the means. The fitted means
+    count as many landmarks as their beta distributions do, and are not exceeded. The rates differ
+    between regions as much as the fitted ones.
+    """
+    rates = RIGHT
+    for _ in range(_ROUNDS):
+        right, wrong = log_likelihood(k, n, rates), log_likelihood(k, n, WRONG)
+        weight = scipy.special.expit(right - wrong)
+        found, searched = weight @ k, weight @ n
+        means = [
+            min((own.seen + found[c]) / (own.seen + own.missed + searched[c]), own.mean)
+            for c, own in enumerate(RIGHT)
+        ]
+        rates = (RIGHT[0].with_mean(means[0]), RIGHT[1].with_mean(means[1]))
+    return rates
+
+
+def log10_against_chance(k: np.ndarray, n: np.ndarray, rates: Rates = RIGHT) -> Float:
     """Return the log10 likelihood ratio (...) of k of n (..., 2), right motion over chance."""
-    return (log_likelihood(k, n, RIGHT) - log_likelihood(k, n, WRONG)) / np.log(10.0)
+    return (log_likelihood(k, n, rates) - log_likelihood(k, n, WRONG)) / np.log(10.0)
 
 
-def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares) -> Float:
+def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares, rates: Rates = RIGHT) -> Float:
     """Return the log10 likelihood ratio of each region, right over wrong motion, shape (R,).
 
     Under a wrong motion the whole region is a copy, or only its COPIED part is, or no part of it.
@@ -103,8 +131,11 @@ def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares) -> Float:
         k: matched landmarks, shape (R, 2, 2): OWN and COPIED, that must be seen and may be seen.
         n: landmarks that are searched for, shape (R, 2, 2).
         shares: shares of copies, each above 0 and below 1.
+        rates: rates of a right motion. A copy has the same ones, or a share of them if it is
+            partial, as at the edge of a repeated texture.
     """
-    right, part, chance = (log_likelihood(k, n, rates) for rates in (RIGHT, PART, WRONG))
+    partial = (rates[0].in_part(), rates[1].in_part())
+    right, part, chance = (log_likelihood(k, n, each) for each in (rates, partial, WRONG))
     whole = right.sum(axis=1)
     own, copied = (np.log([share, 1 - share]) for share in shares)
     copies = _twin(right[:, COPIED], part[:, COPIED])

@@ -15,10 +15,12 @@ from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.verification.likelihood import (
     DECISIVE,
+    Rates,
     TwinShares,
     log10_against_chance,
     log10_ratio,
     log10_without_discovery,
+    rates_of_maps,
 )
 from mapfusion.verification.rivals import (
     BETWEEN,
@@ -204,8 +206,13 @@ class Regions:
         return int(np.sum(against))
 
     @cached_property
+    def rates(self) -> Rates:
+        """Rates of landmarks seen again under the motion if it is right."""
+        return rates_of_maps(self.found.sum(axis=1), self.expected.sum(axis=1))
+
+    @cached_property
     def _parts(self) -> Float:
-        return log10_against_chance(self.found, self.expected)
+        return log10_against_chance(self.found, self.expected, self.rates)
 
     @cached_property
     def _all(self) -> Float:
@@ -228,7 +235,7 @@ class Regions:
 
     def log10_ratio(self, shares: TwinShares) -> float:
         """Return the log10 likelihood ratio of all regions, right motion over wrong motion."""
-        return float(np.sum(log10_ratio(self.found, self.expected, shares)))
+        return float(np.sum(log10_ratio(self.found, self.expected, shares, self.rates)))
 
     def log10_evidence(self, shares: TwinShares) -> float:
         """Return the log10 likelihood ratio without the region that led to the motion.
@@ -236,7 +243,7 @@ class Regions:
         It is 0 without regions.
         """
         if shares not in self._evidence:  # used several times by a verdict
-            ratios = log10_ratio(self.found, self.expected, shares)
+            ratios = log10_ratio(self.found, self.expected, shares, self.rates)
             self._evidence[shares] = log10_without_discovery(ratios)
         return self._evidence[shares]
 
