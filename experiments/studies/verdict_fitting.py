@@ -39,12 +39,12 @@ from mapfusion.verification import fitted, fitted_rates, fitted_twins
 from mapfusion.verification.likelihood import (
     COPIED,
     OWN,
-    PART,
     RIGHT,
     WRONG,
     BetaRate,
     Rates,
     log_likelihood,
+    rates_in_part,
 )
 from mapfusion.verification.regions import RegionGrid, Regions, ViewedMap, ViewedMapPair
 from mapfusion.verification.rivals import (
@@ -206,7 +206,8 @@ def fit_twins(regions: Sequence[Regions]) -> Float:
     for each, part in itertools.product(regions, (OWN, COPIED)):
         rows = each.beside_best(part)
         k, n = each.found[rows, part], each.expected[rows, part]
-        log_of.append([log_likelihood(k, n, rates) for rates in (RIGHT, PART, WRONG)])
+        hypotheses = (RIGHT, rates_in_part(RIGHT), WRONG)
+        log_of.append([log_likelihood(k, n, rates) for rates in hypotheses])
     log_of = np.concatenate(log_of, axis=1)
     shares = np.full(3, 1 / 3)
     for _ in range(_ROUNDS):

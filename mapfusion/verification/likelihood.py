@@ -53,6 +53,13 @@ class BetaRate(NamedTuple):
 Rates = tuple[BetaRate, BetaRate]  # of landmarks that must be seen, and that may be seen
 RIGHT: Rates = (BetaRate(*fitted_rates.RIGHT[0]), BetaRate(*fitted_rates.RIGHT[1]))
 WRONG: Rates = (BetaRate(*fitted_rates.WRONG[0]), BetaRate(*fitted_rates.WRONG[1]))
+
+
+def rates_in_part(rates: Rates) -> Rates:
+    """Return the rates of a region that is a copy in part, as at the edge of a repeated texture."""
+    return rates[0].in_part(), rates[1].in_part()
+
+
 # Probability that a region under a right motion looks as under a wrong one: a moved object, changed
 # light, drift of one map. It limits the evidence of one region against a motion. It depends on the
 # world and cannot be estimated from the maps. It is below 1 / `most_against`, so that one missing
@@ -100,7 +107,8 @@ def rates_of_maps(k: np.ndarray, n: np.ndarray) -> Rates:
     Light, noise, resolution and the detector change the share of landmarks that a robot sees again,
     in all regions alike. Expectation maximisation (Dempster et al. 1977) of a mixture of regions
     with the rates of a right motion and with those of chance gives the means. The fitted means
-    count as many landmarks as their beta distributions do, and are not exceeded. The rates differ
+    count as many landmarks as their beta distributions do, and are not exceeded. Half of them is
+    the lower limit, below which all regions would look like partial copies. The rates differ
     between regions as much as the fitted ones.
     """
     rates = RIGHT
@@ -109,10 +117,14 @@ def rates_of_maps(k: np.ndarray, n: np.ndarray) -> Rates:
         weight = scipy.special.expit(right - wrong)
         found, searched = weight @ k, weight @ n
         means = [
-            min((own.seen + found[c]) / (own.seen + own.missed + searched[c]), own.mean)
+            (own.seen + found[c]) / (own.seen + own.missed + searched[c])
             for c, own in enumerate(RIGHT)
         ]
-        rates = (RIGHT[0].with_mean(means[0]), RIGHT[1].with_mean(means[1]))
+        must, may = (
+            own.with_mean(float(np.clip(mean, own.mean / 2, own.mean)))
+            for own, mean in zip(RIGHT, means, strict=True)
+        )
+        rates = must, may
     return rates
 
 
@@ -131,11 +143,9 @@ def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares, rates: Rates =
         k: matched landmarks, shape (R, 2, 2): OWN and COPIED, that must be seen and may be seen.
         n: landmarks that are searched for, shape (R, 2, 2).
         shares: shares of copies, each above 0 and below 1.
-        rates: rates of a right motion. A copy has the same ones, or a share of them if it is
-            partial, as at the edge of a repeated texture.
+        rates: rates of a right motion; a copy has the same ones.
     """
-    partial = (rates[0].in_part(), rates[1].in_part())
-    right, part, chance = (log_likelihood(k, n, each) for each in (rates, partial, WRONG))
+    right, part, chance = (log_likelihood(k, n, r) for r in (rates, rates_in_part(rates), WRONG))
     whole = right.sum(axis=1)
     own, copied = (np.log([share, 1 - share]) for share in shares)
     copies = _twin(right[:, COPIED], part[:, COPIED])

@@ -8,7 +8,6 @@ from mapfusion.verification import likelihood as model
 from mapfusion.verification.fitted_twins import WHOLE
 from mapfusion.verification.likelihood import (
     CHANGED,
-    PART,
     RIGHT,
     WRONG,
     BetaRate,
@@ -18,6 +17,8 @@ from mapfusion.verification.likelihood import (
     log10_ratio,
     log10_without_discovery,
     probability_correct,
+    rates_in_part,
+    rates_of_maps,
 )
 
 
@@ -38,7 +39,7 @@ def test_it_is_the_ratio_of_the_two_mixtures(shares: TwinShares) -> None:
     rng = np.random.default_rng(0)
     n = rng.integers(0, 12, (300, 2, 2))
     k = rng.binomial(n, rng.random((300, 1, 1)))
-    right, part, chance = pmf(k, n, RIGHT), pmf(k, n, PART), pmf(k, n, WRONG)
+    right, part, chance = pmf(k, n, RIGHT), pmf(k, n, rates_in_part(RIGHT)), pmf(k, n, WRONG)
     twins = WHOLE * right[:, 1] + (1 - WHOLE) * part[:, 1]
     copies = shares.copied * twins + (1 - shares.copied) * chance[:, 1]
     throughout = WHOLE * right.prod(axis=1) + (1 - WHOLE) * part.prod(axis=1)
@@ -96,7 +97,9 @@ def test_where_all_is_a_twin_only_that_it_is_one_throughout_speaks_for_a_motion(
 
 def of_twin(k: np.ndarray, n: int) -> np.ndarray:
     """Return the likelihood of k of n that must be seen in a copy."""
-    return WHOLE * betabinom.pmf(k, n, *RIGHT[0]) + (1 - WHOLE) * betabinom.pmf(k, n, *PART[0])
+    return WHOLE * betabinom.pmf(k, n, *RIGHT[0]) + (1 - WHOLE) * betabinom.pmf(
+        k, n, *rates_in_part(RIGHT)[0]
+    )
 
 
 def test_the_ratio_s_mean_under_wrong_motions_is_one() -> None:
@@ -190,3 +193,39 @@ def test_coefficients_belong_to_their_features(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(model, "WEIGHTS", tuple(0.5 * (i == k) for i in range(7)))
         p = probability_correct(signs)
         assert np.log(p / (1 - p)) == pytest.approx(0.5 * feature - 0.25)
+
+
+def drawn_regions(rng: np.random.Generator, means: tuple[float, float], n_right: int, n_wrong: int):
+    """Return counts (R, 2) in regions with given mean rates, and in regions of chance."""
+    rates = tuple(own.with_mean(mean) for own, mean in zip(RIGHT, means, strict=True))
+    n = rng.integers(5, 40, (n_right + n_wrong, 2))
+    of_each = [rates] * n_right + [WRONG] * n_wrong
+    share = np.array([[rng.beta(*own) for own in each] for each in of_each])
+    return rng.binomial(n, share), n
+
+
+@pytest.mark.parametrize("n_wrong", [0, 60])
+@pytest.mark.parametrize("means", [(0.5, 0.2), (0.45, 0.3), (0.8, 0.38)])
+def test_rates_of_darker_maps_are_found(means: tuple[float, float], n_wrong: int) -> None:
+    k, n = drawn_regions(np.random.default_rng(1), means, 200, n_wrong)
+    found = rates_of_maps(k, n)
+    for own, fitted, mean in zip(found, RIGHT, means, strict=True):
+        assert own.mean == pytest.approx(mean, abs=0.05)
+        assert sum(own) == pytest.approx(sum(fitted))
+
+
+def test_rates_do_not_exceed_the_fitted_ones_and_few_regions_change_little() -> None:
+    k, n = drawn_regions(np.random.default_rng(2), (0.97, 0.9), 100, 0)
+    np.testing.assert_allclose(rates_of_maps(k, n), RIGHT)
+    empty = np.zeros((0, 2), np.int64)
+    np.testing.assert_allclose(rates_of_maps(empty, empty), RIGHT)
+    one = rates_of_maps(np.array([[2, 0]]), np.array([[5, 0]]))
+    assert 0.7 < one[0].mean < RIGHT[0].mean
+
+
+def test_chance_does_not_lower_the_rates() -> None:
+    k, n = drawn_regions(np.random.default_rng(3), (0.5, 0.2), 0, 100)
+    found = rates_of_maps(k, n)
+    assert found[0].mean >= RIGHT[0].mean / 2
+    regions = log10_against_chance(k, n, found)
+    assert np.mean(regions < 0) > 0.9
