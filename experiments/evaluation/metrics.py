@@ -226,7 +226,7 @@ def largest_translation_m(tables: Tables, aligner: str) -> float:
     return criteria.absolute_errors(rows, ["translation_error_m"])["translation_error_m"].max()
 
 
-@metric(nees_per_dof="nees_per_dof", coverage_90="inside")
+@metric(motion_nees_per_dof="nees_per_dof", motion_coverage_90="inside")
 def _alignment_consistency(tables: Tables, aligner: str, which: str) -> float:
     """Return the consistency of T_a_b: the median NEES per degree of freedom, or the coverage."""
     of_maps = criteria.alignment_consistency(_of(tables["errors"], aligner))[which]

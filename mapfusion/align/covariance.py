@@ -40,7 +40,7 @@ class MotionCovariance(NamedTuple):
 
     Attributes:
         covariance: shape (3, 3).
-        lower_bound: True if a map does not state the errors that its landmarks share.
+        lower_bound: True if a map does not state all errors that its landmarks share.
     """
 
     covariance: Float
@@ -48,7 +48,11 @@ class MotionCovariance(NamedTuple):
 
 
 def alignment_covariance(
-    T_a_b: Float, pairs: Pairs, gain: Float, drift_sigma_m: float
+    T_a_b: Float,
+    pairs: Pairs,
+    gain: Float,
+    drift_sigma_m: float,
+    independent: Float | None = None,
 ) -> MotionCovariance:
     """Return the covariance of a motion that was fitted to pairs.
 
@@ -57,13 +61,16 @@ def alignment_covariance(
         pairs: the n fitted pairs, not all on one point.
         gain: derivatives of the motion by each residual, shape (n, 3, 2).
         drift_sigma_m: s_drift of the residuals.
+        independent: covariance (3, 3) by independent errors, for maps without joint covariances; by
+            default that of the gains.
     """
     by_calibration = calibration_covariance(T_a_b, pairs, gain)
     a, b = pairs.map_a.joint, pairs.map_b.joint
     if a is None or b is None:
-        own = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
-        covariance = motion_covariance(gain, own + drift_sigma_m**2 * np.eye(2))
-        return MotionCovariance(covariance + by_calibration, True)
+        if independent is None:
+            own = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
+            independent = motion_covariance(gain, own + drift_sigma_m**2 * np.eye(2))
+        return MotionCovariance(independent + by_calibration, True)
     R = rotation(T_a_b[2])
     by_shared = np.zeros((3, 3))
     for joint, index, turn in ((a, pairs.index_a, np.eye(2)), (b, pairs.index_b, R)):
@@ -72,7 +79,8 @@ def alignment_covariance(
     own = residual_covariances(T_a_b, a.own_m2[pairs.index_a], b.own_m2[pairs.index_b])
     by_own = motion_covariance(gain, own + DRIFT_FLOOR_M**2 * np.eye(2))
     factor = _residual_factor(T_a_b, pairs, gain, by_own)
-    return MotionCovariance(factor * by_own + by_shared + by_calibration, False)
+    lower_bound = not (a.complete and b.complete)
+    return MotionCovariance(factor * by_own + by_shared + by_calibration, lower_bound)
 
 
 # Degrees of freedom of the Student-t weights of residuals, the usual choice for data with outliers

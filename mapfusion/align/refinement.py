@@ -131,8 +131,11 @@ class Refinement:
             # derivative of the solution of the weighted normal equations by each residual
             S = residual_covariances(T_a_b, used.covariance_a, used.covariance_b)
             W = truth[truth > 0.5, None, None] * np.linalg.inv(S + variance * np.eye(2))
-            gain = covariance @ np.swapaxes(motion_jacobian(T_a_b, used.p_b), 1, 2) @ W
-            covariance, lower_bound = alignment_covariance(T_a_b, used, gain, drift_m)
+            J = motion_jacobian(T_a_b, used.p_b)
+            weighted = np.swapaxes(J, 1, 2) @ W
+            gain = np.linalg.solve(np.sum(weighted @ J, axis=0), weighted)
+            made = alignment_covariance(T_a_b, used, gain, drift_m, covariance)
+            covariance, lower_bound = made
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
             T_a_b,

@@ -39,10 +39,12 @@ class JointCovariance:
         own_m2: covariance of each landmark's own error, shape (N, 3, 3).
         common_m: C_i, displacement of each landmark by one sigma of each shared variable, shape
             (N, R, 3).
+        complete: False if shared errors of a last part of the path are missing.
     """
 
     own_m2: Float
     common_m: Float
+    complete: bool = True
 
     def __post_init__(self) -> None:
         n = len(self.own_m2)
@@ -55,7 +57,7 @@ class JointCovariance:
         return len(self.own_m2)
 
     def __getitem__(self, rows: np.ndarray | slice) -> "JointCovariance":
-        return JointCovariance(self.own_m2[rows], self.common_m[rows])
+        return JointCovariance(self.own_m2[rows], self.common_m[rows], self.complete)
 
     @property
     def rank(self) -> int:

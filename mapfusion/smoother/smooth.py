@@ -422,7 +422,9 @@ def smoothed_map(
     return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
 
 
-def with_path_errors(filtered: LandmarkMap, smoothed: LandmarkMap) -> LandmarkMap:
+def with_path_errors(
+    filtered: LandmarkMap, smoothed: LandmarkMap, complete: bool = True
+) -> LandmarkMap:
     """Add the joint covariance of its errors to a map of the filter.
 
     The covariances of the filter are conditional on the path of one particle. The errors of its map
@@ -433,6 +435,8 @@ def with_path_errors(filtered: LandmarkMap, smoothed: LandmarkMap) -> LandmarkMa
     Args:
         filtered: map of the filter.
         smoothed: smoothed map of the same log in the same frame, with a joint covariance.
+        complete: False if the smoothed map is of an earlier iteration. The errors of the path since
+            then are missing.
     """
     assert smoothed.joint is not None
     order = np.argsort(smoothed.source_observation, kind="stable")
@@ -449,7 +453,7 @@ def with_path_errors(filtered: LandmarkMap, smoothed: LandmarkMap) -> LandmarkMa
     nearest[known] = np.arange(len(known))
     own_m2 = filtered.covariance_m2.copy()
     own_m2[known] = smoothed.joint.own_m2[twin]
-    return replace(filtered, joint=JointCovariance(own_m2, shared[nearest]))
+    return replace(filtered, joint=JointCovariance(own_m2, shared[nearest], complete))
 
 
 @one_blas_thread

@@ -50,8 +50,8 @@ class Snapshots(Mapping[int, LandmarkMap]):
         slam: folder of the stage.
         log: the filter's input log.
         viewing: True if maps have viewing evidence, which depends on the whole log up to then.
-        smoothed: smoothed maps by iteration. They determine the joint covariance of the errors of
-            the filter's maps at the same iterations.
+        smoothed: smoothed maps by iteration. The last one until an iteration determines the joint
+            covariance of the errors of the filter's map.
     """
 
     def __init__(
@@ -98,8 +98,10 @@ class Snapshots(Mapping[int, LandmarkMap]):
                 viewing=viewing,
                 calibration=log.calibration,
             )
-            if (smoothed := self._smoothed.get(iteration)) is not None:
-                made = with_path_errors(made, smoothed)
+            known = [k for k in self._smoothed if k <= iteration]
+            if known:
+                last = max(known)
+                made = with_path_errors(made, self._smoothed[last], complete=last == iteration)
             self._made[iteration] = made
         return self._made[iteration]
 

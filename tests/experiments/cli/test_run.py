@@ -163,7 +163,10 @@ def test_truth_is_for_the_evaluation_alone(
         folders.append(folder)
     shuffled = Recording.model_validate(
         {"schema_version": 1, "name": "shuffled", "seed": tiny.seed, "logs": [*map(str, folders)]}
-        | {name: getattr(tiny, name) for name in ("slam", "align", "evaluate", "merge")}
+        | {
+            name: getattr(tiny, name)
+            for name in ("slam", "smooth", "align", "evaluate", "merge", "fuse")
+        }
     )
     result = run_scenario(shuffled, tmp_path / "results", 1, quietly)
     before = estimated_tables(tiny_results / "tiny-3")
@@ -193,6 +196,9 @@ def test_estimating_opens_no_truth(tiny: Simulation, tiny_results: Path, tmp_pat
             (log / name).hardlink_to(run.store.path(robot.log) / name)
         folders[robot.slam.key] = log / "slam"
         robot.slam.work(robot.slam.settings, Job({"log": log}, log / "slam"))
+        folders[robot.smooth.key], inputs = log / "smooth", {"log": log, "slam": log / "slam"}
+        for part in robot.smooth.parts:
+            robot.smooth.work(robot.smooth.settings, Job(inputs, log / "smooth", part))
     (pair,) = run.pipeline.pairs
     for number, stage in enumerate(pair.estimates.before.values()):
         folders[stage.key] = tmp_path / f"{stage.name}{number}"

@@ -27,6 +27,7 @@ align:
     - {name: svd, method: svd}
     - {name: icp, method: icp}
 evaluate: {every: 10, timing_points: 2, timing_repeats: 1}
+fuse: {every: 40}
 """
 NEED_THE_TRUTH = {"errors", "fusion", "true_pairs", "path_statistics", "map_fits", "landmark_nees"}
 SOUND = {"tracks", "findings"}  # of logs without pictures that agree with themselves

@@ -36,6 +36,7 @@ def error(
     row = {"seed": 0, "robot_a": "A", "robot_b": "B", "iteration": iteration, "aligner": aligner}
     row |= {"translation_error_m": translation_m, "refined_translation_error_m": refined_m}
     row |= {"refined_rotation_error_rad": 0.0, "oracle_distance_m": 0.0, "n_true": 40}
+    row |= {"repetition": 0, "lower_bound": False, "alignment_nees": 0.35 * iteration}
     row |= {"accepted": True, "n_common": 60, "n_correspondences": 80, "rotation_error_rad": 0.0}
     return row | more
 
@@ -118,7 +119,7 @@ def tables() -> dict[str, pd.DataFrame]:
         error("oracle", 20, 0.5, 0.4, n_true=50, refined_rotation_error_rad=0.01, seed=1),
         error("oracle", 20, 0.5, 5.0, n_true=90, refined_rotation_error_rad=0.5, seed=2),
         # few pairs: left out wherever 30 are needed, the first even where 3 are
-        error("ransac", 10, 99.0, 99.0, n_true=2, oracle_distance_m=99.0),
+        error("ransac", 10, 99.0, 99.0, n_true=2, oracle_distance_m=99.0, lower_bound=True),
         error("ransac", 15, 0.1, 99.0, n_true=3, oracle_distance_m=99.0),
         error("ransac", 16, 9.0, 99.0, n_true=4, oracle_distance_m=99.0),
         error("ransac", 20, 0.6, 0.3, oracle_distance_m=0.01),
@@ -184,6 +185,7 @@ KNOWN = {
     "oracle_translation_m": 0.4,
     "oracle_rotation_rad": 0.03,
     "true_pairs_at_end": 50.0,
+    "false_merges": 3 / 14,
     "fused_over_parents": 0.5,  # 1 / ((sqrt(12.5) + 1) / 2), 0.5 and 5
     "fused_nees_with_drift": (1 + 2 + 1 + 1) / 4,
     "fused_nees_without_drift": (10 + 20 + 10 + 10) / 4,
@@ -202,6 +204,8 @@ KNOWN = {
     "ransac.estimated_translation_m": 0.7,  # three maps, one of them thrice
     "ransac.largest_translation_m": 0.9,
     "svd.largest_translation_m": 12.1,
+    "ransac.motion_nees_per_dof": 0.35 * (16 + 20) / 2 / 3,  # three iterations, 20 twice
+    "ransac.motion_coverage_90": 2 / 4,  # 6.25 is the bound
     "ransac.lead_over_others": 2.0,
     "svd.lead_over_others": 0.7 / 2.5,
     "ransac.scatter_m": 0.24,
