@@ -142,7 +142,7 @@ _FORMER_MODULES = {
     "align.rigid_motion": "align.rigid",
     "align.correspondences": "align.nearest_descriptors",
     "align.mahalanobis_gate": "align.near_pairs align.leverage",
-    "align.drift": "align.calibration_part",
+    "align.covariance": "align.drift align.calibration_part",
     "align.consensus": "align.consistency",
     "align.clique": "align.max_clique",
     "align.nearest_neighbours": "align.box_tree align.nearest_points align.closest",

@@ -421,7 +421,8 @@ CLAIMS = (
         "",
         (0.0, 1.0),
         _sigma_by_distance,
-        "The error of stereo depth grows with the square of the distance.",
+        "The error of stereo depth grows with the square of the distance. The printed filter needs "
+        "more noise than that, equal at all distances, so that the number of sightings decides.",
     ),
     Claim(
         "correspondences",

@@ -20,8 +20,7 @@ from mapfusion.align.alignment import (
     why_too_few,
 )
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.covariance import alignment_covariance
-from mapfusion.align.drift import drift_step
+from mapfusion.align.covariance import alignment_covariance, drift_step
 from mapfusion.align.mahalanobis_gate import (
     PlanarPairs,
     highest_leverage_pair,

@@ -21,8 +21,7 @@ from mapfusion.align.alignment import (
     why_too_few,
 )
 from mapfusion.align.correspondences import Correspondences, HeightGate
-from mapfusion.align.covariance import alignment_covariance
-from mapfusion.align.drift import estimate_drift_m
+from mapfusion.align.covariance import alignment_covariance, estimate_drift_m
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (
     least_squares_gain,

@@ -34,8 +34,11 @@ class RobotFolders(NamedTuple):
 
 def folders_of_both(job: Job) -> list[RobotFolders]:
     """Return the folders of the two robots of a pair's job."""
-    kinds = ("log", "slam", "smooth")
-    return [RobotFolders(*(job.inputs.get(f"{kind}_{side}") for kind in kinds)) for side in "ab"]
+    folders, inputs = [], job.inputs
+    for side in "ab":
+        smooth = inputs.get(f"smooth_{side}")
+        folders.append(RobotFolders(inputs[f"log_{side}"], inputs[f"slam_{side}"], smooth))
+    return folders
 
 
 ROBOTS_KEPT = 4  # robots whose maps a process keeps; tens of megabytes for minutes of driving

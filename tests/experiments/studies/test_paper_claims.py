@@ -1,17 +1,20 @@
 """Claims of the paper against runs whose values are known."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from experiments.pipeline.tables import read_rows
 from experiments.reports.study_files import claim_text, claims_page, claims_table
 from experiments.studies.benchmark import crossing_shares
 from experiments.studies.paper_claims import (
     CLAIMS,
     CROSSING,
+    SCENARIOS,
     VALUES,
     NotMeasured,
     TablesOfRun,
@@ -208,3 +211,15 @@ def test_crossings_are_where_the_ratio_is_one(
 ) -> None:
     errors = pd.DataFrame({"a": first, "b": second}, index=np.array([0.0, 1.0]))
     assert crossing_shares(errors, "a", "b") == pytest.approx(shares)
+
+
+def test_the_published_page_is_made_of_its_tables_and_the_present_claims() -> None:
+    folder = Path(__file__).parents[3] / "results" / "reference" / "paper_claims"
+    values = read_rows(folder / "claims.parquet", VALUES)
+    crossing = read_rows(folder / "crossing.parquet", CROSSING)
+    assert (folder / "paper.md").read_text(encoding="utf-8") == claims_page(values, crossing)
+    told = ["name", "where", "claim", "measure", "unit", "why"]
+    present = [(c.name, c.where, c.text, c.measure, c.unit, c.why) for c in CLAIMS]
+    assert list(dict.fromkeys(values[told].itertuples(index=False, name=None))) == present
+    of_runs = values.groupby("scenario")["n_runs"].max()
+    assert (of_runs.reindex(SCENARIOS) >= 10).all()

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from mapfusion.align.alignment import Pairs, Status
-from mapfusion.align.drift import drift_step
+from mapfusion.align.covariance import drift_step
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.refinement import Refinement, maximise_likelihood
 from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances, residuals
