@@ -43,7 +43,7 @@ def test_known_rates_are_found_if_some_regions_have_changed() -> None:
 def drawn_motions(n: int, seed: int) -> list[Regions]:
     """Draw n motions of six regions each, all of one part; the first region led to the motion."""
     rng = np.random.default_rng(seed)
-    hypotheses = likelihood.RIGHT, likelihood.PART, likelihood.WRONG
+    hypotheses = likelihood.RIGHT, likelihood.rates_in_part(likelihood.RIGHT), likelihood.WRONG
     motions = []
     for _ in range(n):
         found, expected = np.zeros((6, 2, 2), np.int64), np.zeros((6, 2, 2), np.int64)
