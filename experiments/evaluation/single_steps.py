@@ -397,6 +397,10 @@ def calibrate_logs(
     for path, name in zip(logs, names, strict=True):
         if names.count(name) > 1:
             raise InputError(f"{path}: robot {name} has more than one log here")
+        inputs = {each.resolve() for each in logs}
+        for written in () if output is None else (output, output / name):
+            if written.resolve() in inputs:
+                raise InputError(f"--output {output}: {written} is an input; name another folder")
     landmarks, paths = [], list[Float | None]()
     for log in loaded:
         label, frame = log.observations.label, None

@@ -55,10 +55,20 @@ def test_rounds_that_end_before_their_time_say_so(
     assert (found["n_rounds"], found["settled"]) == (1, False)
 
 
+def test_corrected_logs_may_lie_beside_the_folder_of_the_raw_ones(
+    raw: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    below = raw.parent / "results" / "raw"
+    below.mkdir(parents=True)
+    own = raw.rename(below / "R1")
+    assert command(capsys, "study", "calibrate", own, "-o", below.parent).code == 0
+    assert (below.parent / "R1" / "frames.parquet").is_file()
+
+
 def test_a_log_is_not_written_over(raw: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = raw.rename(raw.parent / "R1")
     assert_refused(
-        command(capsys, "study", "calibrate", own, "-o", own.parent), "--output", "holds the input"
+        command(capsys, "study", "calibrate", own, "-o", own.parent), "--output", "R1 is an input"
     )
     reply = command(capsys, "study", "calibrate", own, own, "-o", own.parent / "logs")
     assert_refused(reply, "R1", "more than one log")
