@@ -10,6 +10,11 @@ import scipy
 from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.covariance import with_common_motion
 from mapfusion.align.refinement import Refinement
+from mapfusion.align.rigid_motion import (
+    least_squares_gain,
+    motion_covariance,
+    residual_covariances,
+)
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -462,10 +467,14 @@ class PairVerifier:
 
     def _why_unsure(self, alignment: Alignment) -> str:
         """Return why the covariance of an alignment is too large; empty if it is not."""
-        settings, p_a = self._settings.evidence, self._pairs.p_a[alignment.inlier, :2]
-        # labelled landmarks are few and far apart, so that their drift is independent
-        by_name = self._pairs.by_name
-        stated = alignment.covariance if by_name else with_common_motion(alignment, p_a)
+        settings, used = self._settings.evidence, self._pairs[alignment.inlier]
+        stated = with_common_motion(alignment, used.p_a[:, :2])
+        if self._pairs.by_name:
+            # Landmarks with labels fall on each other however far the starts of both maps are off.
+            # They are few and far apart, so that their drift is independent.
+            T_a_b, drift_m2 = alignment.T_a_b, alignment.drift_sigma_m**2 * np.eye(2)
+            own = residual_covariances(T_a_b, used.covariance_a, used.covariance_b)
+            stated = motion_covariance(least_squares_gain(T_a_b, used.p_b), own + drift_m2)
         p_b = self._pairs.map_b.position_m[:, :2]
         sigma_m, sigma_rad = landmark_sigma_m(alignment.T_a_b, stated, p_b), math.sqrt(stated[2, 2])
         if sigma_m <= settings.max_sigma_m and sigma_rad <= settings.max_sigma_rad:
