@@ -197,10 +197,13 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
                     )
 
 
-def require_folder(path: Path | None, inputs: Iterable[Path | str | None] = ()) -> None:
+def require_folder(
+    path: Path | None, inputs: Iterable[Path | str | None] = (), may_hold: bool = False
+) -> None:
     """Raise InputError unless a folder can be written, is no input and contains no input folder.
 
-    It may contain input files, such as the scenario whose results are written.
+    It may contain input files, such as the scenario whose results are written; and input folders if
+    `may_hold`, for a command that itself refuses to write into them.
     """
     from mapfusion.files import require_writable
     from mapfusion.landmark_map import MAP_ENDINGS
@@ -217,7 +220,8 @@ def require_folder(path: Path | None, inputs: Iterable[Path | str | None] = ()) 
     for each in _paths(inputs):
         if _is_same(path, each):
             raise InputError(f"--output {path}: is an input; name another folder")
-        if each.is_dir() and each.resolve().is_relative_to(path.resolve()):
+        held = each.is_dir() and each.resolve().is_relative_to(path.resolve())
+        if held and not may_hold:
             raise InputError(f"--output {path}: holds the input {each}; name another folder")
 
 

@@ -355,7 +355,7 @@ def calibrate(
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of
 
-    require_folder(output, [scenario])  # it may hold the input logs in other folders
+    require_folder(output, [*logs, scenario], may_hold=True)
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
         found = calibrate_logs(logs, output, settings, show)

@@ -184,7 +184,6 @@ def test_a_file_of_a_log_is_no_output_under_another_name(
         ("import mrclam log -o log", ["is an input"]),
         ("import euroc log -o .", ["holds the input log"]),
         ("study calibrate log -o log", ["is an input"]),
-        ("study calibrate log -o .", ["holds the input log"]),
         ("export log --format tum -o log", ["is an input"]),
         ("export log --format tum -o a.csv", ["a.csv: ends in .csv, as a file does"]),
         ("record quick -o logs.parquet", ["ends in .parquet", "writes a folder"]),
