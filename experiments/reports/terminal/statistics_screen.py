@@ -113,10 +113,8 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
     note += "errors of T_a_b, medians over pairs in one map; (95 %, Wilson, bootstrap)"
     title = "Alignments between robots at the end"
     _print(_rows(summary, "team_pairs"), _TEAM_PAIRS, title, note)
-    note = (
-        "accepted alignments of maps with joint covariances; in 90 %: true motions in the stated\n"
-    )
-    note += "90 % ellipsoid; (95 %, bootstrap)"
+    note = "accepted alignments of maps with joint covariances; in 90 %: share of the true\n"
+    note += "motions in the stated 90 % ellipsoid; (95 %, bootstrap)"
     title = "Covariances of T_a_b: median NEES per degree of freedom"
     _print(_rows(summary, "alignment_nees"), _ALIGNMENT_NEES, title, note)
     nees = _rows(summary, "nees")
