@@ -13,7 +13,7 @@ from mapfusion.align.correspondences import Correspondences, HeightGate, nearest
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.geometry.se2 import inverse, transform_points
+from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
 
@@ -206,33 +206,30 @@ def self_motions(
     return pairs, found
 
 
-def count_exclusive(pairs: Pairs, inlier: np.ndarray, T_other: Float, gate_m: float) -> int:
-    """Count the supporters of one motion that have no twin under another motion.
+def explained_landmarks(
+    map_a: LandmarkMap, map_b: LandmarkMap, T_a_b: Float, gate_m: float
+) -> np.ndarray:
+    """Return, shape (N_b,), True for landmarks of map b that a motion lays on similar ones of a.
 
-    A pair has a twin if either of its landmarks lies near a similar landmark of the other map under
-    the other motion. Structure that repeats supports both motions, and the correspondences follow
-    one or the other by chance; only the other supporters can tell which motion is right.
+    Landmarks are similar if their descriptors are. Without descriptors all landmarks are similar.
 
     Args:
-        pairs: correspondences of two maps without labels.
-        inlier: supporters of the one motion, bool, shape (N,).
-        T_other: the other motion, shape (3,).
-        gate_m: largest distance of twins in the plane.
+        map_a: the reference map, without labels.
+        map_b: the other map.
+        T_a_b: motion, shape (3,).
+        gate_m: largest distance in the plane.
     """
-    twin = np.zeros(int(np.count_nonzero(inlier)), dtype=bool)
-    for own, other, rows, T in (
-        (pairs.map_a, pairs.map_b, pairs.index_a[inlier], inverse(T_other)),
-        (pairs.map_b, pairs.map_a, pairs.index_b[inlier], T_other),
-    ):
-        moved = transform_points(T, own.position_m[rows, :2])
-        near = scipy.spatial.KDTree(other.position_m[:, :2]).query_ball_point(moved, gate_m)
-        for k, (row, found) in enumerate(zip(rows, near, strict=True)):
-            if found and own.descriptor is not None and other.descriptor is not None:
-                off = own.descriptor[row] - other.descriptor[found]
-                twin[k] |= bool(np.min(np.linalg.norm(off, axis=1)) <= _UNLIKE)
-            else:
-                twin[k] |= bool(found)
-    return int(np.count_nonzero(~twin))
+    moved = transform_points(T_a_b, map_b.position_m[:, :2])
+    near = scipy.spatial.KDTree(map_a.position_m[:, :2]).sparse_distance_matrix(
+        scipy.spatial.KDTree(moved), gate_m, output_type="ndarray"
+    )
+    row_a, row_b = near["i"], near["j"]
+    if map_a.descriptor is not None and map_b.descriptor is not None:
+        off = map_a.descriptor[row_a] - map_b.descriptor[row_b]
+        row_b = row_b[np.linalg.norm(off, axis=1) <= _UNLIKE]
+    explained = np.zeros(len(map_b), np.bool_)
+    explained[row_b] = True
+    return explained
 
 
 def _within(T_a_b: Float, p_a: Float, p_b: Float, gate_m: float) -> np.ndarray:

@@ -16,7 +16,7 @@ from mapfusion.align.rigid_motion import (
     residual_covariances,
 )
 from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.se2 import transform_points
+from mapfusion.geometry.se2 import compose, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.likelihood import (
@@ -37,9 +37,8 @@ from mapfusion.verification.rivals import (
     BETWEEN,
     DISTINCT_M,
     RepeatedLandmarks,
-    SupportedMotion,
-    count_exclusive,
     distinct_motions,
+    explained_landmarks,
     longest_patch_side_m,
     repeated_under_others,
     rms_distance_m,
@@ -323,11 +322,7 @@ class PairVerifier:
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
             if rival := self._equal_rival(alignment):
-                status, n = Status.AMBIGUOUS, np.count_nonzero(alignment.inlier)
-                reason = (
-                    f"{n} correspondences support it, {np.count_nonzero(rival.inlier)} support "
-                    f"{_motion_text(rival.T_a_b)}; nothing tells which one is right: {why}"
-                )
+                status, reason = Status.AMBIGUOUS, f"{rival}; nothing tells which is right: {why}"
             else:
                 reason = f"no evidence to the contrary could be sought: {why}"
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
@@ -342,38 +337,61 @@ class PairVerifier:
         if self.evidence is not None:
             others = [each.T_a_b for each in self._others(alignment.T_a_b, self.evidence)]
         else:
-            others = [each.T_a_b for each in self._other_motions(alignment.T_a_b)]
+            others = self._other_motions(alignment.T_a_b)
         refined = (self._settings.refinement.refine(self._pairs, each) for each in others)
         return [replace(each, status=Status.AMBIGUOUS) for each in refined if each.ok]
 
     @cached_property
-    def _motions(self) -> list[SupportedMotion]:
-        """Best distinct motions between maps without labels, found at first use."""
-        own = self._settings
-        if self._pairs.by_name:
-            return []
-        return distinct_motions(self._pairs, N_RIVALS, own.acceptance, own.refinement)
+    def _motions_beyond_chance(self) -> tuple[list[Float], list[Float], list[Float]]:
+        """Motions beyond chance between the maps, of a onto itself and of b onto itself."""
+        own, pairs = self._settings, self._pairs
+        if pairs.by_name:
+            return [], [], []
+        between = distinct_motions(pairs, N_RIVALS, own.acceptance, own.refinement)
+        found = [between]
+        for landmarks in (pairs.map_a, pairs.map_b):
+            parts = (N_SELF_MOTIONS, own.acceptance, own.refinement)
+            found.append(self_motions(landmarks, *parts)[1])
+        known = [[m.T_a_b for m in of if m.log10_false_alarms <= self._bound] for of in found]
+        return known[0], known[1], known[2]
 
-    def _other_motions(self, T_a_b: Float) -> list[SupportedMotion]:
-        """Return the motions of maps without evidence that differ from a motion."""
-        p_b = self._pairs.map_b.position_m[:, :2]
-        return [m for m in self._motions if rms_distance_m(T_a_b, m.T_a_b, p_b) >= DISTINCT_M]
+    def _other_motions(self, T_a_b: Float) -> list[Float]:
+        """Return the motions of maps without evidence that may be right in place of a motion.
 
-    def _equal_rival(self, alignment: Alignment) -> SupportedMotion | None:
-        """Return a motion beyond chance that the alignment does not outdo; None without one.
-
-        Supporters that have a twin under the other motion tell nothing. Of the others either motion
-        has as many if nothing but the repeated structure is common to the maps (sign test).
+        A motion that maps a part of one map onto a similar part gives another motion between the
+        maps, even if too few correspondences follow it: each landmark has one correspondence only.
         """
-        gate_m = max(self._settings.acceptance.gates_m)
-        for rival in self._other_motions(alignment.T_a_b):
-            if rival.log10_false_alarms > self._bound:
-                continue
-            own = count_exclusive(self._pairs, alignment.inlier, rival.T_a_b, gate_m)
-            its = count_exclusive(self._pairs, rival.inlier, alignment.T_a_b, gate_m)
+        between, of_a, of_b = self._motions_beyond_chance
+        p_b = self._pairs.map_b.position_m[:, :2]
+        by_symmetry = [compose(T, T_a_b) for T in of_a] + [compose(T_a_b, T) for T in of_b]
+        others: list[Float] = []
+        for T in [*between, *by_symmetry]:
+            if all(rms_distance_m(T, each, p_b) >= DISTINCT_M for each in [T_a_b, *others]):
+                others.append(T)
+        return others
+
+    def _equal_rival(self, alignment: Alignment) -> str:
+        """Return in words a motion that the alignment does not outdo; empty without one.
+
+        Landmarks of map b that both motions lay on similar landmarks of map a tell nothing. If
+        only the structure that repeats is common to the maps, each motion explains as many of the
+        others (sign test).
+        """
+        maps, gate_m = (
+            (self._pairs.map_a, self._pairs.map_b),
+            max(self._settings.acceptance.gates_m),
+        )
+        by_own = explained_landmarks(*maps, alignment.T_a_b, gate_m)
+        for T_a_b in self._other_motions(alignment.T_a_b):
+            by_rival = explained_landmarks(*maps, T_a_b, gate_m)
+            own, its = (int(np.count_nonzero(m)) for m in (by_own & ~by_rival, by_rival & ~by_own))
             if scipy.special.bdtrc(own - 1, own + its, 0.5) > _EQUAL:  # P(X >= own)
-                return rival
-        return None
+                counts = [int(np.count_nonzero(m)) for m in (by_own, by_rival)]
+                return (
+                    f"it lays {counts[0]} landmarks of map {maps[1].name} on similar ones of "
+                    f"map {maps[0].name}, {_motion_text(T_a_b)} lays {counts[1]}"
+                )
+        return ""
 
     def features(self, alignment: Alignment) -> EvidenceFeatures | None:
         """Return the features of an alignment; None if the maps carry no evidence."""

@@ -1,11 +1,14 @@
 """Tests of `mapfusion.verification.rivals`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from mapfusion.align.nearest_neighbours import Grid
 from mapfusion.align.refinement import Refinement
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters, ViewedMap, ViewedMapPair
@@ -13,6 +16,7 @@ from mapfusion.verification.rivals import (
     BETWEEN,
     RepeatedLandmarks,
     count_neighbours,
+    explained_landmarks,
     longest_patch_side_m,
     mark_repeated,
     repeated_under_others,
@@ -138,3 +142,23 @@ def test_motions_lie_apart_by_the_root_mean_square_over_the_points() -> None:
     expected = 2 * np.sin(0.3) * np.sqrt((1 + 4 + 25) / 3)
     assert rms_distance_m(turn, np.zeros(3), p) == pytest.approx(expected)
     assert rms_distance_m(np.zeros(3), turn, p) == pytest.approx(expected)
+
+
+def test_explained_landmarks_equal_the_slow_twin() -> None:
+    rng = np.random.default_rng(3)
+    maps, T_a_b = [], np.array([0.3, -0.2, 0.1])
+    for n in (60, 50):
+        about = np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.ones(n, np.int32), np.arange(n)
+        position_m = rng.uniform(0, 4, (n, 3))
+        maps.append(LandmarkMap(position_m, *about, descriptor=rng.uniform(0, 0.18, (n, 64))))
+    a, b = maps
+    moved = b.position_m[:, :2] @ se2.rotation(T_a_b[2]).T + T_a_b[:2]
+    near = np.linalg.norm(a.position_m[:, None, :2] - moved, axis=2) <= 0.4
+    assert a.descriptor is not None
+    assert b.descriptor is not None
+    alike = np.linalg.norm(a.descriptor[:, None] - b.descriptor, axis=2) <= 0.6
+    found = explained_landmarks(a, b, T_a_b, 0.4)
+    np.testing.assert_array_equal(found, (near & alike).any(axis=0))
+    bare = (replace(own, descriptor=None) for own in maps)
+    np.testing.assert_array_equal(explained_landmarks(*bare, T_a_b, 0.4), near.any(axis=0))
+    assert 10 < found.sum() < near.any(axis=0).sum() < 50

@@ -10,7 +10,7 @@ import pytest
 
 from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.clique import Clique
-from mapfusion.align.correspondences import Correspondences, match
+from mapfusion.align.correspondences import match
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification import verdict as verdict_module
@@ -248,49 +248,53 @@ def test_where_the_frames_have_their_origins_does_not_matter() -> None:
     assert there == pytest.approx(landmark_sigma_m(T, COVARIANCE, P_B), rel=1e-9)
 
 
-def symmetric_rooms(rng: np.random.Generator, n_alike: int, n_other: int) -> Pairs:
-    """Return two maps of a room of which most landmarks have a twin after half a turn.
-
-    Twins look alike, so that half of their correspondences belong to the wrong one.
-    """
-    p = rng.uniform(-4, 4, (n_alike // 2, 2))
-    others = rng.uniform(-4, 4, (n_other, 2))
-    points = np.zeros((n_alike + n_other, 3))
-    points[:, :2] = np.concatenate([p, -p, others])
-    n = len(points)
-    index_b = np.arange(n)
-    swapped = rng.random(n_alike // 2) < 0.5
-    first = np.flatnonzero(swapped)
-    index_b[first], index_b[first + n_alike // 2] = first + n_alike // 2, first
-    about = np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.ones(n, np.int32), np.arange(n)
-    T_b_a = se2.inverse(TRUE)
-    moved = points.copy()
-    moved[:, :2] = se2.transform_points(T_b_a, points[:, :2])
-    maps = [LandmarkMap(own + rng.normal(0, 0.01, (n, 3)), *about) for own in (points, moved)]
-    return Pairs(*maps, Correspondences(np.arange(n), index_b, rng.uniform(0, 0.3, n)))
-
-
 TRUE = np.array([2.0, -1.0, 0.4])
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_a_symmetric_room_is_ambiguous_without_viewing_evidence(seed: int) -> None:
-    pairs = symmetric_rooms(np.random.default_rng(seed), 40, 0)
+def symmetric_rooms(seed: int, n_twins: int, n_other: int, n_kept: int) -> Pairs:
+    """Return two maps of a room with landmarks that have a twin after half a turn, and others.
+
+    Each map holds `n_kept` of the landmarks. Twins have the same descriptor but for noise.
+    """
+    rng = np.random.default_rng(seed)
+    n = 2 * n_twins + n_other
+    points = np.column_stack([rng.uniform(-4, 4, (n, 2)), rng.uniform(0.2, 1.5, n)])
+    points[n_twins : 2 * n_twins] = points[:n_twins] * [-1, -1, 1]
+    looks = rng.normal(size=(n, 64))
+    looks[n_twins : 2 * n_twins] = looks[:n_twins]
+    maps = []
+    for name, T_map_room in (("a", np.zeros(3)), ("b", se2.inverse(TRUE))):
+        kept = np.sort(rng.permutation(n)[:n_kept])
+        own = points[kept] + rng.normal(0, 0.01, (n_kept, 3))
+        own[:, :2] = se2.transform_points(T_map_room, own[:, :2])
+        seen = looks[kept] + rng.normal(0, 0.15, (n_kept, 64))
+        seen = (seen / np.linalg.norm(seen, axis=1)[:, None]).astype(np.float32)
+        about = np.tile(1e-4 * np.eye(3), (n_kept, 1, 1)), np.ones(n_kept, np.int32)
+        maps.append(LandmarkMap(own, *about, np.arange(n_kept), descriptor=seen, name=name))
+    return Pairs(*maps, match(*maps))
+
+
+@pytest.mark.parametrize("n_kept", [60, 52, 40])
+@pytest.mark.parametrize("seed", range(7))
+def test_a_symmetric_room_is_ambiguous_without_viewing_evidence(seed: int, n_kept: int) -> None:
+    pairs = symmetric_rooms(seed, 30, 0, n_kept)
     done = Registration(Clique()).register(pairs.map_a, pairs.map_b, pairs.correspondences, None)
     assert done.verdict.status is Status.AMBIGUOUS
     rival = re.search(r"T_a_b = \((.*) m, (.*) m, (.*) rad\)", done.verdict.reason)
     assert rival is not None
     motions = np.array([done.refined.T_a_b, np.array(rival.groups(), float)])
-    turned = se2.compose(np.array([0.0, 0.0, np.pi]), TRUE)
-    for expected in (TRUE, turned):
+    for expected in (TRUE, se2.compose(np.array([0.0, 0.0, np.pi]), TRUE)):
         off = motions - expected
         off[:, 2] = se2.wrap(off[:, 2])
-        assert np.abs(off).max(axis=1).min() < 0.05
+        assert np.abs(off).max(axis=1).min() < 0.1
 
 
+@pytest.mark.parametrize(("n_twins", "n_other"), [(10, 40), (30, 10)])
 @pytest.mark.parametrize("seed", range(5))
-def test_a_room_with_few_twins_is_accepted_without_viewing_evidence(seed: int) -> None:
-    pairs = symmetric_rooms(np.random.default_rng(seed), 20, 40)
+def test_a_room_with_other_landmarks_is_accepted_without_viewing_evidence(
+    seed: int, n_twins: int, n_other: int
+) -> None:
+    pairs = symmetric_rooms(seed, n_twins, n_other, 2 * n_twins + n_other)
     done = Registration(Clique()).register(pairs.map_a, pairs.map_b, pairs.correspondences, None)
     assert done.verdict.accepted
     assert np.abs(done.refined.T_a_b - TRUE).max() < 0.05
