@@ -377,19 +377,17 @@ class PairVerifier:
         only the structure that repeats is common to the maps, each motion explains as many of the
         others (sign test).
         """
-        maps, gate_m = (
-            (self._pairs.map_a, self._pairs.map_b),
-            max(self._settings.acceptance.gates_m),
-        )
+        maps = self._pairs.map_a, self._pairs.map_b
+        gate_m = max(self._settings.acceptance.gates_m)
         by_own = explained_landmarks(*maps, alignment.T_a_b, gate_m)
         for T_a_b in self._other_motions(alignment.T_a_b):
             by_rival = explained_landmarks(*maps, T_a_b, gate_m)
             own, its = (int(np.count_nonzero(m)) for m in (by_own & ~by_rival, by_rival & ~by_own))
             if scipy.special.bdtrc(own - 1, own + its, 0.5) > _EQUAL:  # P(X >= own)
-                counts = [int(np.count_nonzero(m)) for m in (by_own, by_rival)]
+                of, of_rival = (int(np.count_nonzero(m)) for m in (by_own, by_rival))
                 return (
-                    f"it lays {counts[0]} landmarks of map {maps[1].name} on similar ones of "
-                    f"map {maps[0].name}, {_motion_text(T_a_b)} lays {counts[1]}"
+                    f"{_motion_text(alignment.T_a_b)} explains {of} landmarks of map "
+                    f"{maps[1].name}, {_motion_text(T_a_b)} explains {of_rival}"
                 )
         return ""
 
