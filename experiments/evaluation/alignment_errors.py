@@ -16,6 +16,7 @@ from experiments.evaluation.truth import (
     common_landmarks,
     join_map_pairs,
     load_robot,
+    load_robot_smoothed,
     motion_errors,
     squared_mahalanobis,
 )
@@ -121,16 +122,23 @@ class EvaluationSettings:
 
 
 def run_evaluation(settings: EvaluationSettings, job: Job) -> None:
-    """Write the pair's `errors.parquet` and `fusion.parquet`."""
-    robots = [load_robot(folders) for folders in folders_of_both(job)]
-    aligned = [tables.read(job.inputs["align"] / f"{name}.parquet", name) for name in ALIGNED]
-    map_pairs, radius_m = join_map_pairs(robots, *aligned), settings.true_pair_radius_m
-    errors = pd.concat([error_rows(pair, settings.verifier, radius_m) for pair in map_pairs])
-    tables.write(job.output / "errors.parquet", "errors", errors)
+    """Write the pair's `errors.parquet`, `smoothed_errors.parquet` and `fusion.parquet`."""
+    folders, radius_m, map_pairs = folders_of_both(job), settings.true_pair_radius_m, []
+    for name, load, align in (
+        ("smoothed_errors", load_robot_smoothed, job.inputs["align_smoothed"]),
+        ("errors", load_robot, job.inputs["align"]),
+    ):
+        aligned = [tables.read(align / f"{table}.parquet", table) for table in ALIGNED]
+        map_pairs = join_map_pairs([load(each) for each in folders], *aligned)
+        errors = pd.concat([error_rows(pair, settings.verifier, radius_m) for pair in map_pairs])
+        tables.write(job.output / f"{name}.parquet", name, errors)
     fusion = fusion_rows(map_pairs, settings.merge, radius_m)
     tables.write(job.output / "fusion.parquet", "fusion", fusion)
 
 
 EVALUATION_STAGE = StageKind(
-    "judge", "compare with the truth", run_evaluation, ("errors.parquet", "fusion.parquet")
+    "judge",
+    "compare with the truth",
+    run_evaluation,
+    ("errors.parquet", "smoothed_errors.parquet", "fusion.parquet"),
 )

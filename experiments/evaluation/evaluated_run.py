@@ -33,7 +33,6 @@ from experiments.evaluation.truth import (
     load_robot,
 )
 from experiments.pipeline.stage import Stage
-from experiments.pipeline.stages.align import latest_at
 from experiments.pipeline.stages.fuse import read_fusions
 from experiments.pipeline.stages.pipeline import (
     PairStages,
@@ -42,7 +41,7 @@ from experiments.pipeline.stages.pipeline import (
     build_pipeline,
     require_memory,
 )
-from experiments.pipeline.stages.robot_maps import RobotFolders, stored_maps
+from experiments.pipeline.stages.robot_maps import RobotFolders, latest_at, stored_maps
 from experiments.pipeline.stages.slam import read_findings
 from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
@@ -61,7 +60,9 @@ from mapfusion.robot_log import RobotLog, read_log, read_true_poses
 from mapfusion.verification.registration import Aligner
 
 TABLES_PART = "tables"  # part of a run outside its stages, in the table `timings`
-_EVALUATION_TABLES = {"errors", "fusion"}  # the stage `align` writes the other tables of pairs
+SMOOTHED_PREFIX = "smoothed_"  # of tables of alignments of smoothed maps
+# Tables of pairs that the evaluation writes; the stage `align` writes the others.
+_EVALUATION_TABLES = {"errors", "smoothed_errors", "fusion"}
 
 
 _PERCENTILES = {"elapsed_low_s": 10, "elapsed_s": 50, "elapsed_high_s": 90}
@@ -161,7 +162,8 @@ class EvaluatedRun:
         no_truth = scenario.why_no_truth()
         kind, evaluations = EVALUATION_STAGE, []
         for pair in () if no_truth else pipeline.pairs:
-            before = {"align": pair.estimates, "log_a": pair.a.log, "slam_a": pair.a.slam}
+            before = {"align": pair.filtered.estimates, "align_smoothed": pair.smoothed.estimates}
+            before |= {"log_a": pair.a.log, "slam_a": pair.a.slam}
             before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
             before |= {"smooth_a": pair.a.smooth, "smooth_b": pair.b.smooth}
             evaluations.append(
@@ -271,17 +273,20 @@ class EvaluatedRun:
     def untimed(self) -> Iterator[tuple[PairStages, Path]]:
         """Yield robot pairs without a table `aligner_timings`, and the path of this table."""
         for pair in self.pipeline.pairs:
-            path = self.store.path(pair.estimates) / "aligner_timings.parquet"
+            path = self.store.path(pair.filtered.estimates) / "aligner_timings.parquet"
             if not path.is_file():
                 yield pair, path
 
     def pair_table(self, name: str) -> pd.DataFrame:
         """Return a table of robot pairs, of all pairs."""
-        of_evaluation = name in _EVALUATION_TABLES
-        stages = (
-            self.evaluations if of_evaluation else [pair.estimates for pair in self.pipeline.pairs]
-        )
-        parts = [tables.read(self.store.path(s) / f"{name}.parquet", name) for s in stages]
+        if name in _EVALUATION_TABLES:
+            stages, file = self.evaluations, name
+        else:
+            file, pairs = name.removeprefix(SMOOTHED_PREFIX), self.pipeline.pairs
+            stages = [
+                (each.filtered if file == name else each.smoothed).estimates for each in pairs
+            ]
+        parts = [tables.read(self.store.path(s) / f"{file}.parquet", name) for s in stages]
         return pd.concat(parts, ignore_index=True) if parts else tables.as_table(name, [])
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:
@@ -308,8 +313,9 @@ class EvaluatedRun:
                 if any(self.untimed()):
                     _ = self.timings
 
-        robots, estimates = self.pipeline.robots, [p.estimates for p in self.pipeline.pairs]
-        loaded = [*(robot.slam for robot in robots), *estimates]
+        robots, pairs = self.pipeline.robots, self.pipeline.pairs
+        estimates = [each.estimates for p in pairs for each in (p.filtered, p.smoothed)]
+        loaded = [robot.slam for robot in robots] + [pair.filtered.estimates for pair in pairs]
         needs = tuple(name for stage in loaded for name in task_names(stage))
         load_task = Task("team", "load the maps", load, (), (), needs)
         try:

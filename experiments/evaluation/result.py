@@ -179,7 +179,7 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
     def landmark_nees() -> list[dict[str, Any]]:
         return fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m)
 
-    of_pairs = ("errors", *ALIGNED, "fusion")
+    of_pairs = ("errors", *ALIGNED, "fusion", "smoothed_errors", "smoothed_estimates")
     makers: dict[str, TableMaker] = {name: partial(run.pair_table, name) for name in of_pairs}
     makers |= {
         "landmarks": landmarks,

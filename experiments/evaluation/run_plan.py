@@ -120,7 +120,7 @@ def _kind(stage: Stage, scenario: AnyScenario) -> str:
 
 def _amounts(run: EvaluatedRun) -> dict[Stage, float]:
     """Return the amount of work of each stage, in the units of `_TYPICAL_S`."""
-    pipeline, every = run.pipeline, run.scenario.evaluate.every
+    pipeline = run.pipeline
     amounts: dict[Stage, float] = dict.fromkeys(run.stages(), 1.0)
     frames = sum(robot.n_frames for robot in pipeline.robots)
     for robot in pipeline.robots:
@@ -133,8 +133,9 @@ def _amounts(run: EvaluatedRun) -> dict[Stage, float]:
         amounts[drive] = float(frames)
     maps: dict[Stage, float] = {}
     for pair in pipeline.pairs:
-        n_maps = float(-(-max(pair.a.n_frames, pair.b.n_frames) // every))
-        maps |= dict.fromkeys((pair.match, *pair.aligners.values(), pair.estimates), n_maps)
+        for each in (pair.filtered, pair.smoothed):
+            n_maps = float(len(each.match.settings.iterations))
+            maps |= dict.fromkeys((each.match, *each.aligners.values(), each.estimates), n_maps)
     for stage in run.evaluations:
         estimates = stage.before["align"]
         assert isinstance(estimates, Stage)

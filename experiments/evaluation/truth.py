@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,15 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from experiments.pipeline.stages.align import alignment_of, correspondences_of, latest_at
-from experiments.pipeline.stages.robot_maps import ROBOTS_KEPT, RobotFolders, stored_maps
+from experiments.pipeline.stages.align import alignment_of, correspondences_of
+from experiments.pipeline.stages.robot_maps import (
+    ROBOTS_KEPT,
+    RobotFolders,
+    latest_at,
+    smoothed_maps,
+    stored_maps,
+)
+from experiments.pipeline.stages.smooth import read_smoothed_path, smoothed_owners
 from experiments.pipeline.tables import records
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid
@@ -270,3 +277,20 @@ def load_robot(folders: RobotFolders, viewing: bool = True) -> EvaluatedRobot:
     maps = stored_maps(folders, viewing=viewing)
     points = landmark_truth(truth, maps.associations.at, maps)
     return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def load_robot_smoothed(folders: RobotFolders) -> EvaluatedRobot:
+    """Load a robot's smoothed maps as `load_robot` does; see `smoothed_maps`."""
+    robot, maps = load_robot(folders), smoothed_maps(folders, viewing=True)
+    assert folders.smooth is not None
+    smooth, smoothed = folders.smooth, {*read_smoothed_path(folders.smooth)}
+    associations = stored_maps(folders, viewing=True).associations
+
+    def owners_at(iteration: int, n: int) -> np.ndarray:
+        if iteration in smoothed:
+            return smoothed_owners(smooth, folders.slam, iteration, n)
+        return associations.at(iteration, n)
+
+    truth = truth_or_unknown(folders.log, read_log(folders.log))
+    return replace(robot, maps=maps, points_world_m=landmark_truth(truth, owners_at, maps))

@@ -152,7 +152,7 @@ class RecordedTeam:
         """Stages that must be finished, in any number of processes, before measurements."""
         pipeline = self.run.pipeline
         smoothed = [robot.smooth for robot in pipeline.robots]
-        return [*smoothed, *(pair.estimates for pair in pipeline.pairs)]
+        return [*smoothed, *(pair.smoothed.estimates for pair in pipeline.pairs)]
 
     @property
     def measured(self) -> list[Stage]:
@@ -182,18 +182,14 @@ class RecordedTeam:
         """Measurement of the alignment of each pair of maps."""
         found = list[Stage]()
         for pair in self.run.pipeline.pairs:
-            aligned = next(iter(pair.aligners.values()))
-            matched, own = pair.match.settings, aligned.settings
+            aligned = next(iter(pair.smoothed.aligners.values()))
+            matched, own = pair.smoothed.match.settings, aligned.settings
             assert isinstance(matched, MatchSettings)
             assert isinstance(own, AlignerSettings)
             # the batches of iterations in which the aligner ran do not change its cost
             own = replace(own, iterations=())
-            before = {
-                "log_a": pair.a.log,
-                "slam_a": pair.a.slam,
-                "log_b": pair.b.log,
-                "slam_b": pair.b.slam,
-            }
+            before = {"log_a": pair.a.log, "slam_a": pair.a.slam, "smooth_a": pair.a.smooth}
+            before |= {"log_b": pair.b.log, "slam_b": pair.b.slam, "smooth_b": pair.b.smooth}
             found.append(
                 Stage(
                     "pair_costs",

@@ -20,8 +20,9 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import fuse, smooth
-from experiments.pipeline.stages.align import AlignerSettings, latest_at, maps_of_both
+from experiments.pipeline.stages.align import AlignerSettings
 from experiments.pipeline.stages.fuse import FuseSettings
+from experiments.pipeline.stages.robot_maps import folders_of_both, latest_at, maps_of
 from experiments.pipeline.stages.slam import SlamSettings
 from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows
@@ -224,7 +225,8 @@ class PairCostSettings:
 def measure_pair(settings: PairCostSettings, job: Job) -> None:
     """Write the cost of aligning two maps at each iteration, with matching and acceptance."""
     single_threaded()
-    maps_a, maps_b = maps_of_both(job)
+    smoothed = settings.aligner.smoothed
+    maps_a, maps_b = (maps_of(each, smoothed=smoothed) for each in folders_of_both(job))
     both = {k: (latest_at(maps_a, k), latest_at(maps_b, k)) for k in settings.iterations}
     _align(settings, *both[settings.iterations[-1]])  # compiles and fills caches
     costs = [cost_row(k, ALIGNMENT, _align(settings, *maps)) for k, maps in both.items()]

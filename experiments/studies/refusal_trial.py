@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation.tables import table_path
-from experiments.pipeline.stages.align import latest_at
+from experiments.pipeline.stages.robot_maps import latest_at
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.tasks import OnProgress
 from experiments.pipeline.workers import workers

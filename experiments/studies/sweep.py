@@ -105,7 +105,15 @@ def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[Swe
 
 
 _LONGEST_NAME = 80
-_TABLES = ("errors", "fusion", "robots", "path_statistics", "map_fits", "landmark_nees")
+_TABLES = (
+    "errors",
+    "smoothed_errors",
+    "fusion",
+    "robots",
+    "path_statistics",
+    "map_fits",
+    "landmark_nees",
+)
 _TABLES += ("sightings", "smoother", "team", "team_pairs", "fusers")
 
 
@@ -181,7 +189,7 @@ def plan_run(
     pipeline = evaluated.pipeline
     stages = [f"{each.name}/{each.key}" for each in evaluated.stages()]
     read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam, robot.smooth)]
-    read += [*(pair.estimates for pair in pipeline.pairs), *evaluated.evaluations]
+    read += [*(pair.filtered.estimates for pair in pipeline.pairs), *evaluated.evaluations]
     read += pipeline.fusers.values()
     needs = tuple(name for stage in read for name in task_names(stage))
     name, arguments = f"run/{run.run_id}", (run, evaluated, stages, tables.dataset)

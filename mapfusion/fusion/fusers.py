@@ -6,8 +6,7 @@ that implements `Fuser` and has a constructor without arguments.
 
 import importlib
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from itertools import zip_longest
 from typing import Annotated, Any, Protocol
@@ -17,7 +16,7 @@ import numpy as np
 from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.errors import did_you_mean, moved_module_note
-from mapfusion.fusion.aligned_landmarks import ABSENT, AssociationTest
+from mapfusion.fusion.aligned_landmarks import AssociationTest
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
@@ -189,27 +188,6 @@ class Component:
             own = [p.alignment.drift_sigma_m for p in self.pairs if k in (p.a, p.b)]
             drift[k] = np.sqrt(np.mean(np.square(own)) / 2) if own else 0.0
         return drift
-
-    def on(self, maps: Sequence[LandmarkMap]) -> "Component":
-        """Return the component with other maps of the same observations.
-
-        Inliers without a landmark in both new maps are removed.
-        """
-        row_of = []  # row in the new map of each landmark of the old map
-        for old, new in zip(self.maps, maps, strict=True):
-            rows = {int(source): row for row, source in enumerate(new.source_observation)}
-            sources = old.source_observation
-            row_of.append(np.array([rows.get(int(s), ABSENT) for s in sources], dtype=np.int64))
-        pairs = []
-        for pair in self.pairs:
-            known = pair.inliers
-            index_a = row_of[pair.a][known.index_a]
-            index_b = row_of[pair.b][known.index_b]
-            kept = (index_a != ABSENT) & (index_b != ABSENT)
-            inliers = Correspondences(index_a[kept], index_b[kept], known.distance[kept])
-            alignment = replace(pair.alignment, inlier=np.ones(len(inliers), dtype=bool))
-            pairs.append(replace(pair, alignment=alignment, correspondences=inliers))
-        return replace(self, maps=tuple(maps), pairs=tuple(pairs))
 
 
 class Fuser(Protocol):

@@ -42,7 +42,6 @@ class ConnectedMaps:
         self,
         fuser: Fuser,
         parameters: MergeParameters,
-        smoothed: Sequence[LandmarkMap] | None = None,
         recordings: Sequence[AssociatedLog | None] = (),
     ) -> Fusion:
         """Fuse the maps of each component.
@@ -50,12 +49,9 @@ class ConnectedMaps:
         Args:
             fuser: fusion method.
             parameters: parameters of the merge.
-            smoothed: smoothed maps of the same robots, for fusers that use them.
-            recordings: logs of the smoothed maps, for fusers that smooth again.
+            recordings: logs of the maps, if these are smoothed, for fusers that smooth again.
         """
         given = [replace(each, recordings=tuple(recordings)) for each in self.components]
-        if fuser.smoothed and smoothed is not None:
-            given = [component.on(smoothed) for component in given]
         return Fusion(tuple(fuser.fuse(each, parameters) for each in given), self.edge_status)
 
 

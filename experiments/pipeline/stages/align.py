@@ -7,7 +7,7 @@ import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,9 +17,9 @@ from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages.robot_maps import (
     ROBOTS_KEPT,
     RobotFolders,
-    Snapshots,
     folders_of_both,
-    stored_maps,
+    latest_at,
+    maps_of,
 )
 from experiments.pipeline.tables import (
     CORRESPONDENCES,
@@ -52,19 +52,22 @@ _UPPER = np.triu_indices(3)
 # Evaluated iterations per part: small enough that an interruption loses little and all cores end at
 # about the same time, large enough that reading the maps is fast compared to their alignment.
 _ITERATIONS_PER_BATCH = 12
-_Known = TypeVar("_Known")
 _LABEL = "align the maps"
 _BATCH_FILE, _RIVALS_FILE = "batch_{part}.parquet", "rivals_{part}.parquet"
 
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """Settings of correspondences and rivals, in addition to the maps."""
+    """Settings of correspondences and rivals, in addition to the maps.
+
+    `smoothed` is true for smoothed maps, false for maps of the filter.
+    """
 
     match: MatchParameters
     acceptance: Acceptance
     evidence: EvidenceParameters
     refinement: Refinement
+    smoothed: bool
     iterations: tuple[int, ...]
 
 
@@ -72,13 +75,14 @@ def run_match(settings: MatchSettings, job: Job) -> None:
     """Find correspondences and rival motions of one batch of iterations."""
     made, rivals = [], []
     verifier = Verifier(settings.acceptance, settings.evidence, settings.refinement)
-    for k, map_a, map_b in pairs_of_maps(job, settings.iterations):
+    for k, map_a, map_b in pairs_of_maps(job, settings.smoothed, settings.iterations):
         pairs = match(map_a, map_b, settings.match)
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
         viewed_maps = None
         if not why_not_sought(map_a, map_b):
             a, b = folders_of_both(job)
-            viewed_maps = _viewed_map(a, k), _viewed_map(b, k)
+            of_k = settings.smoothed, k
+            viewed_maps = _viewed_map(a, *of_k), _viewed_map(b, *of_k)
         if evidence := verifier.on(Pairs(map_a, map_b, pairs), viewed_maps=viewed_maps).evidence:
             rivals += rival_rows(names, evidence)
         columns = names | {"index_a": pairs.index_a, "index_b": pairs.index_b}
@@ -91,9 +95,9 @@ MATCH_STAGE = StageKind("match", _LABEL, run_match, (_BATCH_FILE, _RIVALS_FILE))
 
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT * _ITERATIONS_PER_BATCH)
-def _viewed_map(folders: RobotFolders, iteration: int) -> ViewedMap:
+def _viewed_map(folders: RobotFolders, smoothed: bool, iteration: int) -> ViewedMap:
     """Return a robot's map with its cached queries, which all pairs of the robot share."""
-    return ViewedMap(latest_at(stored_maps(folders, viewing=True), iteration))
+    return ViewedMap(latest_at(maps_of(folders, smoothed=smoothed), iteration))
 
 
 def batches(iterations: tuple[int, ...]) -> tuple[str, ...]:
@@ -117,24 +121,14 @@ def rivals_path(folder: Path, part: str) -> Path:
     return folder / _RIVALS_FILE.format(part=part)
 
 
-def maps_of_both(job: Job) -> list[Snapshots]:
-    """Return all maps of the job's two robots, by iteration."""
-    return [stored_maps(folders, viewing=True) for folders in folders_of_both(job)]
-
-
 def pairs_of_maps(
-    job: Job, iterations: tuple[int, ...]
+    job: Job, smoothed: bool, iterations: tuple[int, ...]
 ) -> Iterator[tuple[int, LandmarkMap, LandmarkMap]]:
     """Yield (iteration, map a, map b) of the job's batch."""
-    a, b = maps_of_both(job)
+    a, b = (maps_of(folders, smoothed=smoothed) for folders in folders_of_both(job))
     start = int(job.part) * _ITERATIONS_PER_BATCH
     for k in iterations[start : start + _ITERATIONS_PER_BATCH]:
         yield k, latest_at(a, k), latest_at(b, k)
-
-
-def latest_at(known: Mapping[int, _Known], iteration: int) -> _Known:
-    """Return a robot's value at an iteration; the last one if the log ended earlier."""
-    return known[max((k for k in known if k <= iteration), default=min(known))]
 
 
 def estimate_row(
@@ -239,7 +233,10 @@ _BATCHES_KEPT = 2  # batches in memory of a process: the present one and the nex
 
 @dataclass(frozen=True)
 class AlignerSettings:
-    """Settings of an aligner's estimates, in addition to maps and correspondences."""
+    """Settings of an aligner's estimates, in addition to maps and correspondences.
+
+    `smoothed` is true for smoothed maps, false for maps of the filter.
+    """
 
     seed: int
     name: str
@@ -251,6 +248,7 @@ class AlignerSettings:
     refinement: Refinement
     acceptance: Acceptance
     evidence: EvidenceParameters
+    smoothed: bool
     iterations: tuple[int, ...]
 
 
@@ -260,7 +258,8 @@ def run_aligner(settings: AlignerSettings, job: Job) -> None:
     verifier = Verifier(settings.acceptance, settings.evidence, settings.refinement)
     inputs = tuple(job.inputs.items())
     rows = []
-    for k, refinement in _refinements(inputs, job.part, verifier, settings.iterations):
+    maps = settings.smoothed, settings.iterations
+    for k, refinement in _refinements(inputs, job.part, verifier, *maps):
         pairs, on_pair = refinement.pairs, PairRegistration(aligner, refinement)
         for repetition in range(settings.repetitions if aligner.randomised else 1):
             names = {"robot_a": pairs.map_a.name, "robot_b": pairs.map_b.name, "iteration": k}
@@ -275,7 +274,11 @@ ALIGNER_STAGE = StageKind("aligner", _LABEL, run_aligner, (_BATCH_FILE,))
 
 @functools.lru_cache(maxsize=_BATCHES_KEPT)
 def _refinements(
-    inputs: tuple[tuple[str, Path], ...], part: str, verifier: Verifier, iterations: tuple[int, ...]
+    inputs: tuple[tuple[str, Path], ...],
+    part: str,
+    verifier: Verifier,
+    smoothed: bool,
+    iterations: tuple[int, ...],
 ) -> Sequence[tuple[int, VerifiedRefinement]]:
     """Return iterations of a batch with the data that complete an estimate of any aligner.
 
@@ -286,7 +289,7 @@ def _refinements(
     offered = read_rows(batch_path(job.inputs["match"], part), CORRESPONDENCES)
     rivals = read_rows(rivals_path(job.inputs["match"], part), RIVALS)
     refinements = []
-    for k, map_a, map_b in pairs_of_maps(job, iterations):
+    for k, map_a, map_b in pairs_of_maps(job, smoothed, iterations):
         pairs = Pairs(map_a, map_b, correspondences_of(at_iteration(offered, k)))
         evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), verifier.evidence)
         refinements.append((k, VerifiedRefinement(pairs, verifier.refinement, verifier, evidence)))

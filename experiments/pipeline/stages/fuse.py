@@ -1,7 +1,7 @@
 """Stage: maps of all robots fused by one fuser, at each iteration at which maps are fused.
 
-Maps, alignments and the team's decisions about them are the same for all fusers. Fusers of smoothed
-maps get smoothed maps if they exist.
+Fusers of smoothed maps get the smoothed maps and their alignments, other fusers those of the
+filter. The alignments of the same maps are the same for all fusers.
 """
 
 import time
@@ -16,11 +16,10 @@ import pyarrow as pa
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages import align
 from experiments.pipeline.stages.align import alignment_of, correspondences_of
-from experiments.pipeline.stages.robot_maps import RobotFolders, stored_maps
+from experiments.pipeline.stages.robot_maps import RobotFolders, latest_at, maps_of
 from experiments.pipeline.stages.slam import log_as_filtered
 from experiments.pipeline.stages.smooth import (
     log_until,
-    read_smoothed,
     read_smoothed_path,
     smoothed_owners,
 )
@@ -51,6 +50,7 @@ from mapfusion.files import (
 from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import AlignedPair, FusedMap, MergeParameters, make_fuser
 from mapfusion.fusion.merge import ConnectedMaps, connect
+from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.smoother.joint_smoothing import AssociatedLog
 from mapfusion.smoother.smooth import SmootherParameters
@@ -93,15 +93,13 @@ class GivenTeam:
     """Maps and alignments of a team at an iteration, in the order of the robots.
 
     Attributes:
-        maps: maps of the filter.
+        maps: smoothed maps for fusers that take them, else maps of the filter.
         pairs: alignments of these maps.
-        smoothed: smoothed maps for fusers that take them, else maps of the filter.
         recordings: inputs of the smoothed maps; None for maps of the filter.
     """
 
     maps: Sequence[LandmarkMap]
     pairs: Sequence[AlignedPair]
-    smoothed: Sequence[LandmarkMap]
     recordings: Sequence[AssociatedLog | None]
 
     def connected(self, settings: FuseSettings) -> ConnectedMaps:
@@ -110,8 +108,8 @@ class GivenTeam:
 
     def fused(self, connected: ConnectedMaps, settings: FuseSettings) -> Sequence[FusedMap]:
         """Fuse the maps of each component."""
-        fuser, given = make_fuser(settings.fuser), (self.smoothed, self.recordings)
-        return connected.fused_by(fuser, settings.parameters, *given).fused
+        fuser = make_fuser(settings.fuser)
+        return connected.fused_by(fuser, settings.parameters, self.recordings).fused
 
 
 def run(settings: FuseSettings, job: Job) -> dict[str, float]:
@@ -134,19 +132,19 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
     takes_smoothed = make_fuser(settings.fuser).smoothed
     # our fusers do not use viewing evidence
     viewing = bool(settings.origin)
-    filtered: dict[str, Mapping[int, LandmarkMap]] = {}
-    smoothed: dict[str, Mapping[int, LandmarkMap]] = {}
+    maps: dict[str, Mapping[int, LandmarkMap]] = {}
+    paths: dict[str, Mapping[int, Float]] = {}
     for name in settings.robots:
-        folders = RobotFolders(job.inputs[f"log {name}"], job.inputs[f"slam {name}"])
-        filtered[name] = stored_maps(folders, viewing=viewing)
-        smoothed[name] = read_smoothed(job.inputs[f"smooth {name}"]) if takes_smoothed else {}
+        log, slam, smooth = (job.inputs[f"{stage} {name}"] for stage in ("log", "slam", "smooth"))
+        folders = RobotFolders(log, slam, smooth if takes_smoothed else None)
+        maps[name] = maps_of(folders, smoothed=takes_smoothed, viewing=viewing)
+        paths[name] = read_smoothed_path(smooth) if takes_smoothed else {}
     asked = (name.split(" ") for name in job.inputs)
     alignments = [_Alignments(settings, job, *both) for kind, *both in asked if kind == "aligner"]
     for k in settings.iterations:
-        given, recordings = [], list[AssociatedLog | None]()
+        recordings: list[AssociatedLog | None] = []
         for name in settings.robots:
-            known = {i: own for i, own in smoothed[name].items() if i <= k}
-            given.append(align.latest_at(known or filtered[name], k))
+            known = [i for i in paths[name] if i <= k]
             if not known:
                 recordings.append(None)
                 continue
@@ -154,12 +152,14 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
             log, covariance = log_as_filtered(job.inputs[f"log {name}"], slam)
             log = log_until(log, max(known), settings.noise_floor_m)
             landmark = smoothed_owners(smooth, slam, max(known), len(log.observations))
-            path = read_smoothed_path(smooth)[max(known)]
+            path = paths[name][max(known)]
             smoother = replace(settings.smoother, odometry_covariance=covariance)
             recordings.append(AssociatedLog(log, landmark, path, smoother))
-        maps = [align.latest_at(filtered[name], k) for name in settings.robots]
         pairs = [pair for each in alignments if (pair := each.at(k)) is not None]
-        yield k, GivenTeam(maps, pairs, given, recordings)
+        yield (
+            k,
+            GivenTeam([latest_at(maps[name], k) for name in settings.robots], pairs, recordings),
+        )
 
 
 class _Alignments:

@@ -30,7 +30,7 @@ from experiments.scenario.settings import (
 )
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section
 from mapfusion.errors import InputError
-from mapfusion.fusion.fusers import FUSERS, name_order, target_of
+from mapfusion.fusion.fusers import FUSERS, make_fuser, name_order, target_of
 from mapfusion.robot_log import read_log
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.tables import is_csv, table_path
@@ -60,22 +60,35 @@ class SimulatedRobotStages(RobotStages):
 
 
 @dataclass(frozen=True)
-class PairStages:
-    """Stages of two robots, up to the aligners' estimates from their maps.
+class AlignmentStages:
+    """Stages from the maps of two robots to the aligners' estimates.
 
     Attributes:
-        a: first robot by name.
-        b: second robot.
         match: correspondences and rivals.
         aligners: stages of the aligners by their names in the scenario.
         estimates: estimates of all aligners joined.
     """
 
-    a: RobotStages
-    b: RobotStages
     match: Stage
     aligners: Mapping[str, Stage]
     estimates: Stage
+
+
+@dataclass(frozen=True)
+class PairStages:
+    """Alignments of two robots.
+
+    Attributes:
+        a: first robot by name.
+        b: second robot.
+        filtered: stages on the filter's maps, at each evaluated iteration.
+        smoothed: stages on the smoothed maps, at each iteration at which maps are fused.
+    """
+
+    a: RobotStages
+    b: RobotStages
+    filtered: AlignmentStages
+    smoothed: AlignmentStages
 
 
 @dataclass(frozen=True)
@@ -103,7 +116,8 @@ class Pipeline:
         logs = [robot.log for robot in self.simulated]
         filters = [robot.slam for robot in self.robots]
         maps = [robot.smooth for robot in self.robots]
-        estimates = (pair.estimates for pair in self.pairs)
+        both = ((pair.smoothed, pair.filtered) for pair in self.pairs)
+        estimates = (each.estimates for pair in both for each in pair)
         in_order = [*images, *logs, *filters, *maps, *self.fusers.values(), *estimates]
         return in_dependency_order(in_order)
 
@@ -243,16 +257,35 @@ def smoother_parameters(scenario: Scenario) -> SmootherParameters:
 def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
     """Return the stages of two robots, which are ordered by name."""
     a, b = sorted(robots, key=lambda robot: name_order(robot.name))
-    n_frames = max(a.n_frames, b.n_frames)
-    iterations = tuple(slam.evaluated_iterations(n_frames, scenario.evaluate.every))
-    parts = align.batches(iterations)
+    n_frames, every = max(a.n_frames, b.n_frames), scenario.evaluate.every
+    evaluated = tuple(slam.evaluated_iterations(n_frames, every))
+    fused = tuple(smooth.fused_iterations(n_frames, every, scenario.fuse.every))
+    filtered = {"smoothed": False, "iterations": evaluated}
+    # the variation between repetitions is told by the filter's maps
+    smoothed = {"smoothed": True, "iterations": fused, "repetitions": 1}
+    return PairStages(
+        a, b, _alignment(scenario, a, b, filtered), _alignment(scenario, a, b, smoothed)
+    )
+
+
+def _alignment(
+    scenario: Scenario, a: RobotStages, b: RobotStages, own: dict[str, Any]
+) -> AlignmentStages:
+    """Return the stages that align maps of two robots."""
+    parts = align.batches(own["iterations"])
     maps: dict[str, Stage | RecordedLog] = {}
+    smooth_of: dict[str, Stage | RecordedLog] = {}
     for side, robot in (("a", a), ("b", b)):
         maps |= {f"log_{side}": robot.log, f"slam_{side}": robot.slam}
-    own = {"iterations": iterations}
+        smooth_of[f"smooth_{side}"] = robot.smooth
     # a robot's maps are shared by several pairs, and the matches of a pair by all aligners
     matched = _stage(
-        align.MATCH_STAGE, scenario.align, own=own, before=maps, parts=parts, shares="maps"
+        align.MATCH_STAGE,
+        scenario.align,
+        own=own,
+        before=maps | smooth_of if own["smoothed"] else maps,
+        parts=parts,
+        shares="maps",
     )
     estimates: dict[str, Stage] = {}
     for entry in scenario.align.aligners:
@@ -261,7 +294,7 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
             align.ALIGNER_STAGE,
             *(scenario, scenario.align, entry),
             own=own | {"origin": method.origin()},
-            before=maps | {"smooth_a": a.smooth, "smooth_b": b.smooth, "match": matched},
+            before=maps | smooth_of | {"match": matched},
             parts=parts,
             loads=(method.own_module,),
             # fusing waits for the merging aligner only
@@ -269,7 +302,7 @@ def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
         )
     named = {f"aligner {i}": stage for i, stage in enumerate(estimates.values())}
     joined = _stage(align.ALIGN_STAGE, own={"batches": parts}, before={"match": matched} | named)
-    return PairStages(a, b, matched, estimates, joined)
+    return AlignmentStages(matched, estimates, joined)
 
 
 def _fusers(
@@ -282,10 +315,14 @@ def _fusers(
     for robot in robots:
         before |= {f"log {robot.name}": robot.log, f"slam {robot.name}": robot.slam}
         before[f"smooth {robot.name}"] = robot.smooth
+    aligned: dict[bool, dict[str, Stage | RecordedLog]] = {True: {}, False: {}}
     for pair in pairs:  # fused maps do not depend on the other aligners
         both = f"{pair.a.name} {pair.b.name}"
-        before[f"match {both}"] = pair.match
-        before[f"aligner {both}"] = pair.aligners[scenario.merge.aligner]
+        for smoothed, stages_of in ((True, pair.smoothed), (False, pair.filtered)):
+            aligned[smoothed] |= {
+                f"match {both}": stages_of.match,
+                f"aligner {both}": stages_of.aligners[scenario.merge.aligner],
+            }
     own = {"robots": tuple(robot.name for robot in robots), "iterations": tuple(iterations)}
     own |= {"smoother": smoother_parameters(scenario)}
     own |= {"noise_floor_m": scenario.slam.filter.noise_floor_m}
@@ -298,7 +335,7 @@ def _fusers(
             fuse.FUSE_STAGE,
             scenario.merge,
             own=own | {"fuser": name, "origin": origin},
-            before=before,
+            before=before | aligned[make_fuser(name).smoothed],
             loads=(module if ours else "mapfusion.fusion",),
         )
     return stages

@@ -6,19 +6,21 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from experiments.pipeline.stage import Job
 from experiments.pipeline.stages.slam import PATHS, SNAPSHOTS, Associations
-from experiments.pipeline.stages.smooth import read_smoothed
+from experiments.pipeline.stages.smooth import read_endings, read_smoothed
 from mapfusion.files import POSE_FIELDS, column, columns, points_from, read_table
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log, with_rows
 from mapfusion.smoother.smooth import with_path_errors
 from mapfusion.viewing import LogSightings
+
+_Known = TypeVar("_Known")
 
 
 class RobotFolders(NamedTuple):
@@ -39,6 +41,11 @@ def folders_of_both(job: Job) -> list[RobotFolders]:
         smooth = inputs.get(f"smooth_{side}")
         folders.append(RobotFolders(inputs[f"log_{side}"], inputs[f"slam_{side}"], smooth))
     return folders
+
+
+def latest_at(known: Mapping[int, _Known], iteration: int) -> _Known:
+    """Return a robot's value at an iteration; the last one if the log ended earlier."""
+    return known[max((k for k in known if k <= iteration), default=min(known))]
 
 
 ROBOTS_KEPT = 4  # robots whose maps a process keeps; tens of megabytes for minutes of driving
@@ -132,3 +139,24 @@ def stored_maps(folders: RobotFolders, *, viewing: bool) -> Snapshots:
     """
     smoothed = {} if folders.smooth is None else read_smoothed(folders.smooth)
     return Snapshots(folders.slam, read_log(folders.log), viewing, smoothed)
+
+
+@functools.lru_cache(maxsize=ROBOTS_KEPT)
+def smoothed_maps(folders: RobotFolders, *, viewing: bool) -> Mapping[int, LandmarkMap]:
+    """Return a robot's maps at the iterations at which maps are fused: smoothed ones if possible.
+
+    Where smoothing failed, the last smoothed map until then stands in. Before the first one, the
+    filter's map does.
+    """
+    assert folders.smooth is not None
+    smoothed, filtered = read_smoothed(folders.smooth), stored_maps(folders, viewing=viewing)
+    first = min(smoothed, default=np.inf)
+    before = [k for k in read_endings(folders.smooth)["iteration"].tolist() if k < first]
+    return {k: latest_at(filtered, k) for k in before} | smoothed
+
+
+def maps_of(
+    folders: RobotFolders, *, smoothed: bool, viewing: bool = True
+) -> Mapping[int, LandmarkMap]:
+    """Return a robot's smoothed maps or those of the filter."""
+    return (smoothed_maps if smoothed else stored_maps)(folders, viewing=viewing)

@@ -200,7 +200,7 @@ def test_estimating_opens_no_truth(tiny: Simulation, tiny_results: Path, tmp_pat
         for part in robot.smooth.parts:
             robot.smooth.work(robot.smooth.settings, Job(inputs, log / "smooth", part))
     (pair,) = run.pipeline.pairs
-    for number, stage in enumerate(pair.estimates.before.values()):
+    for number, stage in enumerate(pair.filtered.estimates.before.values()):
         folders[stage.key] = tmp_path / f"{stage.name}{number}"
         inputs = {name: folders[before.key] for name, before in stage.before.items()}
         stage.work(stage.settings, Job(inputs, folders[stage.key], "000"))
@@ -212,7 +212,7 @@ def test_only_the_changed_aligner_runs_again(tiny: Simulation) -> None:
     entries = [changed, *tiny.align.aligners[1:]]
     other = tiny.model_copy(update={"align": tiny.align.model_copy(update={"aligners": entries})})
     before, after = (
-        build_pipeline(scenario).pairs[0].estimates.before for scenario in (tiny, other)
+        build_pipeline(scenario).pairs[0].filtered.estimates.before for scenario in (tiny, other)
     )
     same = {name: after[name].key == stage.key for name, stage in before.items()}
     assert same == {"match": True, "aligner 0": False, "aligner 1": True, "aligner 2": True}
