@@ -38,14 +38,14 @@ from experiments.evaluation.criteria import (
 )
 from experiments.evaluation.loop_closures import loop_closures
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.settings import FUSER_METRICS, AnyScenario, Bound
+from experiments.scenario.settings import FUSER_METRICS, SMOOTHED_METRICS, AnyScenario, Bound
 from experiments.scenario.suite import scenarios_of
 from mapfusion.errors import InputError
 
 # The four methods of the paper, algorithm 1 in both readings, as the default list names them.
 PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
 USED_TABLES = ("robots", "errors", "fusion", "map_fits", "fused_motions", "team", "team_pairs")
-USED_TABLES += ("smoother", "fusers", "sightings")
+USED_TABLES += ("smoother", "fusers", "sightings", "smoothed_errors")
 MERGED_ROBOTS = "team.merged_robots"
 WITHOUT_TRUTH = (MERGED_ROBOTS,)  # metrics that need no truth
 
@@ -268,8 +268,11 @@ def repetition_spread_m(rows: pd.DataFrame) -> float:
 
 @metric(false_merges="")
 def _all_false_merges(tables: Tables, which: str) -> float:
-    """Return the share of false merges among all alignments of all aligners."""
-    errors = tables["errors"]
+    """Return the share of false merges among all alignments of all aligners.
+
+    Alignments of the filter's maps and of the smoothed maps count.
+    """
+    errors = pd.concat([tables["errors"], tables["smoothed_errors"]], ignore_index=True)
     return criteria.is_false_merge(errors[errors["aligner"] != ORACLE]).mean()
 
 
@@ -283,6 +286,20 @@ def false_merges(tables: Tables, aligner: str) -> float:
 def missed_merges(tables: Tables, aligner: str) -> float:
     """Return the share of refused alignments of an aligner among mergeable pairs."""
     return (~criteria.mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
+
+
+def _register_metrics_of_smoothed_maps() -> None:
+    """Register metrics of alignments of smoothed maps, by the functions of the filter's maps."""
+
+    def on_smoothed(tables: Tables, aligner: str, of_aligner: Metric) -> float:
+        return of_aligner({**tables, "errors": tables["smoothed_errors"]}, aligner)
+
+    for name in SMOOTHED_METRICS:
+        function = ALIGNER_METRICS[name]
+        ALIGNER_METRICS[f"smoothed_{name}"] = partial(on_smoothed, of_aligner=function)
+
+
+_register_metrics_of_smoothed_maps()
 
 
 def compute(name: str, tables: Tables) -> float:

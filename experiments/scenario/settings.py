@@ -92,6 +92,10 @@ ALIGNER_METRICS = (
     "false_merges",
     "missed_merges",
 )
+# Metrics that each aligner also has for alignments of smoothed maps, after "smoothed_".
+SMOOTHED_METRICS = ("refined_over_oracle", "motion_nees_per_dof", "motion_coverage_90")
+SMOOTHED_METRICS += ("false_merges", "missed_merges")
+ALIGNER_METRICS += tuple(f"smoothed_{name}" for name in SMOOTHED_METRICS)
 
 
 def known_metrics(aligners: Sequence[str], fusers: Sequence[str]) -> list[str]:

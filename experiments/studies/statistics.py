@@ -212,18 +212,25 @@ def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
     return nees_of_maps(known.assign(n_landmarks=1, share_in_gate=np.nan), rng)
 
 
-def alignment_nees(errors: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+def alignment_nees(
+    errors: pd.DataFrame, rng: np.random.Generator, maps: str = "FastSLAM's"
+) -> pd.DataFrame:
     """Summarise the consistency of accepted alignments (`criteria.alignment_consistency`).
 
+    Args:
+        errors: rows of `errors` or `smoothed_errors`.
+        rng: random generator of the intervals.
+        maps: name of the kind of maps, for a column.
+
     Returns:
-        One row per aligner: aligner, n_runs, n_maps, nees_per_dof (median) and coverage_90 (share
-        of true motions in the 90 % ellipsoid) with intervals over runs.
+        One row per aligner: aligner, maps, n_runs, n_maps, nees_per_dof (median) and coverage_90
+        (share of true motions in the 90 % ellipsoid) with intervals over runs.
     """
     rows = []
     known = criteria.alignment_consistency(errors)
     for aligner, own in known.groupby("aligner", sort=False):
         runs, inside = intervals.clusters_of(own), own["inside"].to_numpy(dtype=np.float64)
-        row = {"aligner": aligner, "n_runs": runs.n, "n_maps": len(own)}
+        row = {"aligner": aligner, "maps": maps, "n_runs": runs.n, "n_maps": len(own)}
         row |= _medians(own, ("nees_per_dof",), rng)
         share = intervals.weighted_mean_interval(inside, np.ones(len(own)), runs, rng)
         rows.append(row | share.columns("coverage_90"))
@@ -343,6 +350,12 @@ _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "fusers": (FUSER_COLUMNS, "fusers", fuser_summary, "fusers"),
     "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
     "errors": (criteria.CONSISTENCY_COLUMNS, "alignment_nees", alignment_nees, "alignment_nees"),
+    "smoothed_errors": (
+        criteria.CONSISTENCY_COLUMNS,
+        "alignment_nees",
+        partial(alignment_nees, maps="smoothed"),
+        "alignment_nees smoothed",
+    ),
 }
 
 

@@ -70,15 +70,16 @@ _REGISTRY = {
         "draw_translation_error",
         "Figure 4: error of the alignments' translation against the iteration. Of lines that "
         "coincide, the narrow ones are drawn above the wide ones. A line ends where the method has "
-        "no answer.",
-        _ANSWERS,
+        "no answer. The first two panels show the alignments of FastSLAM's maps, the third one "
+        "those of smoothed maps.",
+        (*_ANSWERS, "smoothed_errors"),
     ),
     "fig05_rotation_error": _Figure(
         "error_figures",
         "draw_rotation_error",
         "Figure 5: signed error of the alignments' rotation against the iteration, drawn as in "
         "figure 4.",
-        _ANSWERS,
+        (*_ANSWERS, "smoothed_errors"),
     ),
     "fig06_aligner_time": _Figure(
         "error_figures",

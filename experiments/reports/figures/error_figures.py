@@ -109,7 +109,7 @@ def draw_rotation_error(data: ResultTables) -> Figure:
 
 
 def _draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[Figure, np.ndarray]:
-    """Draw one row of panels per robot pair: as estimated on the left, refined on the right.
+    """Draw one row of panels per robot pair: as estimated, refined, and refined on smoothed maps.
 
     If there are many pairs, only those with the most true pairs are drawn, and a note says so.
 
@@ -133,19 +133,22 @@ def _draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[F
         pairs = [pair for pair in pairs if pair in chosen]
     errors = errors[pd.MultiIndex.from_frame(errors[["robot_a", "robot_b"]]).isin(pairs)]
     bands = error_bands(errors)
-    kinds = {"as estimated": quantity, "refined": f"refined_{quantity}"}
-    columns = [f"{column}{end}" for column in kinds.values() for end in ("_low", "", "_high")]
-    drawn = bands[columns].to_numpy().ravel()
+    kinds = {"as estimated": (bands, quantity), "refined": (bands, f"refined_{quantity}")}
+    if len(smoothed := data.rows("smoothed_errors")):
+        kinds["refined, smoothed maps"] = (error_bands(smoothed), f"refined_{quantity}")
+    ends = ("_low", "", "_high")
+    parts = [own[f"{column}{end}"].to_numpy() for own, column in kinds.values() for end in ends]
+    drawn = np.concatenate(parts)
     drawn = drawn[np.isfinite(drawn)]
     if not len(drawn):
         raise NothingToDraw("no aligner found an estimate at any iteration")
     figure = Figure(figsize=(PAGE_WIDTH_IN, len(pairs) * _PANEL_HEIGHT_IN + _EXTRA_HEIGHT_IN))
-    panels = figure.subplots(len(pairs), 2, sharex=True, sharey=True, squeeze=False)
+    panels = figure.subplots(len(pairs), len(kinds), sharex=True, sharey=True, squeeze=False)
     for row, pair in zip(panels, pairs, strict=True):
-        for axes, (kind, column) in zip(row, kinds.items(), strict=True):
+        for axes, (kind, (own, column)) in zip(row, kinds.items(), strict=True):
             for start, stop in scarce_spans(of_pair(errors, pair)):
                 axes.axvspan(start, stop, zorder=0, **_SCARCE_STYLE)
-            _draw_panel(axes, data, of_pair(bands, pair), column)
+            _draw_panel(axes, data, of_pair(own, pair), column)
             axes.set_title(f"{pair[0]} - {pair[1]}, {kind}")
         row[0].set_ylabel(label)
     left_out = len(data.pairs) > len(pairs)
@@ -156,7 +159,8 @@ def _draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[F
     if any(len(list(scarce_spans(of_pair(errors, pair)))) for pair in pairs):
         explained.append(Patch(label=f"< {ANSWERABLE_PAIRS} true pairs", **_SCARCE_STYLE))
     # Bands are visible only for aligners whose repetitions, or runs, differ.
-    wide = [bands[f"{column}_high"] > bands[f"{column}_low"] for column in kinds.values()]
+    compared = (quantity, f"refined_{quantity}")
+    wide = [bands[f"{column}_high"] > bands[f"{column}_low"] for column in compared]
     if banded := set(bands["aligner"][np.any(wide, axis=0)]):
         shown = next(name for name in data.aligners if name in banded)
         colour = data.styles[shown]["color"]

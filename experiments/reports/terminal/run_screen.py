@@ -93,6 +93,9 @@ _SEEDS_SHOWN = 3  # one by one, in a table of checks
 _ALIGNERS = columns("", aligner="aligner")
 _ALIGNERS |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
 _ALIGNERS |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
+_SMOOTHED = columns("", aligner="aligner")
+_SMOOTHED |= columns(".3f", filter_m="FastSLAM's\nm") | columns(".0%", filter_ok="\nok")
+_SMOOTHED |= columns(".3f", smoothed_m="smoothed\nm") | columns(".0%", smoothed_ok="\nok")
 _PAIRS = [("pair", ""), ("error, m", ".3f"), ("error, rad", "+.4f")]
 _PAIRS += [("oracle, m", ".3f"), ("oracle, rad", "+.4f"), ("true pairs", ">")]
 _ANSWERS = columns("", aligner="aligner")
@@ -214,6 +217,18 @@ def _advice_without_truth(result: Path) -> str:
     )
 
 
+def _filter_beside_smoothed(errors: pd.DataFrame, smoothed: pd.DataFrame) -> pd.DataFrame:
+    """Return errors and accepted shares of both kinds of maps at the smoothed iterations."""
+    rows: dict[str, pd.Series] = {}
+    at_both = errors[errors["iteration"].isin(smoothed["iteration"])]
+    for kind, own in (("filter", at_both), ("smoothed", smoothed)):
+        by_aligner = summarise_alignments(answerable(own)).groupby("aligner", sort=False)
+        rows[f"{kind}_m"] = by_aligner["refined_translation_error_m"].median()
+        rows[f"{kind}_ok"] = by_aligner["accepted"].mean()
+    table = pd.DataFrame(rows)
+    return table.loc[[*methods_in(table.reset_index(), oracle=True)]].reset_index()
+
+
 def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
     """Print the tables of a run, and the folders of tables and figures; None: no figures."""
 
@@ -232,6 +247,12 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
         summary = aligner_summary(errors, table("aligner_timings"), aligners)
         print_frame(summary, _ALIGNERS, title, note)
         print_lines(f"  {line}" for line in not_run_lines(errors))
+        smoothed = table("smoothed_errors")
+        if len(answerable(smoothed)):
+            note = "at the iterations at which maps are fused; inf: no estimate on most of them\n"
+            note += "ok: accepted"
+            rows = _filter_beside_smoothed(errors, smoothed)
+            print_frame(rows, _SMOOTHED, "Refined errors on FastSLAM's and on smoothed maps", note)
         # Each pair at its last iteration: the first aligner, refined, beside the oracle
         names = ["refined_translation_error_m", "refined_rotation_error_rad"]
         bands = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])

@@ -61,7 +61,12 @@ _TEAM_PAIRS |= columns(".3g", alone_m="alone, m", team_m="in the team, m")
 _NEES = columns("", landmarks="landmarks") | columns("d", n_landmarks="n")
 _NEES |= columns(".3g", nees_per_dof="NEES") | columns(">", band="chi-square")
 _NEES |= columns(".0%", share_in_gate="in gate")
-_ALIGNMENT_NEES = _METHOD | columns("d", n_maps="maps") | columns(".2g", nees_per_dof="NEES / dof")
+_ALIGNMENT_NEES = (
+    _METHOD
+    | columns("", maps="maps")
+    | columns("d", n_maps="n")
+    | columns(".2g", nees_per_dof="NEES / dof")
+)
 _ALIGNMENT_NEES |= columns(".0%", coverage_90="in 90 %")
 
 
