@@ -71,9 +71,13 @@ class JointCovariance:
 
     @cached_property
     def leading(self) -> "JointCovariance":
-        """The joint covariance with `LEADING` shared variables, for computations that need few."""
-        flat = self.common_m.transpose(1, 0, 2).reshape(self.rank, 3 * len(self))
-        return reduce_rank(self.own_m2, flat, LEADING)
+        """The joint covariance by the `LEADING` shared variables that move the landmarks most.
+
+        The effect of the others is added to the landmarks' own covariances.
+        """
+        by_effect = np.argsort(-np.sum(self.common_m**2, axis=(0, 2)), kind="stable")
+        kept, others = (self.common_m[:, by] for by in np.split(by_effect, [LEADING]))
+        return JointCovariance(self.own_m2 + _squares(others), kept, self.complete)
 
     def dense_m2(self) -> Float:
         """Return the dense covariance, shape (3N, 3N), for small maps."""

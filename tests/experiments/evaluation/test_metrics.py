@@ -130,6 +130,12 @@ def tables() -> dict[str, pd.DataFrame]:
         *[error("svd", 20 + k, m, 0.3) for k, m in ((1, 3.0), (2, 12.1))],
         *[error("icp", 20 + k, m, 0.3) for k, m in enumerate((1.4, 1.2, 30.0))],
     ]
+    smoothed_errors = [
+        error("oracle", 20, 0.5, 0.1, n_true=40),
+        error("ransac", 10, 9.0, 9.0, n_true=2),
+        error("ransac", 20, 0.6, 0.2, n_true=40),
+        error("ransac", 20, 0.6, 0.2, n_true=40, seed=1, accepted=False),
+    ]
     fusion = [
         # RMS of parents sqrt((9 + 16) / 2) and 1, of fused 1
         (0, 3.0, 1.0, 1.0, 2.0, 20.0, 2, True),
@@ -149,6 +155,7 @@ def tables() -> dict[str, pd.DataFrame]:
         "robots": pd.concat([pd.DataFrame(robots), closing_robots()]),
         "sightings": pd.concat([closing_sightings(seed) for seed in (0, 1)]),
         "errors": pd.DataFrame(errors),
+        "smoothed_errors": pd.DataFrame(smoothed_errors),
         "fusion": pd.DataFrame(fusion, columns=pd.Index(columns)).assign(robot_a="A", robot_b="B"),
         "map_fits": pd.DataFrame(fits, columns=pd.Index(["seed", "map", "rmse_m"])),
         "smoother": pd.DataFrame(smoother),
@@ -185,7 +192,7 @@ KNOWN = {
     "oracle_translation_m": 0.4,
     "oracle_rotation_rad": 0.03,
     "true_pairs_at_end": 50.0,
-    "false_merges": 3 / 14,
+    "false_merges": (3 + 1) / (14 + 3),
     "fused_over_parents": 0.5,  # 1 / ((sqrt(12.5) + 1) / 2), 0.5 and 5
     "fused_nees_with_drift": (1 + 2 + 1 + 1) / 4,
     "fused_nees_without_drift": (10 + 20 + 10 + 10) / 4,
@@ -212,6 +219,11 @@ KNOWN = {
     "svd.scatter_m": 0.8,
     "ransac.false_merges": 3 / 6,  # those 99 m off
     "ransac.missed_merges": 1 / 3,
+    "ransac.smoothed_refined_over_oracle": 2.0,
+    "ransac.smoothed_motion_nees_per_dof": 0.35 * (10 + 20) / 2 / 3,
+    "ransac.smoothed_motion_coverage_90": 1 / 2,
+    "ransac.smoothed_false_merges": 1 / 3,
+    "ransac.smoothed_missed_merges": 1 / 2,
     **{f"smoother.{name}": 3.0 * k for k, name in enumerate(SMOOTHER, 1)},
     **{f"{fuser}.{name}": 2.0 * k for fuser in FUSERS for k, name in enumerate(FUSER, 1)},
 }

@@ -87,7 +87,7 @@ TOLD = {
     "merge": "judge fuse",
     "merge.aligner": "judge",  # fusing begins from that aligner's stage
     "merge.fuser": "",
-    "fuse": "smooth fuse",
+    "fuse": "smooth match aligner fuse",
     "fuse.fusers": "fuse",
     "evaluate.every": "slam match aligner",
     "evaluate.true_pair_radius_m": "judge",
@@ -326,9 +326,8 @@ def test_one_method_s_source_is_not_in_another_s_key(resolved: dict[str, Any]) -
     data["align"]["aligners"] = [{"name": name, "method": name} for name in OWN_METHODS]
     scenario = scenario_of(data, "tiny")
     assert isinstance(scenario, Simulation)
-    stages = stages_of(scenario)
-    aligners = dict(zip(OWN_METHODS, (s for s in stages if s.name == "aligner"), strict=True))
-    (match,) = (s for s in stages if s.name == "match")
+    (pair,) = build_pipeline(scenario).pairs
+    aligners, match = pair.filtered.aligners, pair.filtered.match
     for name in OWN_METHODS:
         own = find_method(name).target.partition(":")[0].replace(".", "/") + ".py"
         elsewhere = {other for other, stage in aligners.items() if own in stage.sources}

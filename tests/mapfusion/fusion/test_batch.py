@@ -187,7 +187,7 @@ def test_connected_maps_hand_on_what_they_were_smoothed_from() -> None:
     team = LoggedTeam(4)
     connected = connect(team.maps, team.component(0, 1).pairs)
     for recordings, fallback in ((team.recordings, False), ((), True)):
-        fused = connected.fused_by(Batch(), MergeParameters(), team.maps, recordings).fused[0]
+        fused = connected.fused_by(Batch(), MergeParameters(), recordings).fused[0]
         np.testing.assert_array_equal(fused.members, [0, 1])
         assert bool(fused.fallback) == fallback
 

@@ -12,7 +12,7 @@ from mapfusion.fusion.fusers import FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.fusion.joint_estimate import JointMap, estimate_jointly
 from mapfusion.fusion.kalman import KalmanDrift
-from mapfusion.fusion.merge import connect, merge
+from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.geometry.camera import CalibrationError
 from mapfusion.landmark_map import LandmarkMap
@@ -362,20 +362,3 @@ def test_drift_counts_as_a_landmark_s_own_where_nothing_is_shared() -> None:
     assert made.n_shared == 0
     np.testing.assert_allclose(made.joint.own_m2, own.covariance_m2 + np.diag([0.09, 0.09, 0]))
     assert JointMap.of(own, 0.3, 3).joint is own.joint  # which has it all
-
-
-def test_pairs_keep_their_distances_where_other_maps_of_the_robots_lack_landmarks() -> None:
-    team = DrawnTeam([slice(0, 30), slice(10, 40)], 7)
-    (pair,) = team.pairs
-    dissimilarity = np.linspace(0.1, 0.2, len(pair.inliers))
-    pair = replace(pair, correspondences=replace(pair.correspondences, distance=dissimilarity))
-    (component,) = connect(team.maps, [pair], MergeParameters().team).components
-    others = [team.maps[0][np.arange(29, 3, -1)], team.maps[1][np.array([3, 0, 19, 7, 25])]]
-    found = component.on(others).pairs[0].inliers
-    origin = [own.source_observation for own in others]
-    rows = zip(found.index_a, found.index_b, found.distance, strict=True)
-    got = {(int(origin[0][a]), int(origin[1][b])): dissimilarity for a, b, dissimilarity in rows}
-    rows = zip(pair.inliers.index_a, pair.inliers.index_b, dissimilarity, strict=True)
-    expected = {(int(a), int(b)): dissimilarity for a, b, dissimilarity in rows}
-    assert len(got) == 4  # the fifth of map b is not in map a
-    assert got.items() <= expected.items()
