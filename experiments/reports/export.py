@@ -165,11 +165,13 @@ def fusion_document(
 ) -> dict[str, Any]:
     """Return the document of `merge`: the largest fused map, and the others.
 
-    `T_first_map` is null for a map that was left out. Without `paths` nothing was merged, and `map`
+    `note` says what the verdict on a used alignment could not test; null if nothing. `T_first_map`
+    is null for a map that was left out. Without `paths` nothing was merged, and `map`
     is null.
     """
     pairs = [
         {"map_a": maps[a], "map_b": maps[b], "merged": not reason, "reason": reason or None}
+        | {"note": None if reason else merged.notes.get((a, b))}
         for (a, b), reason in merged.reasons().items()
     ]
     documents: list[dict[str, Any]] = []
@@ -189,7 +191,8 @@ def fusion_document(
     first, *others = documents
     if not paths:
         first |= {"n_landmarks": 0, "n_fused_of_several": 0, "duplicate_share": None}
-    return {"seed": seed, **first, "others": others, "pairs": pairs}
+    head = {"seed": seed, "aligner": merged.aligner}
+    return {**head, **first, "others": others, "pairs": pairs}
 
 
 def check_document(checks: Sequence[CheckedScenario]) -> dict[str, Any]:
