@@ -115,6 +115,7 @@ def align(
     from experiments.cli.options import DOCUMENT, require_file
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
+    from experiments.reports.terminal.layout import print_lines
     from experiments.reports.terminal.run_screen import print_estimates, print_verdict
     from experiments.scenario.suite import settings_of, with_aligners
     from mapfusion.align.alignment import Status
@@ -128,13 +129,14 @@ def align(
         rows.append(row)
         if not as_json:
             print_verdict(row)
-    found = export.alignment_document((map_a, map_b), settings.seed, rows)
+    accepted = any(single.final_status(row)[0] is Status.ACCEPTED for row in rows)
+    note = "" if accepted else single.align_note(map_a, map_b, settings)
+    found = export.alignment_document((map_a, map_b), settings.seed, rows, note)
     export.publish_json("align", found, as_json, output)
     if not as_json:
         print_estimates(rows)
-    if require_accepted and all(
-        single.final_status(row)[0] is not Status.ACCEPTED for row in rows
-    ):
+        print_lines([note] if note else [])
+    if require_accepted and not accepted:
         options.print_to_stderr(f"{map_a} and {map_b}: no estimate of T_a_b is accepted")
         raise typer.Exit(options.EXIT_FAILED)
 
@@ -176,5 +178,5 @@ def merge(
         raise typer.Exit(options.EXIT_FAILED)
     if not as_json:
         for path, fused in zip(paths, merged.fusion.fused, strict=True):
-            print_fused(path, fused, maps, merged.aligner)
+            print_fused(path, fused, maps, merged.aligner, merged.is_lower_bound(fused))
         print_lines([f"  note: {merged.note}"] if merged.note else [])

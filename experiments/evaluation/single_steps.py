@@ -32,7 +32,7 @@ from mapfusion.datasets.log_consistency import Finding, check_log, gate_finding,
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
-from mapfusion.fusion.fusers import AlignedPair, Fusion, make_fuser, name_order
+from mapfusion.fusion.fusers import AlignedPair, FusedMap, Fusion, make_fuser, name_order
 from mapfusion.fusion.merge import merge as merge_maps
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.numerics import Float
@@ -49,6 +49,7 @@ from mapfusion.smoother.odometry_calibration import Calibration, calibrate
 from mapfusion.smoother.smooth import SmootherParameters, with_path_errors
 from mapfusion.tables import NO_LABEL
 from mapfusion.verification.registration import Registration
+from mapfusion.verification.rivals import is_mirrored
 from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
 
@@ -218,6 +219,17 @@ class MergeResult(NamedTuple):
         others = f" (and for {len(told) - 1} more pairs of maps)" if len(told) > 1 else ""
         return f"{told[0]}{others}"
 
+    def is_lower_bound(self, fused: FusedMap) -> bool:
+        """Return True if the covariances of a fused map's motions are lower bounds.
+
+        They are if a used alignment is of a map that does not state all errors that its landmarks
+        share.
+        """
+        used = {pair for pair, reason in self.reasons().items() if not reason}
+        members = set(fused.members.tolist())
+        of_fused = (p for p in self.pairs if (p.a, p.b) in used and {p.a, p.b} <= members)
+        return any(pair.alignment.lower_bound for pair in of_fused)
+
     @property
     def any_merged(self) -> bool:
         """True if two or more maps were merged."""
@@ -290,6 +302,21 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
         yield row
 
 
+def align_note(path_a: Path, path_b: Path, settings: Scenario) -> str:
+    """Return a cause for which every aligner fails on two maps; empty if none is found."""
+    map_a, map_b = read_map(path_a), read_map(path_b)
+    pairs = Pairs(map_a, map_b, match(map_a, map_b, settings.align.match))
+    return _mirror_note(pairs, settings.align)
+
+
+def _mirror_note(pairs: Pairs, settings: Align) -> str:
+    """Say that two maps look like mirror images of each other; empty if they do not."""
+    if not is_mirrored(pairs, settings.acceptance, settings.refinement):
+        return ""
+    a, b = pairs.map_a.name, pairs.map_b.name
+    return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"
+
+
 def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
     """Return the final status of a row of `align`, and the reason."""
     status = Status(row["verdict"])
@@ -326,6 +353,10 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         found = done.applied
         if found.status in NOT_RUN:  # the reason does not name the aligner
             found = replace(found, reason=f"{name}: {found.status}: {found.reason}")
+        elif not found.ok and (note := _mirror_note(
+            Pairs(maps[a], maps[b], offered), settings.align
+        )):
+            found = replace(found, reason=f"{found.reason}; {note}")
         pairs.append(AlignedPair(a, b, found, offered, false_alarms))
         if done.verdict.accepted and done.verdict.reason:
             notes[a, b] = done.verdict.reason

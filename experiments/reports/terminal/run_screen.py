@@ -351,6 +351,9 @@ def print_verdict(row: dict[str, Any]) -> None:
     print_lines([f"  {row['aligner']}: {status}" + (f": {reason}" if reason else "")])
 
 
+_LOWER_BOUND = "≥: a lower bound, since a map does not state the errors that its landmarks share"
+
+
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Print the estimates of all aligners on two maps, and the verdicts on them."""
     found = pd.DataFrame(rows)
@@ -364,8 +367,7 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     stated = found.assign(sigma_m=texts(sigma_m, ".3f"), sigma_rad=texts(sigma_rad, ".4f"))
     note = "sigma: stated for the refined estimate, of distance and angle"
     if found["lower_bound"].any():
-        note += "; ≥: a lower bound,\n"
-        note += "because a map does not state the errors that its landmarks share"
+        note += f"\n{_LOWER_BOUND}"
     print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
     inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
     verdicts = [str(final_status(row)[0]) for row in rows]
@@ -374,12 +376,14 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         found.assign(inliers=inliers, time=times, verdict=verdicts),
         _VERDICTS,
         "Verdicts on the refined estimates",
-        "NFA: expected number of alignments with as much support by chance; evidence: ratio\n"
-        "of the likelihoods of both robots' observations if it is right; time: of the estimate",
+        "NFA: expected number of alignments with as much support by chance; evidence:\n"
+        "likelihood ratio of both robots' observations; time: of the estimate",
     )
 
 
-def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path], aligner: str) -> None:
+def print_fused(
+    path: Path, fused: FusedMap, maps: Sequence[Path], aligner: str, lower_bound: bool
+) -> None:
     """Print the landmarks and the motions of a fused map, and the aligner of the motions."""
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
     n_maps = len(fused.members)
@@ -391,9 +395,12 @@ def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path], aligner: str)
     sigmas = zip(*motion_sigma(fused.motion_covariance), strict=True)
     for name, (x_m, y_m, theta_rad), sigma in zip(maps, fused.T_first_map, sigmas, strict=True):
         if not math.isnan(x_m):
-            stated = f"sigma {sigma[0]:.3f} m, {sigma[1]:.4f} rad" if any(sigma) else "the frame"
+            bound = "≥ " if lower_bound else ""
+            stated = f"sigma {bound}{sigma[0]:.3f} m, {bound}{sigma[1]:.4f} rad"
+            stated = stated if any(sigma) else "the frame"
             T = f"({x_m:.3f} m, {y_m:.3f} m, {theta_rad:.4f} rad)"
             lines.append(f"  {name}: T_first_map = {T}, {stated}")
+    lines += [f"  {_LOWER_BOUND}"] if lower_bound else []
     lines += [f"  {name}: left out ({reason})" for name, reason in fused.left_out]
     print_lines(lines)
 
