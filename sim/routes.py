@@ -57,7 +57,6 @@ class Route:
                 f"robot {self.robot}: tire_friction is {self.tire_friction}, must be above 0"
             )
 
-
     @property
     def start_text(self) -> str:
         """The start in words, with the random offset if there is one."""

@@ -353,9 +353,9 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         found = done.applied
         if found.status in NOT_RUN:  # the reason does not name the aligner
             found = replace(found, reason=f"{name}: {found.status}: {found.reason}")
-        elif not found.ok and (note := _mirror_note(
-            Pairs(maps[a], maps[b], offered), settings.align
-        )):
+        elif not found.ok and (
+            note := _mirror_note(Pairs(maps[a], maps[b], offered), settings.align)
+        ):
             found = replace(found, reason=f"{found.reason}; {note}")
         pairs.append(AlignedPair(a, b, found, offered, false_alarms))
         if done.verdict.accepted and done.verdict.reason:

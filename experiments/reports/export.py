@@ -170,8 +170,8 @@ def fusion_document(
     """Return the document of `merge`: the largest fused map, and the others.
 
     `lower_bound` is true if the covariances do not contain all errors that the landmarks of a map
-    share. `note` says what the verdict on a used alignment could not test; null if nothing. `T_first_map`
-    is null for a map that was left out. Without `paths` nothing was merged, and `map`
+    share. `note` says what the verdict on a used alignment could not test; null if nothing.
+    `T_first_map` is null for a map that was left out. Without `paths` nothing was merged, and `map`
     is null.
     """
     pairs = [

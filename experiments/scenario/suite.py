@@ -104,7 +104,8 @@ def chosen_aligners(
 ) -> tuple[AlignerEntry, ...]:
     """Return aligners by name: of `entries`, else of the default list, else a method.
 
-    A method has its default parameters. A class in a file, FILE.py:CLASS, is named CLASS. Raises InputError if a name is unknown.
+    A method has its default parameters. A class in a file, FILE.py:CLASS, is named CLASS. Raises
+    InputError if a name is unknown.
     """
     from experiments.plugins.discovery import require_usable
     from experiments.scenario.settings import DEFAULT_ALIGNERS, AlignerEntry

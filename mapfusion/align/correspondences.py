@@ -220,8 +220,8 @@ def _take(side: _Side, i: int, j: int, distance2: float) -> None:
 
 
 FEW = 3  # correspondences; fewer cannot contradict a motion, and `match` explains the shortage
-# Ratio of a descriptor's norm to 1 that `why_not_unit_vectors` reports, and its inverse. Rounding to
-# integers changes norms less.
+# `why_not_unit_vectors` reports norms of this size or more, and of its inverse or less. Rounding
+# to integers changes norms less.
 _NORM_FACTOR = 2.0
 # Constants of `scale_note`. Lengths of two maps differ by a few percent (calibration, drift). An
 # interval of this width contains about 5 % of the ratios of false pairs, whose logarithms have a

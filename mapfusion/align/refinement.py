@@ -36,8 +36,8 @@ from mapfusion.parameters import Range, require_in_range, require_shape
 # be distinguished from false pairs that are uniform over the gate.
 _GATE_SIGMAS = 3.0
 _TOLERANCE_M = 1e-8  # movement of the landmarks at convergence
-# Relative change of s_drift^2 and of the share of true pairs at convergence: the covariance has four
-# digits. Exact maps determine the motion before s_drift has left its start.
+# Relative change of s_drift^2 and of the share of true pairs at convergence: the covariance then
+# has about four digits. Exact maps determine the motion before s_drift has left its start.
 _MIXTURE_TOLERANCE = 1e-4
 # Round from which on the pairs inside the gate are fixed and oscillating steps of s_drift are
 # halved, so that neither a pair on the gate's edge nor s_drift oscillates forever.

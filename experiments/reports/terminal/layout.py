@@ -181,7 +181,7 @@ def print_methods() -> None:
 
     methods = known_methods()
     rows = [
-        (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
+        (each.name, str(each.kind), each.distribution, "absent" if each.absence else each.version)
         for each in methods.values()
     ]
     for entry in DEFAULT_ALIGNERS:

@@ -227,7 +227,9 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
         if len(maps := answerable(errors)):
             n_offered = maps["n_correspondences"]
             share = (maps["n_true"] / n_offered).median()
-            note += f"\ncorrespondences: {n_offered.median():.0f} (median), {share:.0%} of them true"
+            note += (
+                f"\ncorrespondences: {n_offered.median():.0f} (median), {share:.0%} of them true"
+            )
         title = f"Alignment errors: medians over pairs of maps with {ANSWERABLE_PAIRS} or more "
         title += "true correspondences"
         summary = aligner_summary(errors, table("aligner_timings"), aligners)
@@ -389,8 +391,8 @@ def print_fused(
     n_maps = len(fused.members)
     lines = [
         f"{len(fused.landmarks)} landmarks in {path}: fused from {n_maps} maps, aligned by "
-        f"{aligner}; {several} landmarks are of several maps, {fused.duplicate_share:.1%} look like remaining "
-        "duplicates"
+        f"{aligner}; {several} landmarks are of several maps, {fused.duplicate_share:.1%} look "
+        "like remaining duplicates"
     ]
     sigmas = zip(*motion_sigma(fused.motion_covariance), strict=True)
     for name, (x_m, y_m, theta_rad), sigma in zip(maps, fused.T_first_map, sigmas, strict=True):

@@ -44,7 +44,7 @@ from mapfusion.smoother.odometry_calibration import Calibration
 
 
 def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
-    """Print successes and times for each number of correspondences, and the folder of the results."""
+    """Print successes and times by number of correspondences, and the folder of the results."""
 
     def text(row: dict[Any, Any]) -> str:
         if row["status"] == Status.ABSENT:
@@ -260,9 +260,9 @@ def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
         [("kind of world", ""), *shown.values()],
         [row for row in found if row[1:] != ["–"] * (len(row) - 1)],
         "Right answers, by kind of world",
-        f"of all methods, with {MERGEABLE_PAIRS} or more true correspondences; first: a run's first "
-        f"right answer that is accepted (median, {rows[0]['aligner']}), and by the test against chance "
-        "alone",
+        f"of all methods, with {MERGEABLE_PAIRS} or more true correspondences; first: a run's "
+        f"first right answer that is accepted (median, {rows[0]['aligner']}), and by the test "
+        "against chance alone",
     )
 
 
