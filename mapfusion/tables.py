@@ -276,7 +276,7 @@ APPEARANCE_FIELDS = [
     ),
     described(
         pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
-        "descriptor of its appearance (U-SURF or another), NaN for none",
+        "descriptor of its appearance (U-SURF or another), of norm 1; NaN for none",
         np.nan,
     ),
 ]

@@ -138,14 +138,19 @@ def drive(
         InputError: a route or frame interval is impossible, or a robot hits something or is stuck
             (the message names robot, time and place).
     """
-    check_routes(plan, routes)
-    _controls_per_frame(frame_interval_s)
+    require_drivable(plan, routes, frame_interval_s)
     holds: list[Hold] = []
     while True:
         result = _drive_once(plan, routes, settings, n_frames, frame_interval_s, holds)
         if isinstance(result, Trajectory):
             return result
         holds.append(result)
+
+
+def require_drivable(plan: FloorPlan, routes: Sequence[Route], frame_interval_s: float) -> None:
+    """Raise InputError for a route or frame interval that `drive` refuses before it drives."""
+    check_routes(plan, routes)
+    _controls_per_frame(frame_interval_s)
 
 
 def _drive_once(
@@ -200,7 +205,7 @@ def _controls_per_frame(frame_interval_s: float) -> int:
     controls = frame_interval_s * CONTROL_HZ
     if not controls > 0.5 or abs(controls - round(controls)) > 1e-9 * controls:
         raise InputError(
-            f"frame_interval_s is {frame_interval_s}: must be a multiple of 1/{CONTROL_HZ} s"
+            f"drive.frame_interval_s is {frame_interval_s}: must be a multiple of 1/{CONTROL_HZ} s"
         )
     return round(controls)
 

@@ -34,6 +34,7 @@ class Route:
         waypoints_m: waypoints in order, shape (K, 2).
         loop: True if the first waypoint follows the last one; else the robot stops there.
         tire_friction: friction of the wheels against the ground; wheels slip if it is low.
+        planned_start_m: start (x, y) before a random offset, for messages; None without offset.
     """
 
     robot: str
@@ -41,6 +42,7 @@ class Route:
     waypoints_m: Float
     loop: bool = False
     tire_friction: float = TIRE_FRICTION
+    planned_start_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         for name, shape in (("T_world_start", (3,)), ("waypoints_m", (None, 2))):
@@ -55,20 +57,35 @@ class Route:
                 f"robot {self.robot}: tire_friction is {self.tire_friction}, must be above 0"
             )
 
+    @property
+    def start_text(self) -> str:
+        """The start in words, with the random offset if there is one."""
+        if self.planned_start_m is None:
+            return f"start {format_point(self.T_world_start)}"
+        moved = f"moved to {format_point(self.T_world_start)} by the start jitter"
+        return f"start {format_point(self.planned_start_m)}, {moved},"
+
 
 def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
-    """Raise InputError, naming robot and position, if a route cannot be driven."""
+    """Raise InputError if a route cannot be driven.
+
+    The message names robot and position, and the place as robots.INDEX.start or
+    robots.INDEX.route.INDEX, counted from 0.
+    """
     names = [route.robot for route in routes]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"robot {name}: two robots have this name")
-    for route in routes:
+    for number, route in enumerate(routes):
         # room at the waypoints and between them
         points = np.concatenate([route.T_world_start[None, :2], route.waypoints_m])
-        labels = ["start", *(f"waypoint {i}" for i in range(1, len(points)))]
+        said = [f"waypoint {i} {format_point(p)}" for i, p in enumerate(points[1:], start=1)]
+        said.insert(0, route.start_text)
+        fields = [f"robots.{number}.start"]
+        fields += [f"robots.{number}.route.{i}" for i in range(len(points) - 1)]
         on_floor, clearance = plan.contains(points), plan.clearance_m(points)
-        for label, point, inside, room in zip(labels, points, on_floor, clearance, strict=True):
-            where = f"robot {route.robot}: {label} {format_point(point)}"
+        for own, text, inside, room in zip(fields, said, on_floor, clearance, strict=True):
+            where = f"{own}: robot {route.robot}: {text}"
             if not inside:
                 raise InputError(f"{where} lies outside the world")
             if room < 0:
@@ -81,10 +98,7 @@ def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
         starts = list(range(len(ends)))
         for start, end in zip(starts, ends, strict=True):
             room = plan.leg_clearance_m(points[start], points[end])
-            where = (
-                f"robot {route.robot}: the way from {labels[start]} {format_point(points[start])} "
-                f"to {labels[end]} {format_point(points[end])}"
-            )
+            where = f"{fields[end]}: robot {route.robot}: the way from {said[start]} to {said[end]}"
             if room < 0:
                 raise InputError(f"{where} leads through a wall")
             if room < WIDTH_M / 2:
@@ -92,12 +106,13 @@ def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
                     f"{where} passes a wall at {room:.2f} m, the robot needs {WIDTH_M / 2:.2f} m"
                 )
     for i, first in enumerate(routes):
-        for second in routes[i + 1 :]:
+        for k, second in enumerate(routes[i + 1 :], start=i + 1):
             gap = np.hypot(*(first.T_world_start - second.T_world_start)[:2])
             if gap < 2 * OUTER_RADIUS_M:
                 raise InputError(
-                    f"robots {first.robot} and {second.robot}: they start {gap:.2f} m apart, "
-                    f"at {format_point(first.T_world_start)}; {2 * OUTER_RADIUS_M:.2f} m are needed"
+                    f"robots.{i}.start and robots.{k}.start: robots {first.robot} and "
+                    f"{second.robot}: they start {gap:.2f} m apart ({first.start_text} and "
+                    f"{second.start_text}); {2 * OUTER_RADIUS_M:.2f} m are needed"
                 )
 
 

@@ -43,10 +43,12 @@ def complete_setting(incomplete: str) -> list[str]:
 
 
 def complete_aligner(incomplete: str) -> list[str]:
-    """Complete the name of an alignment method."""
+    """Complete the name of an aligner."""
     from experiments.plugins.discovery import known_methods
+    from experiments.scenario.settings import DEFAULT_ALIGNERS
 
-    return _beginning(known_methods(), incomplete)
+    known = [*known_methods(), *(entry.name for entry in DEFAULT_ALIGNERS)]
+    return _beginning(dict.fromkeys(known), incomplete)
 
 
 def _beginning(known: Iterable[str], incomplete: str) -> list[str]:

@@ -123,6 +123,17 @@ def print_to_stderr(text: str) -> None:
     typer.echo(f"mapfusion: {plain(' '.join(text.split()))}", file=sys.stderr)
 
 
+def announce_compilation(as_json: bool = False) -> None:
+    """Print a line on stderr before kernels are compiled in this process, unless `as_json`.
+
+    Only the first command after an installation or an update compiles.
+    """
+    from mapfusion.geometry.numerics import before_compilation
+
+    told = "compiling numerical kernels, once per version; about half a minute"
+    before_compilation(None if as_json else lambda: typer.echo(told, file=sys.stderr))
+
+
 DOCUMENT, JUNIT, REPORT = (".json",), (".xml",), (".html", ".htm")
 # Suffixes of files that commands write; a folder with such a name is a mistake.
 _OF_FILES = {*DOCUMENT, *JUNIT, *REPORT, ".yaml", ".ply", ".g2o", ".tum", ".bag"}

@@ -184,6 +184,7 @@ def check(
     scenarios: options.ScenarioNames,
     *,
     seeds: options.Seeds = "0",
+    aligners: options.Aligners,
     overrides: options.Overrides,
     jobs: options.Jobs = options.ALL_CORES,
     fresh: options.Fresh = False,
@@ -215,7 +216,7 @@ def check(
 
     checks: list[CheckedScenario] = []
     try:
-        for checked in check_all(scenarios, parse_seeds(seeds), overrides, run_one):
+        for checked in check_all(scenarios, parse_seeds(seeds), overrides, run_one, aligners):
             checks.append(checked)
             if checked.error:
                 options.print_to_stderr(checked.error)
@@ -246,7 +247,7 @@ def list_scenarios(
         ),
     ] = None,
     aligners: Annotated[
-        bool, typer.Option("--aligners", help="List the methods they can name instead.")
+        bool, typer.Option("--aligners", help="List the aligners that `--aligner` takes instead.")
     ] = False,
     schema: Annotated[
         bool, typer.Option("--schema", help="Print their JSON schema instead, for editors.")

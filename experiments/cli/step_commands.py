@@ -69,6 +69,7 @@ def slam(
     from experiments.scenario.suite import settings_of
 
     require_map_file(output, [log, scenario])
+    options.announce_compilation(as_json)
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
         made = single.slam(log, settings, show, smooth)
@@ -101,19 +102,26 @@ def align(
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
+    require_accepted: Annotated[
+        bool, typer.Option("--require-accepted", help="Exit code 1 if no estimate is accepted.")
+    ] = False,
     as_json: options.AsJson = False,
 ) -> None:
     """Estimate T_a_b with every aligner: `mapfusion align R1.parquet R2.parquet`.
 
-    T_a_b is the pose of map b in the frame of map a.
+    T_a_b is the pose of map b in the frame of map a: p_a = R(theta) p_b + (tx, ty). Exit code 0
+    also if no estimate is accepted, unless you ask for one with `--require-accepted`.
     """
     from experiments.cli.options import DOCUMENT, require_file
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
+    from experiments.reports.terminal.layout import print_lines
     from experiments.reports.terminal.run_screen import print_estimates, print_verdict
     from experiments.scenario.suite import settings_of, with_aligners
+    from mapfusion.align.alignment import Status
 
     require_file("--output", output, DOCUMENT, [map_a, map_b, scenario])
+    options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
     rows = []
@@ -121,10 +129,16 @@ def align(
         rows.append(row)
         if not as_json:
             print_verdict(row)
-    found = export.alignment_document((map_a, map_b), settings.seed, rows)
+    accepted = any(single.final_status(row)[0] is Status.ACCEPTED for row in rows)
+    note = "" if accepted else single.align_note(map_a, map_b, settings)
+    found = export.alignment_document((map_a, map_b), settings.seed, rows, note)
     export.publish_json("align", found, as_json, output)
     if not as_json:
         print_estimates(rows)
+        print_lines([note] if note else [])
+    if require_accepted and not accepted:
+        options.print_to_stderr(f"{map_a} and {map_b}: no estimate of T_a_b is accepted")
+        raise typer.Exit(options.EXIT_FAILED)
 
 
 @app.command(rich_help_panel=options.STEPS)
@@ -145,10 +159,12 @@ def merge(
     from experiments.cli.options import require_map_file
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
+    from experiments.reports.terminal.layout import print_lines
     from experiments.reports.terminal.run_screen import print_fused, print_unmerged
     from experiments.scenario.suite import settings_of, with_aligners
 
     require_map_file(output, [*maps, scenario], n_maps=max(len(maps) // 2, 1))
+    options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
     merged = single.merge(maps, settings)
@@ -162,4 +178,5 @@ def merge(
         raise typer.Exit(options.EXIT_FAILED)
     if not as_json:
         for path, fused in zip(paths, merged.fusion.fused, strict=True):
-            print_fused(path, fused, maps)
+            print_fused(path, fused, maps, merged.aligner, merged.is_lower_bound(fused))
+        print_lines([f"  note: {merged.note}"] if merged.note else [])

@@ -74,6 +74,7 @@ def sweep(
     scenarios: options.ScenarioNames,
     *,
     seeds: options.Seeds = "0",
+    aligners: options.Aligners,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -109,7 +110,8 @@ def sweep(
     from experiments.studies import sweep
 
     require_folder(output, scenarios)
-    asked = sweep.prepare(scenarios, parse_seeds(seeds), settings or (), results, output)
+    chosen = parse_seeds(seeds), settings or (), results, output, aligners
+    asked = sweep.prepare(scenarios, *chosen)
     if dry_run:
         study_screen.print_survey(sweep.survey(asked))
         return
@@ -356,6 +358,7 @@ def calibrate(
     from experiments.scenario.suite import settings_of
 
     require_folder(output, [*logs, scenario], may_hold=True)
+    options.announce_compilation(as_json)
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
         found = calibrate_logs(logs, output, settings, show)

@@ -39,7 +39,7 @@ from experiments.evaluation.criteria import (
 from experiments.evaluation.loop_closures import loop_closures
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import FUSER_METRICS, SMOOTHED_METRICS, AnyScenario, Bound
-from experiments.scenario.suite import scenarios_of
+from experiments.scenario.suite import scenarios_of, with_aligners
 from mapfusion.errors import InputError
 
 # The four methods of the paper, algorithm 1 in both readings, as the default list names them.
@@ -415,6 +415,7 @@ def check_all(
     seeds: Sequence[int],
     overrides: Sequence[str],
     run: Callable[[AnyScenario], Path],
+    aligners: Sequence[str] = (),
 ) -> Iterator[CheckedScenario]:
     """Run and check scenarios.
 
@@ -426,6 +427,7 @@ def check_all(
         seeds: seeds of the runs of each scenario.
         overrides: entries `key.sub=value` that replace values of the scenarios.
         run: runs a scenario and returns its result folder.
+        aligners: names for `with_aligners`; none keeps the aligners of each scenario.
     """
     loaded: list[CheckedScenario | list[AnyScenario]] = []
     for word in words:
@@ -436,7 +438,8 @@ def check_all(
             continue
         for path in paths:
             try:
-                loaded.append([load_checked(path, overrides, seed) for seed in seeds])
+                own = with_aligners(path, overrides, aligners)
+                loaded.append([load_checked(path, own, seed) for seed in seeds])
             except InputError as error:
                 loaded.append(CheckedScenario(path.stem, error=str(error)))
     unreadable = any(isinstance(each, CheckedScenario) for each in loaded)

@@ -23,7 +23,7 @@ from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.seeds import generator
 from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
 from mapfusion.align.alignment import NOT_RUN, Pairs, Status
-from mapfusion.align.correspondences import match
+from mapfusion.align.correspondences import match, why_not_unit_vectors
 from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.export import StereoDrive
@@ -32,7 +32,7 @@ from mapfusion.datasets.log_consistency import Finding, check_log, gate_finding,
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
-from mapfusion.fusion.fusers import AlignedPair, Fusion, make_fuser, name_order
+from mapfusion.fusion.fusers import AlignedPair, FusedMap, Fusion, make_fuser, name_order
 from mapfusion.fusion.merge import merge as merge_maps
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.numerics import Float
@@ -49,6 +49,7 @@ from mapfusion.smoother.odometry_calibration import Calibration, calibrate
 from mapfusion.smoother.smooth import SmootherParameters, with_path_errors
 from mapfusion.tables import NO_LABEL
 from mapfusion.verification.registration import Registration
+from mapfusion.verification.rivals import is_mirrored
 from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
 
@@ -198,10 +199,36 @@ class MergeResult(NamedTuple):
         fusion: fused maps.
         pairs: alignments of all pairs of maps, in the order of `fusion.place`; with the
             alternatives of ambiguous alignments.
+        aligner: name of the aligner.
+        notes: what the verdicts on accepted alignments say, by pair of maps; only if they say
+            anything.
     """
 
     fusion: Fusion
     pairs: list[AlignedPair]
+    aligner: str
+    notes: Mapping[tuple[int, int], str]
+
+    @property
+    def note(self) -> str:
+        """Notes on the alignments that are used, in one line; empty if there is none."""
+        used = [pair for pair, reason in self.reasons().items() if not reason]
+        told = [self.notes[pair] for pair in used if pair in self.notes]
+        if not told:
+            return ""
+        others = f" (and for {len(told) - 1} more pairs of maps)" if len(told) > 1 else ""
+        return f"{told[0]}{others}"
+
+    def is_lower_bound(self, fused: FusedMap) -> bool:
+        """Return True if the covariances of a fused map's motions are lower bounds.
+
+        They are if a used alignment is of a map that does not state all errors that its landmarks
+        share.
+        """
+        used = {pair for pair, reason in self.reasons().items() if not reason}
+        members = set(fused.members.tolist())
+        of_fused = (p for p in self.pairs if (p.a, p.b) in used and {p.a, p.b} <= members)
+        return any(pair.alignment.lower_bound for pair in of_fused)
 
     @property
     def any_merged(self) -> bool:
@@ -247,13 +274,21 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     return Registration(aligner, settings.refinement, settings.verifier)
 
 
+def _read_map(path: Path) -> LandmarkMap:
+    """Read a map to be aligned; raise InputError also if its descriptors are no unit vectors."""
+    landmarks = read_map(path)
+    if why := why_not_unit_vectors(landmarks):
+        raise InputError(f"{path}: {why}")
+    return landmarks
+
+
 def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, Any]]:
     """Yield for each aligner a row with its estimate, the refinement and the verdict.
 
     Each aligner is called twice with the same random numbers, and the second call is timed. The
     first call compiles kernels and starts processes.
     """
-    map_a, map_b = read_map(path_a), read_map(path_b)
+    map_a, map_b = _read_map(path_a), _read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
     evidence = settings.align.verifier.on(Pairs(map_a, map_b, pairs)).evidence
     for entry in settings.align.aligners:
@@ -265,6 +300,21 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
         row = {"aligner": entry.name, "elapsed_s": done.estimated.elapsed_s}
         row |= {"n_inliers": int(done.refined.inlier.sum())} | estimate_row(len(pairs), *done)
         yield row
+
+
+def align_note(path_a: Path, path_b: Path, settings: Scenario) -> str:
+    """Return a cause for which every aligner fails on two maps; empty if none is found."""
+    map_a, map_b = read_map(path_a), read_map(path_b)
+    pairs = Pairs(map_a, map_b, match(map_a, map_b, settings.align.match))
+    return _mirror_note(pairs, settings.align)
+
+
+def _mirror_note(pairs: Pairs, settings: Align) -> str:
+    """Say that two maps look like mirror images of each other; empty if they do not."""
+    if not is_mirrored(pairs, settings.acceptance, settings.refinement):
+        return ""
+    a, b = pairs.map_a.name, pairs.map_b.name
+    return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"
 
 
 def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
@@ -290,8 +340,9 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
     name, entries = settings.merge.aligner, {each.name: each for each in settings.align.aligners}
     if name not in entries:
         raise InputError(f"merge.aligner: {name} is not among {', '.join(entries)}")
-    maps = [read_map(path) for path in paths]
-    registration, pairs = _registration(entries[name], settings.align), []
+    maps = [_read_map(path) for path in paths]
+    registration, pairs = _registration(entries[name], settings.align), list[AlignedPair]()
+    notes: dict[tuple[int, int], str] = {}
     order = sorted(range(len(maps)), key=lambda k: (name_order(maps[k].name), str(paths[k])))
     for a, b in itertools.combinations(order, 2):
         rng = generator(settings.seed, "align", name, maps[a].name, maps[b].name)
@@ -299,13 +350,22 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         ready = registration.on(maps[a], maps[b], offered)
         done = ready.register(rng)
         false_alarms = done.verdict.log10_false_alarms
-        pairs.append(AlignedPair(a, b, done.applied, offered, false_alarms))
-        if done.applied.status is Status.AMBIGUOUS and ready.verifier is not None:
+        found = done.applied
+        if found.status in NOT_RUN:  # the reason does not name the aligner
+            found = replace(found, reason=f"{name}: {found.status}: {found.reason}")
+        elif not found.ok and (
+            note := _mirror_note(Pairs(maps[a], maps[b], offered), settings.align)
+        ):
+            found = replace(found, reason=f"{found.reason}; {note}")
+        pairs.append(AlignedPair(a, b, found, offered, false_alarms))
+        if done.verdict.accepted and done.verdict.reason:
+            notes[a, b] = done.verdict.reason
+        if found.status is Status.AMBIGUOUS and ready.verifier is not None:
             rivals = ready.verifier.rivals_of(done.refined)
             pairs += [AlignedPair(a, b, rival, offered, false_alarms) for rival in rivals]
     chosen = settings.merge
     fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))
-    return MergeResult(fusion, pairs)
+    return MergeResult(fusion, pairs, name, notes)
 
 
 def write_drives(

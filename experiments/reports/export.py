@@ -116,9 +116,12 @@ def _covariance(upper: Iterable[float]) -> dict[str, float]:
 
 
 def alignment_document(
-    maps: Sequence[Path], seed: int, rows: Sequence[Mapping[str, Any]]
+    maps: Sequence[Path], seed: int, rows: Sequence[Mapping[str, Any]], note: str = ""
 ) -> dict[str, Any]:
-    """Return the document of `align`: T_a_b of every aligner, from one row each."""
+    """Return the document of `align`: T_a_b of every aligner, from one row each.
+
+    `note` says why no estimate is accepted, if that is known.
+    """
     aligners = []
     for row in rows:
         status, reason = final_status(row)
@@ -133,7 +136,8 @@ def alignment_document(
         numbers = ("n_inliers", "n_correspondences", "log10_false_alarms", "log10_evidence")
         numbers += ("n_confirmed", "n_contradicted", "probability", "elapsed_s")
         aligners.append(answer | {name: row[name] for name in numbers})
-    return {"map_a": maps[0], "map_b": maps[1], "seed": seed, "aligners": aligners}
+    head = {"map_a": maps[0], "map_b": maps[1], "seed": seed, "note": note or None}
+    return {**head, "aligners": aligners}
 
 
 def map_document(
@@ -165,11 +169,14 @@ def fusion_document(
 ) -> dict[str, Any]:
     """Return the document of `merge`: the largest fused map, and the others.
 
+    `lower_bound` is true if the covariances do not contain all errors that the landmarks of a map
+    share. `note` says what the verdict on a used alignment could not test; null if nothing.
     `T_first_map` is null for a map that was left out. Without `paths` nothing was merged, and `map`
     is null.
     """
     pairs = [
         {"map_a": maps[a], "map_b": maps[b], "merged": not reason, "reason": reason or None}
+        | {"note": None if reason else merged.notes.get((a, b))}
         for (a, b), reason in merged.reasons().items()
     ]
     documents: list[dict[str, Any]] = []
@@ -185,11 +192,13 @@ def fusion_document(
         several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
         found = {"n_landmarks": len(fused.landmarks), "n_fused_of_several": several}
         found |= {"duplicate_share": fused.duplicate_share}
+        found |= {"lower_bound": merged.is_lower_bound(fused)}
         documents.append({"map": path, "maps": sources} | found)
     first, *others = documents
     if not paths:
         first |= {"n_landmarks": 0, "n_fused_of_several": 0, "duplicate_share": None}
-    return {"seed": seed, **first, "others": others, "pairs": pairs}
+    head = {"seed": seed, "aligner": merged.aligner}
+    return {**head, **first, "others": others, "pairs": pairs}
 
 
 def check_document(checks: Sequence[CheckedScenario]) -> dict[str, Any]:

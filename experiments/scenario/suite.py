@@ -102,14 +102,15 @@ def with_aligners(
 def chosen_aligners(
     names: Sequence[str], entries: Sequence[AlignerEntry] = ()
 ) -> tuple[AlignerEntry, ...]:
-    """Return aligners by name: those of `entries`, else methods with their default parameters.
+    """Return aligners by name: of `entries`, else of the default list, else a method.
 
-    A class in a file, FILE.py:CLASS, is named CLASS. Raises InputError if a name is unknown.
+    A method has its default parameters. A class in a file, FILE.py:CLASS, is named CLASS. Raises
+    InputError if a name is unknown.
     """
     from experiments.plugins.discovery import require_usable
-    from experiments.scenario.settings import AlignerEntry
+    from experiments.scenario.settings import DEFAULT_ALIGNERS, AlignerEntry
 
-    known, chosen = {entry.name: entry for entry in entries}, []
+    known, chosen = {entry.name: entry for entry in (*DEFAULT_ALIGNERS, *entries)}, []
     for name in dict.fromkeys(names):
         if name not in known:
             try:

@@ -228,8 +228,10 @@ class Standing:
     Attributes:
         aligner: its name.
         n_maps: number of pairs of maps with common ground.
-        rate: share of these on which the refined result is right; `low` and `high` are the ends of
-            its 95 % Wilson interval (trials are runs, or the maps of one run).
+        n_alignments: number of alignments of these pairs, with all repetitions.
+        rate: share of these alignments whose refined result is right, the mean over the pairs of
+            maps; `low` and `high` are the ends of its 95 % Wilson interval (trials are runs, or
+            the pairs of maps of one run).
         estimated_m: median error over answerable maps; it and the next three are infinite where
             more than half of the maps have no estimate.
         over_oracle: refined errors over those of the oracle, on rich maps.
@@ -240,6 +242,7 @@ class Standing:
 
     aligner: str
     n_maps: int
+    n_alignments: int
     rate: float
     low: float
     high: float
@@ -252,6 +255,14 @@ class Standing:
     n_false: int
     time_ms: float
     shown: dict[str, float]
+
+    @property
+    def alignments(self) -> str:
+        """Number of alignments that `rate` counts, in words."""
+        maps = f"{self.n_maps} pairs of maps with common ground"
+        if self.n_alignments == self.n_maps:
+            return maps
+        return f"{self.n_alignments} alignments of {maps}"
 
 
 # An aligner with a lower rate, at the upper end of its interval, fails more often than it succeeds.
@@ -370,7 +381,9 @@ def _standings(maps: pd.DataFrame, timings: pd.DataFrame, aligners: list[str]) -
     """Return the results of each aligner, in the order of `aligners`."""
     is_ground = has_common_ground(maps)
     times = maps[["accepted", "false_accepted"]].mul(maps["n_repetitions"], axis=0)
-    counted = times.set_axis(["n_accepted", "n_false"], axis=1).assign(n_maps=is_ground)
+    counted = times.set_axis(["n_accepted", "n_false"], axis=1).assign(
+        n_maps=is_ground, n_alignments=maps["n_repetitions"].where(is_ground, 0)
+    )
     counts = counted.groupby(maps["aligner"]).sum().round()
     shown = _shown_columns(maps)
     found = shown[list(_ERRORS)].rename(columns=_ERRORS).reindex(aligners)

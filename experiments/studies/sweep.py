@@ -28,8 +28,8 @@ from experiments.pipeline.store import Store, retry_damaged
 from experiments.pipeline.tasks import OnProgress, Task, task_names, unfinished
 from experiments.pipeline.workers import single_threaded
 from experiments.scenario.settings import Simulation
-from experiments.scenario.suite import scenarios_of
-from experiments.scenario.yaml_files import parse_value, read_mapping
+from experiments.scenario.suite import scenarios_of, with_aligners
+from experiments.scenario.yaml_files import apply_overrides, parse_value, read_mapping
 from experiments.studies.sweep_tables import (
     ALIGNER_TIMINGS,
     RUN_TIMES,
@@ -43,6 +43,7 @@ from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whol
 from sim.renderer import require_pybullet
 
 _EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
+_ALIGNER_LISTS = {"align.aligners", "align.also"}
 _FIXED = {"seed": "--seeds 0..4", "name": "one sweep for each name"}
 
 # Values of each dotted key, as YAML in one spelling (0.10 is 0.1).
@@ -74,22 +75,27 @@ def parse_axes(entries: Sequence[str], option: str = "--set") -> Axes:
     return axes
 
 
-def runs_of(paths: Sequence[Path], seeds: Sequence[int], axes: Axes) -> list[SweepRun]:
+def runs_of(
+    paths: Sequence[Path], seeds: Sequence[int], axes: Axes, aligners: Sequence[str] = ()
+) -> list[SweepRun]:
     """Return all combinations; runs that share many stages follow each other.
 
     Each scenario file is read once. It is loaded with every combination of values, so a wrong value
-    is reported before anything is computed.
+    is reported before anything is computed. The aligners of `with_aligners` replace those of the
+    file, and the values of `axes` apply to them.
 
     Raises:
-        InputError: a scenario, key or value is wrong, two scenarios have the same name, or PyBullet
-            is not installed.
+        InputError: a scenario, key, value or aligner is wrong, two scenarios have the same name, or
+            PyBullet is not installed.
     """
+    if aligners and (listed := axes.keys() & _ALIGNER_LISTS):
+        raise InputError(f"--aligner: --set {min(listed)} gives aligners, too; use one of the two")
     choices = ([(key, value) for value in values] for key, values in axes.items())
     combinations = list(itertools.product(*choices))
     runs: list[SweepRun] = []
     names: dict[str, Path] = {}
     for path in paths:
-        content = read_mapping(path)
+        content = apply_overrides(read_mapping(path), with_aligners(path, (), aligners))
         loaded = [SweepRun(path, "", seeds[0], each, content).load() for each in combinations]
         if any(isinstance(scenario, Simulation) for scenario in loaded):
             require_pybullet()
@@ -131,6 +137,7 @@ def prepare(
     settings: Sequence[str],
     results: Path,
     output: Path | None = None,
+    aligners: Sequence[str] = (),
 ) -> Sweep:
     """Check what the user asked for, `settings` as in `--set`; nothing is written.
 
@@ -140,7 +147,7 @@ def prepare(
         InputError: a scenario, key or value is wrong.
     """
     axes = parse_axes(settings)
-    runs = runs_of(scenarios_of(asked), seeds, axes)
+    runs = runs_of(scenarios_of(asked), seeds, axes, aligners)
     name = "-".join(Path(part).stem for part in asked)[:_LONGEST_NAME]
     folder = output or results / "sweeps" / name
     # absolute: workers may have been started elsewhere

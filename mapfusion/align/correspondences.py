@@ -220,7 +220,9 @@ def _take(side: _Side, i: int, j: int, distance2: float) -> None:
 
 
 FEW = 3  # correspondences; fewer cannot contradict a motion, and `match` explains the shortage
-_NORM_FACTOR = 2.0  # largest ratio of a descriptor's norm to 1
+# `why_not_unit_vectors` reports norms of this size or more, and of its inverse or less. Rounding
+# to integers changes norms less.
+_NORM_FACTOR = 2.0
 # Constants of `scale_note`. Lengths of two maps differ by a few percent (calibration, drift). An
 # interval of this width contains about 5 % of the ratios of false pairs, whose logarithms have a
 # spread of 0.7; a quarter of the ratios in it cannot be chance.
@@ -410,11 +412,8 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
             f"(median {_short(np.median(distance))})"
         )
         for landmarks, some in ((map_a, rows), (map_b, nearest)):
-            assert landmarks.descriptor is not None
-            norm = float(np.median(np.linalg.norm(landmarks.descriptor[some], axis=1)))
-            if not 1 / _NORM_FACTOR < norm < _NORM_FACTOR:
-                told = f"have the norm {_short(norm)} (median); divide each by its norm"
-                return f"{said}: descriptors of map {landmarks.name} {told}"
+            if why := why_not_unit_vectors(landmarks, some):
+                return f"{said}: map {landmarks.name}: {why}"
         return f"{said}: the maps show other things, or their descriptors are of different kinds"
     if n_alike < len(rows):
         said += f", {n_alike} at most {parameters.max_descriptor_distance:g} apart"
@@ -430,6 +429,28 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
     )
     scale = scale_note(map_a, map_b, rows, nearest)
     return f"{said}; {scale}" if scale else said
+
+
+def why_not_unit_vectors(landmarks: LandmarkMap, rows: np.ndarray | None = None) -> str:
+    """Return which descriptor of a map has a norm far from 1, with a remedy; empty if none has.
+
+    Args:
+        landmarks: the map.
+        rows: landmarks to test, shape (N,); None: all. Landmarks without a descriptor pass.
+    """
+    if landmarks.descriptor is None:
+        return ""
+    rows = np.arange(len(landmarks)) if rows is None else rows
+    norms = np.linalg.norm(landmarks.descriptor[rows].astype(np.float64), axis=1)
+    wrong = np.flatnonzero((norms <= 1 / _NORM_FACTOR) | (norms >= _NORM_FACTOR))
+    if not len(wrong):
+        return ""
+    zero = norms[wrong[0]] == 0
+    remedy = "give NaN where there is none" if zero else "divide each descriptor by its norm"
+    return (
+        f"descriptor: row {rows[wrong[0]]} has norm {_short(norms[wrong[0]])}, expected 1 "
+        f"({len(wrong)} of {len(rows)} rows); {remedy}"
+    )
 
 
 def scale_note(

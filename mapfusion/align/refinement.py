@@ -36,6 +36,9 @@ from mapfusion.parameters import Range, require_in_range, require_shape
 # be distinguished from false pairs that are uniform over the gate.
 _GATE_SIGMAS = 3.0
 _TOLERANCE_M = 1e-8  # movement of the landmarks at convergence
+# Relative change of s_drift^2 and of the share of true pairs at convergence: the covariance then
+# has about four digits. Exact maps determine the motion before s_drift has left its start.
+_MIXTURE_TOLERANCE = 1e-4
 # Round from which on the pairs inside the gate are fixed and oscillating steps of s_drift are
 # halved, so that neither a pair on the gate's edge nor s_drift oscillates forever.
 _SETTLING_ROUNDS = 50
@@ -222,7 +225,7 @@ def maximise_likelihood(
         determined = not total < 1.0 and invert(normal, covariance)
         if not determined:
             break
-        share = total / (count + _PRIOR_FALSE)
+        share_before, share = share, total / (count + _PRIOR_FALSE)
         change = min(drift_step(e, S, truth, variance, gate_m), widest) - variance
         # a few pairs that are far more precise than the others can cause oscillation
         turned_back = change * last_change < 0 and abs(change) > _SWINGING * abs(last_change)
@@ -242,7 +245,9 @@ def maximise_likelihood(
         moved = math.sqrt(farthest2)
         for k in range(3):
             T_a_b[k] += step[k]
-        if moved <= _TOLERANCE_M:
+        settled = abs(step_share * change) <= _MIXTURE_TOLERANCE * variance
+        settled = settled and abs(share - share_before) <= _MIXTURE_TOLERANCE * share
+        if moved <= _TOLERANCE_M and settled:
             break
     if determined:
         # Subtract the missing information about which pairs are true (Louis 1982). The

@@ -35,7 +35,7 @@ class Compiled:
     @cached_property
     def compiled(self) -> Any:
         """Numba's function for calls from Python, kept on disk."""
-        _let_kernels_call_each_other()
+        _prepare_numba()
         return self._compiler(self.py_func, cache=True)
 
     @cached_property
@@ -51,14 +51,37 @@ class Compiled:
         return self.compiled(*arguments)
 
 
+_before_compilation: list[Callable[[], None]] = []  # at most one
+
+
+def before_compilation(action: Callable[[], None] | None) -> None:
+    """Set a function that is called once, before this process compiles its first kernel.
+
+    Kernels that are loaded from the disk do not count. None removes the function of an earlier
+    call.
+    """
+    _before_compilation[:] = [] if action is None else [action]
+
+
 @cache
-def _let_kernels_call_each_other() -> None:
-    """Give a `Compiled` object the Numba type of its `inner` function."""
+def _prepare_numba() -> None:
+    """Give a `Compiled` object the Numba type of its `inner` function; observe compilations."""
+    from numba.core.event import Listener, register
     from numba.core.registry import cpu_target
     from numba.extending import typeof_impl
 
     context = cast(Any, cpu_target).typing_context
     typeof_impl.register(Compiled)(lambda own, _: context.resolve_value_type(own.inner))
+
+    class Observer(Listener):
+        def on_start(self, event: Any) -> None:
+            while _before_compilation:
+                _before_compilation.pop()()
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    register("numba:compile", Observer())
 
 
 def kernel(function: Any = None, **options: Any) -> Any:

@@ -187,6 +187,33 @@ def distinct_motions(
     return found
 
 
+def is_mirrored(pairs: Pairs, acceptance: Acceptance, refinement: Refinement) -> bool:
+    """Return True if the mirror image of map b fits map a beyond chance, and map b does not.
+
+    Maps are mirror images of each other if one of them has y to the right.
+    """
+    flip = np.array([1.0, -1.0, 1.0])
+    own, bound = pairs.map_b, math.log10(acceptance.false_alarms)
+    position, covariance = own.position_m * flip, own.covariance_m2 * np.outer(flip, flip)
+    image = LandmarkMap(
+        position,
+        covariance,
+        own.count,
+        own.source_observation,
+        own.descriptor,
+        own.label,
+        own.planar,
+        own.name,
+    )
+
+    def fits(map_b: LandmarkMap) -> bool:
+        given = Pairs(pairs.map_a, map_b, pairs.correspondences)
+        motions = distinct_motions(given, 1, acceptance, refinement)
+        return any(each.log10_false_alarms <= bound for each in motions)
+
+    return fits(image) and not fits(own)
+
+
 def self_motions(
     landmarks: LandmarkMap, most: int, acceptance: Acceptance, refinement: Refinement
 ) -> tuple[Pairs, list[SupportedMotion]]:

@@ -100,9 +100,9 @@ def test_a_run_ends_as_shown(tiny_result: Path, capsys: pytest.CaptureFixture[st
     advice, opening = shown
     own, opens = closing_lines(tiny_result)
     forms = (
-        r"Method to use: \w+\. It was right on \d+\s% of \d+ pairs of maps with common ground, "
-        r"median error [\d.]+\sm and [\d.]+\srad\..* One run is a hint; a sweep over "
-        r"seeds decides\."
+        r"Method to use: \w+\. It was right in \d+\s% of (\d+ alignments of )?\d+ pairs of "
+        r"maps with common ground, median error [\d.]+\sm and [\d.]+\srad\..* One run is a "
+        r"hint; a sweep over seeds decides\."
     )
     for line in (advice, own):
         assert re.fullmatch(forms, line), line

@@ -7,8 +7,10 @@ import numpy as np
 
 from experiments.pipeline.stage import Job, StageKind
 from experiments.scenario.seeds import generator
-from sim.driver import DriverSettings, Route, drive
+from mapfusion.errors import InputError
+from sim.driver import DriverSettings, drive, require_drivable
 from sim.floorplan import FloorPlan, Wall
+from sim.routes import Route
 from sim.textures import Texture
 from sim.trajectory import BodySway, Trajectory, write_trajectory
 from sim.world import write_faces
@@ -29,8 +31,13 @@ class Walls:
         lines = [np.array(line) for line in self.polylines_m]
         looks = [("", False)] * len(lines) if looks is None else looks
         size = self.height_m, self.thickness_m
-        each = zip(lines, looks, strict=True)
-        return FloorPlan(tuple(Wall(line, *size, *look) for line, look in each))
+        walls = list[Wall]()
+        for i, (line, look) in enumerate(zip(lines, looks, strict=True)):
+            try:
+                walls.append(Wall(line, *size, *look))
+            except InputError as error:
+                raise InputError(f"world.walls.{i}.points: {error}") from error
+        return FloorPlan(tuple(walls))
 
 
 @dataclass(frozen=True)
@@ -88,20 +95,32 @@ def run_drive(settings: DriveSettings, job: Job) -> None:
 DRIVE_STAGE = StageKind("drive", "drive the robots", run_drive, (TRAJECTORY_FILE,))
 
 
+def _routes(settings: DriveSettings) -> list[Route]:
+    """Return the routes of all robots, with random jitter of the starts."""
+    span = np.array([settings.start_jitter_m] * 2 + [settings.start_jitter_rad])
+    routes = []
+    for robot in settings.robots:
+        jitter = generator(settings.seed, "start", robot.name).uniform(-span, span)
+        start, route = np.array(robot.start) + jitter, np.array(robot.route)
+        planned_m = robot.start[:2] if settings.start_jitter_m else None
+        own = robot.loop, robot.tire_friction, planned_m
+        routes.append(Route(robot.name, start, route, *own))
+    return routes
+
+
+def require_drive(settings: DriveSettings) -> None:
+    """Raise InputError for a world that `drive_robots` refuses before the robots drive."""
+    require_drivable(settings.walls.floor_plan(), _routes(settings), settings.frame_interval_s)
+
+
 def drive_robots(settings: DriveSettings) -> Trajectory:
     """Drive the robots from starts with random jitter, and add body sway.
 
     Raises:
         InputError: a robot cannot follow its route.
     """
-    span = np.array([settings.start_jitter_m] * 2 + [settings.start_jitter_rad])
-    routes = []
-    for robot in settings.robots:
-        jitter = generator(settings.seed, "start", robot.name).uniform(-span, span)
-        start, route = np.array(robot.start) + jitter, np.array(robot.route)
-        routes.append(Route(robot.name, start, route, robot.loop, robot.tire_friction))
     plan, interval_s = settings.walls.floor_plan(), settings.frame_interval_s
-    trajectory = drive(plan, routes, settings.control, settings.frames, interval_s)
+    trajectory = drive(plan, _routes(settings), settings.control, settings.frames, interval_s)
     if settings.body_sway.sigma_rad:
         tilts = [
             settings.body_sway.tilts(trajectory.time_s, generator(settings.seed, "sway", robot))

@@ -172,17 +172,25 @@ def print_skipped(skipped: Sequence[str]) -> None:
 
 
 def print_methods() -> None:
-    """Print every alignment method with kind, package and version, and reasons of absence."""
-    from experiments.plugins.discovery import known_methods, name_clashes
+    """Print every aligner by name with kind, package and version, and reasons of absence.
 
-    methods = known_methods().values()
+    Aligners are the alignment methods, and the methods with parameters of the default list.
+    """
+    from experiments.plugins.discovery import known_methods, name_clashes
+    from experiments.scenario.settings import DEFAULT_ALIGNERS
+
+    methods = known_methods()
     rows = [
-        (each.name, each.kind, each.distribution, "absent" if each.absence else each.version)
-        for each in methods
+        (each.name, str(each.kind), each.distribution, "absent" if each.absence else each.version)
+        for each in methods.values()
     ]
-    headings = ("method", "kind", "package", "version")
-    print_table([(heading, "") for heading in headings], rows, "Alignment methods")
-    absent = [f"{each.name}: {each.absence}" for each in methods if each.absence]
+    for entry in DEFAULT_ALIGNERS:
+        if entry.name not in methods:
+            given = ", ".join(f"{key}: {value}" for key, value in entry.parameters.items())
+            rows.append((entry.name, f"{entry.method} with {given}", "", ""))
+    headings = ("aligner", "kind", "package", "version")
+    print_table([(heading, "") for heading in headings], rows, "Aligners")
+    absent = [f"{each.name}: {each.absence}" for each in methods.values() if each.absence]
     print_lines(f"  {line}" for line in (*absent, *name_clashes().values()))
 
 

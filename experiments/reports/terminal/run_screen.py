@@ -74,7 +74,7 @@ def team_lines(motions: pd.DataFrame, team: pd.DataFrame, pairs: pd.DataFrame) -
         found = (used & met & right).sum()
         yield (
             f"alignments believed: {used.sum()}, right: {found}; "
-            f"pairs with common ground: {met.sum()}, found: {found}"
+            f"pairs of maps with common ground: {met.sum()}, found: {found}"
         )
 
 
@@ -96,8 +96,8 @@ _ALIGNERS |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time
 _SMOOTHED = columns("", aligner="aligner")
 _SMOOTHED |= columns(".3f", filter_m="FastSLAM's\nm") | columns(".0%", filter_ok="\nok")
 _SMOOTHED |= columns(".3f", smoothed_m="smoothed\nm") | columns(".0%", smoothed_ok="\nok")
-_PAIRS = [("pair", ""), ("error, m", ".3f"), ("error, rad", "+.4f")]
-_PAIRS += [("oracle, m", ".3f"), ("oracle, rad", "+.4f"), ("true pairs", ">")]
+_PAIRS = [("maps", ""), ("error, m", ".3f"), ("error, rad", "+.4f")]
+_PAIRS += [("oracle, m", ".3f"), ("oracle, rad", "+.4f"), ("correspondences\ntrue", ">")]
 _ANSWERS = columns("", aligner="aligner")
 _ANSWERS |= columns(".0%", estimated="estimated", refined="refined", accepted="accepted")
 _PATHS = columns("", robot="robot") | columns(".3f", path_m="FastSLAM, m")
@@ -114,7 +114,7 @@ _FUSERS |= columns(".3f", fitted_rmse_m="fitted\nm") | columns(".1%", gross_shar
 _FUSERS |= columns(".2f", over_better_parent="over\nparent", over_better_filter="over\nfilter")
 _FUSERS |= columns(".2f", nees_per_dof="NEES\n/ dof") | columns(".0%", coverage_95="in\n95 %")
 _FUSERS |= columns(".3f", alignment_error_m="T_a_b\nm", alignment_sigma_m="sigma\nm")
-_TEAM_PAIRS = columns("", pair="pair", place="its alignment")
+_TEAM_PAIRS = columns("", pair="maps", place="their alignment")
 _TEAM_PAIRS |= columns(".3f", refined_translation_error_m="alone\nm")
 _TEAM_PAIRS |= columns("+.4f", refined_rotation_error_rad="\nrad")
 _TEAM_PAIRS |= columns(".3f", team_translation_error_m="in the team\nm")
@@ -185,8 +185,8 @@ def method_advice(found: Recommendation) -> str:
         return f"Method to use: none. {tried} {hint}"
     name = best.aligner if found.reliable else f"none is reliable. The best is {best.aligner}"
     how = (
-        f"It was right on {percent(best.rate)} of {best.n_maps} pairs of maps with common ground, "
-        f"median error {metres(best.refined_m)} and {radians(best.refined_rad)}"
+        f"It was right in {percent(best.rate)} of {best.alignments}, median error "
+        f"{metres(best.refined_m)} and {radians(best.refined_rad)}"
     )
     if best.n_false:
         how += f", but {best.n_false} of {best.n_accepted} accepted alignments were wrong"
@@ -242,8 +242,11 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
         if len(maps := answerable(errors)):
             n_offered = maps["n_correspondences"]
             share = (maps["n_true"] / n_offered).median()
-            note += f"\npairs offered: {n_offered.median():.0f}, {share:.0%} of them true"
-        title = f"Alignment errors: medians over iterations with {ANSWERABLE_PAIRS}+ true pairs"
+            note += (
+                f"\ncorrespondences: {n_offered.median():.0f} (median), {share:.0%} of them true"
+            )
+        title = f"Alignment errors: medians over pairs of maps with {ANSWERABLE_PAIRS} or more "
+        title += "true correspondences"
         summary = aligner_summary(errors, table("aligner_timings"), aligners)
         print_frame(summary, _ALIGNERS, title, note)
         print_lines(f"  {line}" for line in not_run_lines(errors))
@@ -263,7 +266,7 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
             found = (*medians[(*pair, aligners[0])], *medians[(*pair, ORACLE)])
             n_true = f"{last['n_true']} of {last['n_correspondences']}"
             rows.append([" - ".join(pair), *found, n_true])
-        print_table(_PAIRS, rows, f"Pairs at the last iteration, {aligners[0]} refined")
+        print_table(_PAIRS, rows, f"Pairs of maps at the last iteration, {aligners[0]} refined")
     elif len(estimates := table("estimates")):
         # Without truth: shares of maps and repetitions
         by_aligner = estimates.groupby("aligner", sort=False)
@@ -296,9 +299,9 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
     pairs = table("team_pairs")
     if len(pairs) > 1:
         names = pairs["robot_a"] + " - " + pairs["robot_b"]
-        note = "errors of T_a_b, from the pair's own alignment and from all of the team\n"
-        note += "its alignment: agreement with loops of the others; common: landmarks of both maps"
-        print_frame(pairs.assign(pair=names), _TEAM_PAIRS, "Pairs in the team", note)
+        note = "errors of T_a_b, from the alignment of both maps and from all of the team\n"
+        note += "their alignment: agreement with loops of the others; common: landmarks of both"
+        print_frame(pairs.assign(pair=names), _TEAM_PAIRS, "Pairs of maps in the team", note)
     # Work of each stage, and of a run beside its stages
     times = tables.work_by_stage(table("timings"))
     times["share"] = times["seconds"] / times["seconds"].sum()
@@ -371,6 +374,9 @@ def print_verdict(row: dict[str, Any]) -> None:
     print_lines([f"  {row['aligner']}: {status}" + (f": {reason}" if reason else "")])
 
 
+_LOWER_BOUND = "≥: a lower bound, since a map does not state the errors that its landmarks share"
+
+
 def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     """Print the estimates of all aligners on two maps, and the verdicts on them."""
     found = pd.DataFrame(rows)
@@ -384,8 +390,7 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     stated = found.assign(sigma_m=texts(sigma_m, ".3f"), sigma_rad=texts(sigma_rad, ".4f"))
     note = "sigma: stated for the refined estimate, of distance and angle"
     if found["lower_bound"].any():
-        note += "; ≥: a lower bound,\n"
-        note += "because a map does not state the errors that its landmarks share"
+        note += f"\n{_LOWER_BOUND}"
     print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
     inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
     verdicts = [str(final_status(row)[0]) for row in rows]
@@ -394,26 +399,31 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         found.assign(inliers=inliers, time=times, verdict=verdicts),
         _VERDICTS,
         "Verdicts on the refined estimates",
-        "NFA: expected number of alignments with as much support by chance; evidence: ratio\n"
-        "of the likelihoods of both robots' observations if it is right; time: of the estimate",
+        "NFA: expected number of alignments with as much support by chance; evidence:\n"
+        "likelihood ratio of both robots' observations; time: of the estimate",
     )
 
 
-def print_fused(path: Path, fused: FusedMap, maps: Sequence[Path]) -> None:
-    """Print the landmarks and the motions of a fused map."""
+def print_fused(
+    path: Path, fused: FusedMap, maps: Sequence[Path], aligner: str, lower_bound: bool
+) -> None:
+    """Print the landmarks and the motions of a fused map, and the aligner of the motions."""
     several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
     n_maps = len(fused.members)
     lines = [
-        f"{len(fused.landmarks)} landmarks in {path}: fused from {n_maps} maps; {several} "
-        f"landmarks are of several maps, {fused.duplicate_share:.1%} look like remaining "
-        "duplicates"
+        f"{len(fused.landmarks)} landmarks in {path}: fused from {n_maps} maps, aligned by "
+        f"{aligner}; {several} landmarks are of several maps, {fused.duplicate_share:.1%} look "
+        "like remaining duplicates"
     ]
     sigmas = zip(*motion_sigma(fused.motion_covariance), strict=True)
     for name, (x_m, y_m, theta_rad), sigma in zip(maps, fused.T_first_map, sigmas, strict=True):
         if not math.isnan(x_m):
-            stated = f"sigma {sigma[0]:.3f} m, {sigma[1]:.4f} rad" if any(sigma) else "the frame"
+            bound = "≥ " if lower_bound else ""
+            stated = f"sigma {bound}{sigma[0]:.3f} m, {bound}{sigma[1]:.4f} rad"
+            stated = stated if any(sigma) else "the frame"
             T = f"({x_m:.3f} m, {y_m:.3f} m, {theta_rad:.4f} rad)"
             lines.append(f"  {name}: T_first_map = {T}, {stated}")
+    lines += [f"  {_LOWER_BOUND}"] if lower_bound else []
     lines += [f"  {name}: left out ({reason})" for name, reason in fused.left_out]
     print_lines(lines)
 

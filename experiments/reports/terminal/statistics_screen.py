@@ -55,7 +55,9 @@ _FUSERS |= columns(".2g", over_better_filter="over filter", nees_per_dof="NEES /
 _FUSERS |= columns(".0%", coverage_95="in 95 %")
 _TEAM = columns("", source="path") | columns(">", robots="robots")
 _TEAM |= columns(".3g", rmse="RMSE, m", median="median", max="max")
-_TEAM_PAIRS = columns("d", n_pairs="pairs", n_met="met") | columns(".0%", precision="precision")
+_TEAM_PAIRS = columns("d", n_pairs="pairs\nof maps", n_met="met") | columns(
+    ".0%", precision="precision"
+)
 _TEAM_PAIRS |= columns(".0%", recall="recall")
 _TEAM_PAIRS |= columns(".3g", alone_m="alone, m", team_m="in the team, m")
 _NEES = columns("", landmarks="landmarks") | columns("d", n_landmarks="n")
@@ -82,7 +84,7 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
         shares = by_pairs.pivot_table("estimated_success", index, "bin", sort=False)
         bins = {name: name for name in by_pairs.sort_values("from")["bin"] if name in shares}
         shown = _METHOD | columns(".0%", **bins)
-        note = "by the number of true pairs, from the lower edge of each bin; "
+        note = "by the number of true correspondences, from the lower edge of each bin; "
         note += "intervals: see the files"
         _print(shares.reset_index(), shown, "Share of the maps right as estimated", note)
     ratios = _rows(summary, "error_over_oracle")
@@ -90,7 +92,9 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
         shown = _METHOD | columns(".0%", **{f"{stage}_share": "given"})
         shown |= columns(".3f", **{f"{stage}_m": "error, m"})
         shown |= columns(".2f", **{f"{stage}_ratio": "over the oracle"})
-        note = f"maps with {RICH_PAIRS}+ true pairs; (95 %, bootstrap); {layout.NO_ESTIMATE}"
+        note = (
+            f"maps with {RICH_PAIRS}+ true correspondences; (95 %, bootstrap); {layout.NO_ESTIMATE}"
+        )
         _print(
             ratios, shown, f"Median translation error {kind}, and its ratio to the oracle's", note
         )
@@ -115,7 +119,7 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
         note = "all merged robots under one rigid fit, median over runs; (95 %, bootstrap)"
         _print(team.assign(robots=robots), _TEAM, "Path errors of teams (ATE)", note)
     note = "precision: right ones of those used; recall: found ones of those that met;\n"
-    note += "errors of T_a_b, medians over pairs in one map; (95 %, Wilson, bootstrap)"
+    note += "errors of T_a_b, medians over pairs of merged maps; (95 %, Wilson, bootstrap)"
     title = "Alignments between robots at the end"
     _print(_rows(summary, "team_pairs"), _TEAM_PAIRS, title, note)
     note = "accepted alignments of maps with joint covariances; in 90 %: share of the true\n"

@@ -44,7 +44,7 @@ from mapfusion.smoother.odometry_calibration import Calibration
 
 
 def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
-    """Print successes and times for each number of pairs, and the folder of the results."""
+    """Print successes and times by number of correspondences, and the folder of the results."""
 
     def text(row: dict[Any, Any]) -> str:
         if row["status"] == Status.ABSENT:
@@ -58,7 +58,7 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
             [method, *(text(row) for row in own.to_dict("records"))]
             for method, own in rows.groupby("method", sort=False)
         ]
-        print_table(shown, cells, f"{n_pairs} pairs: success in %, time in ms")
+        print_table(shown, cells, f"{n_pairs} correspondences: success in %, time in ms")
     failed = summary.groupby("method", sort=False)["n_failed"].sum()
     print_lines(
         f"  {method}: failed in {n} trials, see trials.parquet"
@@ -130,7 +130,7 @@ def print_sweep(dataset: SweepDataset, runs: Sequence[SweepRun], failed: Mapping
             shown |= columns(".3f", **{error: f"{stage}\nm"})
             shown |= columns(".0%", **{given: "\ngiven"})
         shown |= columns("d", runs="runs")
-        title = f"Median translation errors over runs, {ANSWERABLE_PAIRS}+ true pairs"
+        title = f"Median translation errors over runs, {ANSWERABLE_PAIRS}+ true correspondences"
         print_frame(summary.head(MAX_ROWS_SHOWN), shown, title, NO_ESTIMATE)
         if len(summary) > MAX_ROWS_SHOWN:
             lines.append(f"... and {len(summary) - MAX_ROWS_SHOWN} more rows")
@@ -217,8 +217,8 @@ def print_refusals(rows: Sequence[dict[str, Any]], false_alarms: float) -> None:
         f"Accepted where chance gives at most {false_alarms:g} a pair of maps",
         "false: accepted without common ground; wrong: accepted with some, "
         f"{RIGHT_WITHIN_M:g} m or {RIGHT_WITHIN_RAD:g} rad off; missed: refused with "
-        f"{MERGEABLE_PAIRS} or more true pairs, of all and of those right; 20 true: just 20 in "
-        "one corner are left",
+        f"{MERGEABLE_PAIRS} or more true correspondences, of all and of those right; 20 true: "
+        "just 20 in one corner are left",
     )
     wide = {
         name: f"{2 * float(name.removeprefix('poster_')):g} m\nwide"
@@ -260,9 +260,9 @@ def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
         [("kind of world", ""), *shown.values()],
         [row for row in found if row[1:] != ["–"] * (len(row) - 1)],
         "Right answers, by kind of world",
-        f"of all methods, with {MERGEABLE_PAIRS} or more true pairs; first: a run's first right "
-        f"answer that is accepted (median, {rows[0]['aligner']}), and by the test against chance "
-        "alone",
+        f"of all methods, with {MERGEABLE_PAIRS} or more true correspondences; first: a run's "
+        f"first right answer that is accepted (median, {rows[0]['aligner']}), and by the test "
+        "against chance alone",
     )
 
 

@@ -11,13 +11,16 @@ import pytest
 import typer
 
 from experiments.cli.completion import (
+    complete_aligner,
     complete_format,
     complete_scenario_or_tag,
     complete_setting,
 )
 from experiments.cli.main import app
+from experiments.plugins.discovery import known_methods
 from experiments.reports import result_export
-from experiments.scenario.suite import entries
+from experiments.scenario.settings import DEFAULT_ALIGNERS
+from experiments.scenario.suite import chosen_aligners, entries
 from experiments.scenario.yaml_files import SHIPPED
 from mapfusion.datasets.formats import EXPORTERS
 from mapfusion.errors import DISTRIBUTION
@@ -107,6 +110,22 @@ def test_completed_names_are_those_that_commands_take() -> None:
     assert set(complete_scenario_or_tag("")) == tags | {
         path.stem for path in SHIPPED.glob("*.yaml")
     }
+
+
+def test_listed_aligners_are_those_that_commands_take(capsys: pytest.CaptureFixture[str]) -> None:
+    listed = command(capsys, "scenarios", "--aligners").out
+    names = {entry.name for entry in DEFAULT_ALIGNERS} | set(known_methods())
+    for name in names:
+        assert re.search(rf"^{name} ", listed, re.MULTILINE), name
+    assert set(complete_aligner("")) == names
+    assert {entry.name for entry in chosen_aligners(sorted(names))} == names
+
+
+def test_the_page_of_commands_lists_each_once() -> None:
+    page = (ROOT / "experiments" / "docs" / "commands.md").read_text(encoding="utf-8")
+    commands = re.findall(r"^\| `(mapfusion [^`]+)`", page, re.MULTILINE)
+    assert len(commands) > 15
+    assert sorted(commands) == sorted(set(commands))
 
 
 @pytest.mark.parametrize(

@@ -351,6 +351,28 @@ def test_none_is_run_where_one_cannot_be_read(
     assert cases["a: run"].find("skipped") is not None
 
 
+def test_all_scenarios_run_with_the_chosen_aligners(
+    three: list[Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ran: list[list[str]] = []
+
+    def run(scenario: AnyScenario, *_: object) -> Path:
+        ran.append([entry.name for entry in scenario.align.aligners])
+        return tmp_path
+
+    monkeypatch.setattr("experiments.evaluation.result.run_scenario", run)
+    monkeypatch.setattr("experiments.evaluation.metrics.check", lambda *_: [])
+    monkeypatch.setattr("experiments.evaluation.metrics.nothing_merged", lambda _: None)
+    reply = command(capsys, "check", *three[:2], "--aligner", "svd-solved", "--aligner", "gnc")
+    assert reply.code == 0, reply.err
+    assert ran == 2 * [["svd-solved", "gnc"]]
+    refused = command(capsys, "check", three[0], "--aligner", "magic")
+    assert (refused.code, len(refused.complaints)) == (2, 1)
+
+
 def test_a_defect_is_told_and_then_raised(three: list[Path]) -> None:
     def run(scenario: AnyScenario) -> Path:
         raise ZeroDivisionError("of ours")

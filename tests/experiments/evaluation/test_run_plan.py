@@ -6,6 +6,9 @@ import pytest
 
 from experiments.evaluation import tables
 from experiments.evaluation.run_plan import plan_run
+from experiments.pipeline.stage import Stage
+from experiments.pipeline.stages.drive import drive_robots
+from experiments.pipeline.stages.pipeline import build_pipeline
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from mapfusion.errors import InputError
@@ -50,3 +53,35 @@ def test_too_much_memory_is_refused(tiny_path: Path, tmp_path: Path) -> None:
     greedy = load_scenario(tiny_path, ["slam.filter.n_particles=10000"])
     with pytest.raises(InputError, match="machine has"):
         plan_run(greedy, tmp_path, 4000)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "robots.0.start=[0.2, 1.2, 0]",
+            r"robots\.0\.start: robot R1: start \(0\.20, 1\.20\), moved to .* by the start jitter",
+        ),
+        ("robots.1.route=[[7, 1]]", r"robots\.1\.route\.0: robot R2: waypoint 1 .* outside"),
+        (
+            "world.walls=[{points: [[0, 0], [6, 0], [6, 4], [0, 4], [0, 0]]}, "
+            "{points: [[3, 0], [3, 4]]}]",
+            r"robots\.0\.route\.0: robot R1: the way from start .* leads through a wall",
+        ),
+        ("robots.1.start=[1.2, 1.3, 0]", r"robots\.0\.start and robots\.1\.start: .* apart"),
+        ("drive.frame_interval_s=0.21", r"drive\.frame_interval_s is 0\.21: .* 1/60 s"),
+        ("world.walls=[{points: [[0, 0], [0.01, 0]]}]", r"world\.walls\.0\.points: .* shorter"),
+    ],
+)
+def test_a_plan_refuses_what_the_drive_refuses(
+    tiny_path: Path, tmp_path: Path, override: str, message: str
+) -> None:
+    blocked = load_scenario(tiny_path, [override])
+    with pytest.raises(InputError, match=f"^scenario tiny: {message}") as planned:
+        plan_run(blocked, tmp_path, 1)
+    (robot, *_) = build_pipeline(blocked).simulated
+    driven = robot.features.before["drive"]
+    assert isinstance(driven, Stage)
+    with pytest.raises(InputError) as refused:
+        drive_robots(driven.settings)
+    assert str(planned.value) == f"scenario tiny: {refused.value}"

@@ -116,7 +116,7 @@ def test_align_with_the_example(
     maps: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     ended = command(capsys, "align", *maps, "--set", entry("best_share"))
-    assert (ended.code, ended.err) == (0, "")
+    assert (ended.code, ended.complaints) == (0, [])
     rows = [line for line in ended.out.splitlines() if line.strip().startswith("theirs")]
     assert rows[0].split()[1] == "accepted"  # shown as soon as the method has answered
     row = rows[1]
@@ -212,7 +212,7 @@ def test_an_absent_package_is_shown_as_absent(tmp_path: Path, maps: tuple[Path, 
     listed = apart(hidden, "scenarios", "--aligners")
     assert "kiss_matcher: the package kiss-matcher is not installed; pip install" in listed.out
     ended = apart(hidden, "align", *maps, "--set", entry("kiss_matcher"))
-    assert (ended.code, ended.err) == (0, "")
+    assert (ended.code, ended.complaints) == (0, [])
     line = (
         "theirs: absent: the package kiss-matcher is not installed; "
         "pip install 'mapfusion-bench[peers]' installs it"
@@ -243,5 +243,5 @@ def test_a_clash_of_names_is_one_line(
     )
     with found_in(tmp_path / "site"):
         ended = command(capsys, "align", *maps, "--set", entry("ransac"))
-        assert (ended.code, ended.err) == (0, f"mapfusion: warning: {line}\n")
+        assert (ended.code, ended.complaints) == (0, [f"mapfusion: warning: {line}"])
         assert line in command(capsys, "scenarios", "--aligners").out

@@ -190,7 +190,7 @@ def test_command_writes_tables_and_figure(
     options = ["--trials", 2, "--pairs", 60, "--outliers", 0.5, "--results", tmp_path]
     reply = command(capsys, "study", "benchmark", "--aligner", "ransac", *options)
     assert reply.code == 0
-    assert "60 pairs" in reply.out
+    assert "60 correspondences" in reply.out
     folder = tmp_path / "benchmark"
     assert {path.name for path in folder.iterdir()} == {
         "benchmark.png",

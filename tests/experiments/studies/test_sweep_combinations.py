@@ -134,3 +134,18 @@ def test_two_scenarios_of_one_name_are_refused(tmp_path: Path) -> None:
     other.write_text(scenario(tmp_path, "one").read_text())
     with pytest.raises(InputError, match=r"other\.yaml: is named one, as .*one\.yaml"):
         runs_of([tmp_path / "one.yaml", other], [0], {})
+
+
+def test_chosen_aligners_are_those_of_all_runs_and_values_apply_to_them(tmp_path: Path) -> None:
+    path = scenario(tmp_path, "one")
+    axes = parse_axes(["align.aligners.1.parameters.translation=printed,solved"])
+    runs = runs_of([path], [0, 1], axes, ["gnc", "svd"])
+    for run in runs:
+        loaded = run.load().align.aligners
+        assert [entry.name for entry in loaded] == ["gnc", "svd"]
+        assert loaded[1].parameters == {"translation": run.settings[0][1]}
+    listed = parse_axes(["align.aligners=[{name: icp, method: icp}]"])
+    with pytest.raises(InputError, match=r"--aligner: --set align\.aligners gives aligners, too"):
+        runs_of([path], [0], listed, ["gnc"])
+    with pytest.raises(InputError, match="--aligner magic: unknown aligner"):
+        runs_of([path], [0], {}, ["magic"])

@@ -293,3 +293,20 @@ def test_wrong_arguments_are_named():
         Refinement(least_drift_m=-0.1)
     with pytest.raises(ValueError, match="max_rounds"):
         Refinement(max_rounds=0)
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.1])
+def test_covariance_of_exact_maps_is_that_of_least_squares(off_m):
+    """The motion of exact maps is found at once; s_drift must leave its start all the same."""
+    pair, (map_a, map_b, c) = offered(np.random.default_rng(7), 60, 1.0, 0.0, sigma_m=0.0)
+    stated = np.tile(0.02**2 * np.eye(3), (60, 1, 1))
+    map_a, map_b = (replace(each, covariance_m2=stated) for each in (map_a, map_b))
+    pairs = Pairs(map_a, map_b, c)
+    found = Refinement().refine(pairs, pair.T_a_b + np.array([off_m, 0.0, 0.0]))
+    S = residual_covariances(pair.T_a_b, pairs.covariance_a, pairs.covariance_b)
+    J = motion_jacobian(pair.T_a_b, pairs.p_b)
+    least_squares = np.linalg.inv(np.sum(np.swapaxes(J, 1, 2) @ np.linalg.inv(S) @ J, axis=0))
+    np.testing.assert_allclose(found.T_a_b, pair.T_a_b, atol=1e-8)
+    # a pair inside the gate is false with a small probability
+    np.testing.assert_allclose(found.covariance, least_squares, rtol=0.02)
+    assert found.drift_sigma_m < 1e-3

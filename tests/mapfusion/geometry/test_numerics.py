@@ -1,6 +1,9 @@
 """Tests of `mapfusion.geometry.numerics`."""
 
 import math
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -107,3 +110,27 @@ def test_a_singular_matrix_is_told():
     nearly = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-10]])
     assert not cholesky(nearly.copy(), 1e-9)
     assert cholesky(nearly.copy(), 1e-12)
+
+
+COMPILING = """
+import numpy as np
+from mapfusion.geometry.numerics import before_compilation, cholesky, invert
+
+before_compilation(lambda: print("compiles"))
+for _ in range(2):
+    invert(np.eye(3), np.zeros((3, 3)))
+cholesky(np.eye(3), 1e-9)
+"""
+
+
+def test_compilation_is_announced_once_and_not_for_kernels_on_the_disk(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    for announced in ("compiles\n", ""):
+        run = subprocess.run(
+            [sys.executable, "-c", COMPILING],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert run.stdout == announced

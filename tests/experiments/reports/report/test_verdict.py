@@ -11,6 +11,7 @@ from experiments.studies.method_comparison import Recommendation, Standing
 GOOD = Standing(
     aligner="good",
     n_maps=20,
+    n_alignments=20,
     rate=0.95,
     low=0.76,
     high=0.99,
@@ -47,7 +48,7 @@ def sentences(ranking: Recommendation, settings: tuple[str, ...] = ()) -> str:
 
 def test_the_best_is_recommended_with_its_numbers() -> None:
     text = sentences(ONE_RUN)
-    assert text.startswith("Use good good aligned 95 % of 20 pairs of maps")
+    assert text.startswith("Use good good was correct in 95 % of 20 pairs of maps")
     assert "95 % interval 76 % to 99 %" in text
     assert "median error of 0.10 m and 0.0050 rad" in text
     assert "the error is 1.05 times the oracle's: the rest is the drift of the maps" in text

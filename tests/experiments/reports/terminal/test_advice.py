@@ -22,8 +22,16 @@ def advice(ranking: Recommendation) -> str:
 
 def test_the_best_is_named_with_its_accuracy() -> None:
     assert advice(ONE_RUN) == (
-        "Method to use: good. It was right on 95 % of 20 pairs of maps with common ground, median "
+        "Method to use: good. It was right in 95 % of 20 pairs of maps with common ground, median "
         f"error 0.10 m and 0.0050 rad. {HINT}"
+    )
+
+
+def test_a_share_of_repetitions_is_no_share_of_pairs() -> None:
+    """82 % of twelve pairs of maps is impossible."""
+    often = replace(GOOD, n_maps=12, n_alignments=240, rate=0.82)
+    assert "right in 82 % of 240 alignments of 12 pairs of maps" in advice(
+        replace(ONE_RUN, best=often)
     )
 
 
@@ -48,7 +56,7 @@ def test_wrong_or_no_accepted_alignments_are_told() -> None:
 def test_no_method_is_recommended_if_none_is_reliable() -> None:
     poor = advice(replace(ONE_RUN, best=POOR))
     assert poor.startswith(
-        "Method to use: none is reliable. The best is poor. It was right on 20 %"
+        "Method to use: none is reliable. The best is poor. It was right in 20 %"
     )
     failed = advice(replace(ONE_RUN, best=None))
     assert failed.startswith("Method to use: none. No method was right on the 20 pairs of maps")

@@ -220,7 +220,7 @@ def test_a_team_of_which_one_is_left_out() -> None:
     assert list(told) == [
         "2 of 3 robots are merged: their paths err by 0.023 m (ATE, one rigid fit for all)",
         "C is left out of the fused map: chance would do",
-        "alignments believed: 2, right: 1; pairs with common ground: 2, found: 1",
+        "alignments believed: 2, right: 1; pairs of maps with common ground: 2, found: 1",
     ]
 
 
