@@ -286,7 +286,7 @@ class EvaluatedRun:
             stages = [
                 (each.filtered if file == name else each.smoothed).estimates for each in pairs
             ]
-        parts = [tables.read(self.store.path(s) / f"{file}.parquet", name) for s in stages]
+        parts = [tables.read(self.store.path(s) / f"{file}.parquet", file) for s in stages]
         return pd.concat(parts, ignore_index=True) if parts else tables.as_table(name, [])
 
     def execute(self, jobs: int, on_progress: OnProgress, only: Sequence[Stage] = ()) -> None:

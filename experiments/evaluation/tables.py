@@ -183,15 +183,15 @@ _COLUMNS = {
 
 ALL = {"estimates": ESTIMATES, "correspondences": CORRESPONDENCES, "rivals": RIVALS}
 ALL |= {"tracks": TRACKS}
-# Alignments of smoothed maps, at the iterations at which maps are fused.
-ALL |= {"smoothed_estimates": ESTIMATES}
 _TYPES = {column: kind for kind, names in _NAMES.items() for column in names.split()}
 for _name, _columns in _COLUMNS.items():
     _own = dict.fromkeys(_columns.split(), tables.FLOAT)
     _own |= {column: _TYPES[column] for column in _own if column in _TYPES}
     _fields = tables.fields(**(_own | _OTHER_TYPES.get(_name, {})))
     ALL[_name] = schema(f"result.{_name}", _VERSIONS.get(_name, 1), _fields)
-ALL["smoothed_errors"] = ALL["errors"]
+# Alignments of smoothed maps, at the iterations at which maps are fused.
+for _name in ("estimates", "errors"):
+    ALL[f"smoothed_{_name}"] = schema(f"result.smoothed_{_name}", 1, list(ALL[_name]))
 
 
 class Shown(NamedTuple):

@@ -152,7 +152,8 @@ class RecordedTeam:
         """Stages that must be finished, in any number of processes, before measurements."""
         pipeline = self.run.pipeline
         smoothed = [robot.smooth for robot in pipeline.robots]
-        return [*smoothed, *(pair.smoothed.estimates for pair in pipeline.pairs)]
+        both = ((pair.filtered, pair.smoothed) for pair in pipeline.pairs)
+        return [*smoothed, *(each.estimates for pair in both for each in pair)]
 
     @property
     def measured(self) -> list[Stage]:

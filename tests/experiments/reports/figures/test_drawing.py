@@ -155,9 +155,10 @@ def test_nothing_is_drawn_of_what_failed(trio_copy: Path) -> None:
         (trio_copy / "figures").mkdir(exist_ok=True)
         (trio_copy / "figures" / f"{name}.png").write_bytes(b"old")
     data = ResultTables(trio_copy)
-    errors = data.table("errors").assign(status="degenerate", refined_status="degenerate")
-    numbers = [name for name in errors if str(name).endswith(("error_m", "error_rad"))]
-    change(trio_copy, "errors", errors.assign(**dict.fromkeys(numbers, np.nan)))
+    for name in ("errors", "smoothed_errors"):
+        errors = data.table(name).assign(status="degenerate", refined_status="degenerate")
+        numbers = [column for column in errors if str(column).endswith(("error_m", "error_rad"))]
+        change(trio_copy, name, errors.assign(**dict.fromkeys(numbers, np.nan)))
     for name in ("correspondences", "fused", "fused_map", "aligner_timings"):
         change(trio_copy, name, data.table(name).iloc[:0])
     assert list(skipped_figures(trio_copy)) == [

@@ -22,8 +22,8 @@ from experiments.reports.figures.style import aligner_styles
 from experiments.studies.statistics import error_bands
 
 COLUMNS = {
-    draw_translation_error: ("translation_error_m", "refined_translation_error_m"),
-    draw_rotation_error: ("rotation_error_rad", "refined_rotation_error_rad"),
+    draw_translation_error: "translation_error_m",
+    draw_rotation_error: "rotation_error_rad",
 }
 
 
@@ -42,13 +42,15 @@ def slow_medians(rows: list[dict], aligner: str, column: str) -> dict[int, float
 
 @pytest.mark.parametrize("draw", COLUMNS)
 def test_drawn_lines_are_the_medians_of_the_repetitions(draw, trio_result: Path) -> None:
-    data = ResultTables(trio_result)
-    errors = data.table("errors")
+    data, error = ResultTables(trio_result), COLUMNS[draw]
+    drawn_columns = (("errors", error), ("errors", f"refined_{error}"))
+    drawn_columns += (("smoothed_errors", f"refined_{error}"),)
     panels = iter(draw(data).axes)
     for robot_a, robot_b in (("R1", "R2"), ("R1", "R3"), ("R2", "R3")):
-        pair = errors[(errors["robot_a"] == robot_a) & (errors["robot_b"] == robot_b)]
-        rows = pair.to_dict("records")
-        for column in COLUMNS[draw]:
+        for table, column in drawn_columns:
+            errors = data.table(table)
+            pair = errors[(errors["robot_a"] == robot_a) & (errors["robot_b"] == robot_b)]
+            rows = pair.to_dict("records")
             axes = next(panels)
             assert axes.get_title().startswith(f"{robot_a} - {robot_b}")
             drawn = {line.get_label(): line for line in axes.get_lines()}
@@ -79,7 +81,7 @@ def test_of_many_pairs_those_with_most_to_go_by_are_drawn_and_it_is_said(
     figure = draw_translation_error(data)
     assert "10 of 190 robot pairs" in figure.get_supxlabel()
     titles = [axes.get_title() for axes in figure.axes]
-    assert len(titles) == 20
+    assert len(titles) == 30
     assert titles[0].startswith("R1 - R0")
     assert titles[-3].startswith("R4 - R2")
     assert titles[-1].startswith("R19 - R17")
