@@ -1,10 +1,11 @@
 """Errors and consistency of a whole map.
 
 A landmark is gross if its distance to its true point exceeds `GROSS_M` after the rigid fit of the
-other landmarks. Gross landmarks are counted, and left out of all other figures. The fit is a motion
-of the plane. An error that such a motion explains is no error of the relative map. Therefore errors
-and covariances are projected by I - J (J'J)^-1 J', where the columns of J (3 n, 3) are the rigid
-motions: the gauge is removed. With a basis N of the remaining space,
+other landmarks. Gross landmarks are counted, and left out of all other figures. Errors are infinite
+and consistency is unknown if too many are left out. The fit is a motion of the plane. An error that
+such a motion explains is no error of the relative map. Therefore errors and covariances are
+projected by I - J (J'J)^-1 J', where the columns of J (3 n, 3) are the rigid motions: the gauge is
+removed. With a basis N of the remaining space,
 
     N (N' S N)^-1 N' = S^-1 - S^-1 J (J' S^-1 J)^-1 J' S^-1,
 
@@ -29,6 +30,8 @@ from mapfusion.landmark_map import LandmarkMap
 # Several times the error of a map of a room after a fit, and about half the distance between
 # neighbouring landmarks.
 GROSS_M = 0.15
+# Largest share of landmarks that a figure may leave out: the others no longer describe the map.
+MOST_GROSS = 0.1
 COVERED = 0.95  # nominal probability of the ellipses of `coverage_95`
 _LEAST = 3  # landmarks: a rigid fit of two is always exact
 _MOST_FITS = 50  # the set of gross landmarks is stable after a few fits
@@ -58,14 +61,37 @@ class FittedMap:
         return float(np.mean(self.gross)) if len(self.rows) else np.nan
 
     @property
+    def too_many_gross(self) -> bool:
+        """True if the landmarks that are not gross do not describe the map."""
+        return self.gross_share > MOST_GROSS
+
+    @property
     def rmse_m(self) -> float:
-        """RMSE of the landmarks that are not gross; NaN without landmarks."""
-        return rmse(self.error_m[~self.gross])
+        """RMSE after the fit of the landmarks that are not gross.
+
+        NaN without landmarks, infinite if too many are gross.
+        """
+        return np.inf if self.too_many_gross else rmse(self.error_m[~self.gross])
+
+    @property
+    def frame_rmse_m(self) -> float:
+        """The same without a fit."""
+        return np.inf if self.too_many_gross else rmse(self.frame_error_m[~self.gross])
+
+    @property
+    def median_m(self) -> float:
+        """Median error in place of the RMSE after the fit."""
+        lengths = np.linalg.norm(self.error_m[~self.gross], axis=1)
+        if self.too_many_gross:
+            return np.inf
+        return float(np.median(lengths)) if len(lengths) else np.nan
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """Agreement of a map's errors with its covariance; NaN for fewer than 3 landmarks.
+    """Agreement of a map's errors with its covariance.
+
+    NaN for fewer than 3 landmarks, and if too many landmarks are gross.
 
     Attributes:
         nees_per_dof: NEES of all landmarks together over its degrees of freedom; near 1 if the
@@ -137,7 +163,7 @@ def consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, 
     """
     not_gross = ~fit.gross
     rows = fit.rows[not_gross]
-    if len(rows) < _LEAST:
+    if len(rows) < _LEAST or fit.too_many_gross:
         return UNKNOWN, UNKNOWN
     d = degrees_of_freedom(landmarks)
     # without a joint covariance, errors of landmarks are taken to be independent

@@ -26,7 +26,6 @@ from experiments.evaluation.map_consistency import (
     consistencies,
     fit_to_truth,
     relative_consistency,
-    rmse,
 )
 from experiments.evaluation.truth import (
     EvaluatedRobot,
@@ -253,16 +252,15 @@ class EvaluatedFusion:
     def row(self) -> dict[str, Any]:
         """Return the row of the table `fusers`."""
         landmarks, fit = self.fusion.landmarks, self.fit
-        lengths = np.linalg.norm(fit.error_m[~fit.gross], axis=1)
         relative, in_frame = self.consistency
         return {
             "fuser": self.fuser,
             "iteration": self.iteration,
             "n_robots": len(self.fusion.members),
             "n_landmarks": len(landmarks),
-            "landmark_rmse_m": rmse(fit.frame_error_m[~fit.gross]),
+            "landmark_rmse_m": fit.frame_rmse_m,
             "fitted_rmse_m": fit.rmse_m,
-            "fitted_median_m": np.median(lengths) if len(lengths) else np.nan,
+            "fitted_median_m": fit.median_m,
             "gross_share": fit.gross_share,
             "over_better_parent": self._over_better_map(of_filter=False),
             "over_better_filter": self._over_better_map(of_filter=True),
@@ -301,9 +299,13 @@ class EvaluatedFusion:
             if of_filter:
                 landmarks, points = given.of_filter, given.of_filter_world_m
             own_fit, errors[k] = fit_to_truth(landmarks, points), np.full(len(landmarks), np.nan)
+            if own_fit.too_many_gross:
+                continue
             length_m = np.linalg.norm(own_fit.error_m, axis=1)
             errors[k][own_fit.rows] = np.where(own_fit.gross, np.nan, length_m)
         fused, fit = np.full(len(parents), np.nan), self.fit
+        if fit.too_many_gross:
+            return np.nan
         fused[fit.rows[~fit.gross]] = np.linalg.norm(fit.error_m[~fit.gross], axis=1)
         ratios = []
         for a, b in itertools.combinations(self.fusion.members, 2):

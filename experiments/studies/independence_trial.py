@@ -17,7 +17,6 @@ import pandas as pd
 
 from experiments.evaluation.alignment_errors import first_shared_iteration
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.map_consistency import rmse
 from experiments.evaluation.map_errors import EvaluatedFusion, GivenMap, SmoothedRobot
 from experiments.evaluation.path_errors import STATISTICS, PlacedPath, team_ate_m
 from experiments.evaluation.tables import UNKNOWN
@@ -358,7 +357,7 @@ def error_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
                 fit = judgement.fit
                 row |= {
                     "n_landmarks": len(fused.landmarks),
-                    "landmark_rmse_m": rmse(fit.frame_error_m[~fit.gross]),
+                    "landmark_rmse_m": fit.frame_rmse_m,
                     "fitted_rmse_m": fit.rmse_m,
                     "gross_share": fit.gross_share,
                     "path_rmse_m": STATISTICS["rmse"](team_ate_m(paths)),

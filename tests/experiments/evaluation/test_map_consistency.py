@@ -162,3 +162,19 @@ def test_of_fewer_landmarks_than_a_fit_needs_nothing_is_known(n: int) -> None:
     assert len(fit.rows) == n
     assert np.isnan(relative_consistency(landmarks, fit).nees_per_dof)
     assert np.isnan(fit.rmse_m) == (n == 0)
+
+
+@pytest.mark.parametrize(("n_wrong", "known"), [(4, True), (5, False)])
+def test_nothing_is_said_of_a_map_with_too_many_gross_landmarks(n_wrong: int, known: bool) -> None:
+    """A tenth of 40 landmarks may be left out."""
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(-4, 4, (40, 3))
+    position = truth + rng.normal(0, 0.01, truth.shape)
+    position[:n_wrong, 0] += 2.0
+    about = np.tile(1e-4 * np.eye(3), (40, 1, 1)), np.ones(40, np.int32), np.arange(40)
+    landmarks = LandmarkMap(position, *about)
+    fit = fit_to_truth(landmarks, truth)
+    assert fit.gross.sum() == n_wrong
+    for figure in (fit.rmse_m, fit.frame_rmse_m, fit.median_m):
+        assert (figure < 0.03) if known else figure == np.inf
+    assert np.isfinite(relative_consistency(landmarks, fit).coverage_95) == known
