@@ -36,7 +36,7 @@ from mapfusion.align.rigid_motion import (
     residual_covariances,
     residuals,
 )
-from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.geometry.numerics import Float, chi_square_bound, kernel
 from mapfusion.geometry.se2 import rotation
 
 _TOLERANCE = 1e-9  # relative step of s_drift^2 that ends the search
@@ -218,6 +218,25 @@ def _residual_factor(T_a_b: Float, pairs: Pairs, gain: Float, stated: Float) -> 
     n_numbers = 2 * len(e)
     observed = moved.T @ moved * n_numbers / max(n_numbers - fitted, 1.0)
     return max(1.0, float(np.trace(np.linalg.solve(stated, observed))) / 3)
+
+
+def residual_scale(T_a_b: Float, pairs: Pairs) -> float:
+    """Return the size of the residuals of pairs in sigmas of their stated covariances.
+
+    This is the root of the median squared Mahalanobis length over the median of chi-square; 1 is
+    expected of covariances that hold.
+    """
+    n_dimensions = 2 if pairs.map_a.planar or pairs.map_b.planar else 3
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(T_a_b[2])
+    a, b = pairs.map_a, pairs.map_b
+    e = a.position_m[pairs.index_a] - b.position_m[pairs.index_b] @ turn.T
+    e[:, :2] -= T_a_b[:2]
+    S = a.covariance_m2[pairs.index_a] + turn @ b.covariance_m2[pairs.index_b] @ turn.T
+    S += DRIFT_FLOOR_M**2 * np.eye(3)  # maps may state zero
+    e, S = e[:, :n_dimensions], S[:, :n_dimensions, :n_dimensions]
+    squares = np.vecdot(e, np.linalg.solve(S, e[..., None])[..., 0])
+    return math.sqrt(float(np.median(squares)) / chi_square_bound(0.5, n_dimensions))
 
 
 def with_common_motion(alignment: Alignment, p_a: Float) -> Float:

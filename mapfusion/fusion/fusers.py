@@ -6,6 +6,7 @@ that implements `Fuser` and has a constructor without arguments.
 
 import importlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from itertools import zip_longest
@@ -144,6 +145,9 @@ class MergeParameters:
         )
 
 
+_MEDIAN_OVER_SIGMA = 0.6745  # median absolute value of a standard normal variable
+
+
 @dataclass(frozen=True)
 class Component:
     """Connected component: K of M maps with their poses in a common frame.
@@ -183,11 +187,33 @@ class Component:
         Half of an alignment's s_drift^2 is attributed to each of its maps. A map has the mean over
         its alignments.
         """
-        drift = np.full(len(self.maps), np.nan)
+        return self._by_map([pair.alignment.drift_sigma_m for pair in self.pairs])
+
+    @property
+    def height_sigma_m(self) -> Float:
+        """Standard deviation of heights beyond the stated variances, as `drift_sigma_m`.
+
+        It is estimated by the median absolute height difference of the inliers.
+        """
+        sigma_m = []
+        for pair in self.pairs:
+            a, b = (self.maps[k] for k in (pair.a, pair.b))
+            rows_a, rows_b = pair.inliers.index_a, pair.inliers.index_b
+            off_m = np.abs(a.position_m[rows_a, 2] - b.position_m[rows_b, 2])
+            stated_m2 = a.covariance_m2[rows_a, 2, 2] + b.covariance_m2[rows_b, 2, 2]
+            seen_m2 = (np.median(off_m) / _MEDIAN_OVER_SIGMA) ** 2 if len(off_m) else 0.0
+            beyond_m2 = seen_m2 - np.median(stated_m2) if len(off_m) else 0.0
+            sigma_m.append(float(np.sqrt(max(beyond_m2, 0.0))))
+        return self._by_map(sigma_m)
+
+    def _by_map(self, sigma_m: Sequence[float]) -> Float:
+        """Return the standard deviation of each map, shape (M,), from those of the pairs."""
+        of_maps = np.full(len(self.maps), np.nan)
         for k in self.members:
-            own = [p.alignment.drift_sigma_m for p in self.pairs if k in (p.a, p.b)]
-            drift[k] = np.sqrt(np.mean(np.square(own)) / 2) if own else 0.0
-        return drift
+            pairs = zip(self.pairs, sigma_m, strict=True)
+            own = [sigma for pair, sigma in pairs if k in (pair.a, pair.b)]
+            of_maps[k] = np.sqrt(np.mean(np.square(own)) / 2) if own else 0.0
+        return of_maps
 
 
 class Fuser(Protocol):

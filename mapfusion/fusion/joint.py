@@ -168,10 +168,10 @@ class JointFuser:
     def _fuse_jointly(component: Component, parameters: MergeParameters) -> FusedMap | None:
         """Return the fused map; None if common landmarks do not connect all maps."""
         n_dimensions = 2 if component.planar else 3
-        drift = component.drift_sigma_m
+        drift, height = component.drift_sigma_m, component.height_sigma_m
         given = [component.maps[k] for k in component.members]
         maps = [
-            JointMap.of(landmarks, float(drift[k]), n_dimensions)
+            JointMap.of(landmarks, float(drift[k]), float(height[k]), n_dimensions)
             for landmarks, k in zip(given, component.members, strict=True)
         ]
         # inliers of the alignments; `a` is the lesser of the two members

@@ -55,19 +55,23 @@ class JointMap:
         return self.joint.rank + (0 if self.calibration.is_none else N_OF_CAMERA)
 
     @classmethod
-    def of(cls, landmarks: LandmarkMap, own_sigma_m: float, n_dimensions: int) -> "JointMap":
+    def of(
+        cls, landmarks: LandmarkMap, own_sigma_m: float, height_sigma_m: float, n_dimensions: int
+    ) -> "JointMap":
         """Convert a map.
 
         Args:
             landmarks: the map.
             own_sigma_m: s_drift, standard deviation of an independent error of x and y that is
                 added if the map has no joint covariance.
+            height_sigma_m: the same of z.
             n_dimensions: 2 or 3.
         """
         joint = landmarks.joint
         if joint is None:
             own = landmarks.covariance_m2.copy()
             own[:, [0, 1], [0, 1]] += own_sigma_m**2
+            own[:, 2, 2] += height_sigma_m**2
             joint = JointCovariance(own, np.zeros((len(landmarks), 0, 3)))
         return cls(landmarks.position_m[:, :n_dimensions], joint, landmarks.calibration)
 

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from mapfusion.align.alignment import Alignment, Pairs, Status
-from mapfusion.align.covariance import with_common_motion
+from mapfusion.align.covariance import residual_scale, with_common_motion
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (
     least_squares_gain,
@@ -68,6 +68,9 @@ def landmark_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
 N_RIVALS, N_SELF_MOTIONS = 4, 3  # motions searched between two maps, and of each map onto itself
 # Significance of the test that an alignment has more supporters of its own than a rival.
 _EQUAL = 0.01
+# Size of the residuals in stated sigmas from which on a verdict says it. Chance does not reach it
+# with the fewest pairs that pass the test against chance.
+_OVERCONFIDENT = 3.0
 _PATCH_REACH_M = 0.7  # largest distance between neighbouring corners of one texture
 _LEAST_OF_PATCH = 5  # landmarks
 # Beta priors of the shares of regions that a wrong motion confirms, as (confirmed, all) regions:
@@ -327,6 +330,8 @@ class PairVerifier:
                 reason = f"no evidence to the contrary could be sought: {why}"
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
             status, reason = Status.TOO_UNCERTAIN, unsure
+        if status is Status.ACCEPTED and (note := self._overconfidence_note(alignment)):
+            reason = "; ".join(filter(None, (reason, note)))
         return Verdict(status, by_chance.log10_false_alarms, reason, **told)
 
     def rivals_of(self, alignment: Alignment) -> list[Alignment]:
@@ -480,6 +485,19 @@ class PairVerifier:
         smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
         most = np.count_nonzero(alignment.inlier) > smaller / 2
         return bool(most) and extent_m < self._settings.evidence.place_m
+
+    def _overconfidence_note(self, alignment: Alignment) -> str:
+        """Say that the residuals contradict the covariances of the maps; empty if they do not.
+
+        Maps with joint covariances are left out: errors that their landmarks share are stated.
+        """
+        maps = self._pairs.map_a, self._pairs.map_b
+        if not alignment.inlier.any() or all(each.joint is not None for each in maps):
+            return ""
+        scale = residual_scale(alignment.T_a_b, self._pairs[alignment.inlier])
+        if scale < _OVERCONFIDENT:
+            return ""
+        return f"the residuals are {scale:.2g} times as large as the maps' covariances state"
 
     def _why_unsure(self, alignment: Alignment) -> str:
         """Return why the covariance of an alignment is too large; empty if it is not."""

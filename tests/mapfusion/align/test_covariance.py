@@ -14,6 +14,7 @@ from mapfusion.align.covariance import (
     alignment_covariance,
     calibration_covariance,
     estimate_drift_m,
+    residual_scale,
     with_common_motion,
 )
 from mapfusion.align.mahalanobis_gate import DRIFT_FLOOR_M
@@ -321,3 +322,26 @@ def test_nothing_to_explain():
     assert estimate_drift_m(rng.normal(0, 0.05, (500, 2)), S) == DRIFT_FLOOR_M
     assert estimate_drift_m(np.zeros((5, 2)), np.zeros((5, 2, 2))) == DRIFT_FLOOR_M
     assert estimate_drift_m(np.zeros((0, 2)), np.zeros((0, 2, 2))) == DRIFT_FLOOR_M
+
+
+@pytest.mark.parametrize("planar", [False, True])
+@pytest.mark.parametrize("factor", [1.0, 20.0])
+def test_residuals_tell_how_much_too_small_covariances_are(factor: float, planar: bool) -> None:
+    """Positions with errors of `factor` times the stated covariance, which differs by direction."""
+    rng, T_a_b, n = np.random.default_rng(1), np.array([3.0, -2.0, 2.1]), 4000
+    shape = np.array([[1.0, 0.6, 0.0], [0.6, 1.0, 0.3], [0.0, 0.3, 0.5]]) * 1e-6
+    point = rng.uniform(-5, 5, (n, 3))
+    in_b = point.copy()
+    in_b[:, :2] = se2.transform_points(se2.inverse(T_a_b), point[:, :2])
+    maps = [
+        LandmarkMap(
+            own + factor * rng.multivariate_normal(np.zeros(3), shape, n),
+            np.tile(shape, (n, 1, 1)),
+            np.ones(n, np.int32),
+            np.arange(n),
+            planar=planar,
+        )
+        for own in (point, in_b)
+    ]
+    pairs = Pairs(*maps, Correspondences(np.arange(n), np.arange(n), np.zeros(n)))
+    assert residual_scale(T_a_b, pairs) == pytest.approx(factor, rel=0.05)

@@ -7,8 +7,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from mapfusion.align.clique import Clique
+from mapfusion.align.correspondences import match
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.fusers import FusedMap, MergeParameters
+from mapfusion.fusion.fusers import AlignedPair, FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.fusion.joint_estimate import JointMap, estimate_jointly
 from mapfusion.fusion.kalman import KalmanDrift
@@ -17,6 +19,7 @@ from mapfusion.geometry import se2
 from mapfusion.geometry.camera import CalibrationError
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.robust_loss import information_share
+from mapfusion.verification.registration import Registration
 from tests.mapfusion.fusion.drawn_maps import BENT_M, DrawnTeam
 
 OPPOSITE = [slice(0, 40), slice(25, 65), slice(50, 90)]  # the first and the last share nothing
@@ -47,7 +50,7 @@ def test_equals_a_general_solver_that_knows_the_weights(planar: bool) -> None:
         DrawnTeam([slice(0, 12), slice(4, 16), slice(8, 20)], 0, planar),
         2 + (not planar),
     )
-    maps = [JointMap.of(own, 0.0, n_dimensions) for own in team.maps]
+    maps = [JointMap.of(own, 0.0, 0.0, n_dimensions) for own in team.maps]
     start = np.array([se2.between(team.T_world_map[0], T) for T in team.T_world_map])
     parents = np.full((20, 3), ABSENT)
     for k, part in enumerate(team.parts):
@@ -155,7 +158,7 @@ def test_noise_does_not_shrink_maps_whose_scale_is_open(camera: str) -> None:
     """Residuals of smaller maps are smaller: the mean of all scales, which nothing tells, stays."""
     team = DrawnTeam([slice(0, 300), slice(0, 300)], 0)
     known = CalibrationError(scale=0.01, camera=camera)
-    maps = [JointMap.of(replace(own, calibration=known), 0.0, 3) for own in team.maps]
+    maps = [JointMap.of(replace(own, calibration=known), 0.0, 0.0, 3) for own in team.maps]
     start = np.array([np.zeros(3), se2.between(*team.T_world_map)])
     found = estimate_jointly(maps, start, np.tile(np.arange(300)[:, None], 2))
     scales = np.array([z[-1] for z in found.shared])
@@ -316,7 +319,7 @@ def test_tails_are_found_and_no_tail_is_cut_off(
             more = np.einsum("nij,nj->ni", root, rng.normal(size=(300, 3))) * np.maximum(scale, 0)
             team.maps[k] = replace(own, position_m=own.position_m + 1.5 * more)
     start = np.array([np.zeros(3), team.pairs[0].alignment.T_a_b])
-    maps = [JointMap.of(own, 0.0, 3) for own in team.maps]
+    maps = [JointMap.of(own, 0.0, 0.0, 3) for own in team.maps]
     rows = np.arange(300)
     found = estimate_jointly(maps, start, np.column_stack([rows, rows]))
     assert least < found.dof < most
@@ -349,7 +352,7 @@ def test_weights_of_a_student_t_are_1_in_the_mean() -> None:
             off = scale * np.einsum("nij,nj->ni", root, rng.normal(size=(300, 3)))
             off += np.einsum("nri,r->ni", own.joint.common_m, rng.normal(size=own.joint.rank))
             team.maps[k] = replace(own, position_m=team.truth(k) + off)
-        maps = [JointMap.of(own, 0.0, 3) for own in team.maps]
+        maps = [JointMap.of(own, 0.0, 0.0, 3) for own in team.maps]
         start = np.array([np.zeros(3), *(pair.alignment.T_a_b for pair in team.pairs[:2])])
         found = estimate_jointly(maps, start, np.column_stack([rows] * 3))
         means.append(found.weight.mean() / information_share(found.dof, 3))
@@ -358,7 +361,30 @@ def test_weights_of_a_student_t_are_1_in_the_mean() -> None:
 
 def test_drift_counts_as_a_landmark_s_own_where_nothing_is_shared() -> None:
     (own,) = DrawnTeam([slice(0, 10)], 0).maps
-    made = JointMap.of(replace(own, joint=None), 0.3, 3)
+    made = JointMap.of(replace(own, joint=None), 0.3, 0.2, 3)
     assert made.n_shared == 0
-    np.testing.assert_allclose(made.joint.own_m2, own.covariance_m2 + np.diag([0.09, 0.09, 0]))
-    assert JointMap.of(own, 0.3, 3).joint is own.joint  # which has it all
+    np.testing.assert_allclose(made.joint.own_m2, own.covariance_m2 + np.diag([0.09, 0.09, 0.04]))
+    assert JointMap.of(own, 0.3, 0.2, 3).joint is own.joint  # which has it all
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_covariances_that_are_too_small_leave_no_duplicates(seed: int) -> None:
+    """Errors of 20 mm in all directions, of which the maps state a twentieth."""
+    rng, n, T_a_b = np.random.default_rng(seed), 60, np.array([2.0, -1.0, 0.4])
+    point = rng.uniform([-4, -4, 0.2], [4, 4, 1.5], (n, 3))
+    looks = rng.normal(size=(n, 64))
+    looks = (looks / np.linalg.norm(looks, axis=1)[:, None]).astype(np.float32)
+    about = np.tile(1e-6 * np.eye(3), (n, 1, 1)), np.ones(n, np.int32), np.arange(n), looks
+    in_b = point.copy()
+    in_b[:, :2] = se2.transform_points(se2.inverse(T_a_b), point[:, :2])
+    maps = [
+        LandmarkMap(own + rng.normal(0, 0.02, (n, 3)), *about, name=name)
+        for name, own in (("a", point), ("b", in_b))
+    ]
+    done = Registration(Clique()).register(*maps, match(*maps), rng)
+    assert "times as large as the maps' covariances state" in done.verdict.reason
+    pair = AlignedPair(0, 1, done.applied, match(*maps))
+    fused = merge(maps, [pair]).fused[0]
+    assert len(fused.landmarks) <= n + 2
+    assert np.hypot(*(fused.T_first_map[1] - T_a_b)[:2]) < 0.012
+    assert abs(fused.T_first_map[1, 2] - T_a_b[2]) < 0.004
