@@ -41,7 +41,7 @@ _OTHER_TYPES = {
     "fused_history": dict.fromkeys(_PLAN, pa.float32()),
     "true_pairs": {"true_pair": pa.binary()},
 }
-_VERSIONS = {"errors": 5}  # of the others: 1
+_VERSIONS = {"errors": 6}  # of the others: 1
 UNKNOWN = -1  # a count that needs the truth, without truth
 _POINT = " ".join(POSITION_FIELDS + COVARIANCE_FIELDS)
 _COLUMNS = {
@@ -57,7 +57,7 @@ _COLUMNS = {
         translation_error_m rotation_error_rad
         refined_status refined_reason refined_translation_error_m refined_rotation_error_rad
         verdict accepted log10_false_alarms log10_evidence n_confirmed n_contradicted
-        probability acceptance_reason oracle_distance_m oracle_distance_rad
+        acceptance_reason oracle_distance_m oracle_distance_rad
         n_correspondences n_true n_common n_inliers precision recall alignment_nees lower_bound""",
     # One row per (robot, iteration): online path of the best particle and odometry, both from the
     # true start without a fit. spread_m: root of the trace of the particles' weighted position

@@ -65,7 +65,7 @@ _ANSWER = {"status": TEXT, "reason": TEXT} | dict.fromkeys(MOTION, FLOAT)
 # Estimates of the aligners, written by the align stage.
 ESTIMATES = schema(
     "result.estimates",
-    4,
+    5,
     fields(
         **_MAPS,
         aligner=TEXT,
@@ -80,7 +80,6 @@ ESTIMATES = schema(
         log10_evidence=FLOAT,
         n_confirmed=INT,
         n_contradicted=INT,
-        probability=FLOAT,
         acceptance_reason=TEXT,
         drift_sigma_m=FLOAT,
         # upper triangle of the refined alignment's covariance

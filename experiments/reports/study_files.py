@@ -33,7 +33,6 @@ from experiments.studies.paper_claims import CROSSING, READINGS, VALUES, crossin
 from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,
-    Reliability,
     first_right_answers,
     of_any_method,
     ordinary,
@@ -303,7 +302,6 @@ def draw_refusals(
     refusals: pd.DataFrame,
     calibration: pd.DataFrame,
     false_alarms: float,
-    held: Reliability | None,
 ) -> list[Path]:
     """Draw the figures that have data, and return their files."""
     place, files = folder / "figures", []
@@ -312,9 +310,6 @@ def draw_refusals(
         files += save_figure(place, "refusal", study_figures.draw_refusal, *data)
     files += save_figure(place, "refusal_kinds", study_figures.draw_refusal_kinds, refusals)
     files += save_figure(place, "refusal_roc", study_figures.draw_refusal_roc, refusals)
-    if held is not None:
-        draw = study_figures.draw_refusal_reliability
-        files += save_figure(place, "refusal_reliability", draw, held)
     return files
 
 

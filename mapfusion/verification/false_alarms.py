@@ -347,7 +347,6 @@ class Verdict:
             without evidence.
         n_confirmed: number of these regions that are in both maps.
         n_contradicted: number of these regions that are missing from one map.
-        probability: probability that the alignment is right; NaN without evidence.
     """
 
     status: Status
@@ -356,7 +355,6 @@ class Verdict:
     log10_evidence: float = math.nan
     n_confirmed: int = 0
     n_contradicted: int = 0
-    probability: float = math.nan
 
     @property
     def accepted(self) -> bool:

@@ -19,13 +19,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.likelihood import (
-    COPIED,
-    OWN,
-    EvidenceFeatures,
-    TwinShares,
-    probability_correct,
-)
+from mapfusion.verification.likelihood import COPIED, OWN, TwinShares
 from mapfusion.verification.regions import (
     EvidenceParameters,
     RegionGrid,
@@ -303,9 +297,7 @@ class PairVerifier:
             regions = self.regions(alignment, evidence)
             log10_evidence = regions.log10_evidence(evidence.shares)
             told = {"log10_evidence": log10_evidence, "n_confirmed": regions.n_confirmed}
-            features = self._features(alignment, regions, evidence, by_chance.log10_false_alarms)
-            p = probability_correct(features)
-            told |= {"n_contradicted": regions.n_contradicted, "probability": p}
+            told |= {"n_contradicted": regions.n_contradicted}
             # a contradiction counts even together with the region that led to the alignment
             settings = self._settings.evidence
             counts = f"{regions.n_confirmed} of {len(regions)} regions that both must have seen"
@@ -316,9 +308,6 @@ class PairVerifier:
                 reason = f"contradicted: {counts}, {missing} are missing from one"
             elif doubt := self._doubt(alignment, regions, evidence):
                 status, reason = Status.AMBIGUOUS, doubt.format(told=counts)
-            elif p < settings.least_probability:
-                status = Status.AMBIGUOUS
-                reason = f"right with probability {p:.2g} alone, by all that speaks for and against"
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
             if rival := self._equal_rival(alignment):
@@ -391,14 +380,6 @@ class PairVerifier:
                 )
         return ""
 
-    def features(self, alignment: Alignment) -> EvidenceFeatures | None:
-        """Return the features of an alignment; None if the maps carry no evidence."""
-        if self.evidence is None:
-            return None
-        by_chance = self._chance.verify(alignment).log10_false_alarms
-        regions = self.regions(alignment, self.evidence)
-        return self._features(alignment, regions, self.evidence, by_chance)
-
     def regions(self, alignment: Alignment, evidence: PairEvidence) -> Regions:
         """Return the regions that both robots must have seen under an alignment."""
         T_a_b, p_b = alignment.T_a_b, self._pairs.map_b.position_m[:, :2]
@@ -410,20 +391,6 @@ class PairVerifier:
         )
         none = RepeatedLandmarks.none(len(self._pairs.map_a), len(self._pairs.map_b))
         return self._viewed_maps.regions(BETWEEN, T_a_b, squares, none.joined(others))
-
-    def _features(
-        self,
-        alignment: Alignment,
-        regions: Regions,
-        evidence: PairEvidence,
-        log10_false_alarms: float,
-    ) -> EvidenceFeatures:
-        told = log10_false_alarms, regions.log10_evidence(evidence.shares)
-        counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
-        extent_m = self._extent_m(alignment)
-        one_place = self._is_one_place(alignment, extent_m)
-        repeats = evidence.repeats(self._bound)
-        return EvidenceFeatures(*told, *counts, extent_m, repeats, one_place)
 
     def _doubt(self, alignment: Alignment, regions: Regions, evidence: PairEvidence) -> str:
         """Return why another motion may be the right one; empty if none may.

@@ -143,7 +143,6 @@ def estimate_row(
         "log10_evidence": verdict.log10_evidence,
         "n_confirmed": verdict.n_confirmed,
         "n_contradicted": verdict.n_contradicted,
-        "probability": verdict.probability,
         "acceptance_reason": verdict.reason,
         "drift_sigma_m": refined.drift_sigma_m,
         **dict(zip(COVARIANCE, refined.covariance[_UPPER], strict=True)),

@@ -17,7 +17,7 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_RAD,
 )
 from experiments.evaluation.single_steps import filter_settings
-from experiments.reports.formatting import interval, two_digits
+from experiments.reports.formatting import two_digits
 from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
@@ -29,7 +29,7 @@ from experiments.reports.terminal.layout import (
     print_table,
 )
 from experiments.studies.independence_trial import STRATEGIES
-from experiments.studies.refusal_rates import VERDICTS, Rate, Reliability, pooled, worst
+from experiments.studies.refusal_rates import VERDICTS, Rate, pooled, worst
 from experiments.studies.sweep import Survey, SweepProgress
 from experiments.studies.sweep_tables import (
     ERRORS,
@@ -269,19 +269,6 @@ def print_kinds(rows: Sequence[dict[str, Any]]) -> None:
 def _hits(rate: Rate) -> str:
     """Return hits/n; a dash without cases."""
     return f"{rate.hits}/{rate.n}" if rate.n else "–"
-
-
-def print_reliability(found: Reliability) -> None:
-    """Print the stated probabilities beside the shares of right answers."""
-    support, wrong = found.brier_of_support, f"{found.n_wrong} of {found.n} wrong"
-    print_frame(
-        found.bins,
-        {"n": ("answers", "d"), "stated": ("stated", ".3f"), "right": ("right", ".3f")},
-        f"Probability that an answer is right ({wrong})",
-        f"calibration error {interval(*found.calibration_error, layout='.3f')}; Brier score "
-        f"{interval(*found.brier, layout='.4f')}"
-        + ("" if math.isnan(support) else f", of support alone {support:.4f}"),
-    )
 
 
 def _print_rates(
