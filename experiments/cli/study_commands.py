@@ -62,6 +62,37 @@ def refusal(
     layout.print_paths(output, [write_kinds(output, refusals, kinds), *pictures])
 
 
+@studies.command()
+def verdicts(
+    paths: Annotated[list[Path], typer.Argument(metavar="RESULT...", help="Results or sweeps.")],
+    *,
+    output: options.OutputFolder = None,
+    alpha: Annotated[
+        float, typer.Option(help="Largest share of runs with a false merge.", min=1e-6, max=0.5)
+    ] = 0.02,
+    delta: Annotated[
+        float, typer.Option(help="One minus the confidence.", min=1e-9, max=0.5)
+    ] = 0.05,
+) -> None:
+    """Bound the share of runs with a false merge, and certify a threshold of the verdict.
+
+    Runs must be independent: other seeds, one setting. Runs with `--set
+    align.evidence.least_ratio=1` can certify any threshold: `mapfusion study verdicts
+    results/sweeps/calibration -o guarantee`.
+    """
+    from experiments.cli.options import require_folder
+    from experiments.reports.study_files import write_guarantee
+    from experiments.reports.terminal import layout, study_screen
+    from experiments.studies.run_tables import find_runs
+    from experiments.studies.verdict_guarantee import guarantee
+
+    require_folder(output, paths)
+    found = guarantee(find_runs(paths), alpha, delta)
+    study_screen.print_guarantee(found)
+    if output is not None:
+        layout.print_paths(output, write_guarantee(output, found))
+
+
 @app.command(rich_help_panel=options.RUN)
 def sweep(
     scenarios: options.ScenarioNames,

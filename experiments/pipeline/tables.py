@@ -78,6 +78,7 @@ ESTIMATES = schema(
         accepted=BOOL,
         log10_false_alarms=FLOAT,
         log10_evidence=FLOAT,
+        log10_ratio_passed=FLOAT,  # infinite if the alignment passes any `least_ratio`
         n_confirmed=INT,
         n_contradicted=INT,
         acceptance_reason=TEXT,

@@ -141,6 +141,7 @@ def estimate_row(
         "accepted": verdict.accepted,
         "log10_false_alarms": verdict.log10_false_alarms,
         "log10_evidence": verdict.log10_evidence,
+        "log10_ratio_passed": verdict.log10_ratio_passed,
         "n_confirmed": verdict.n_confirmed,
         "n_contradicted": verdict.n_contradicted,
         "acceptance_reason": verdict.reason,

@@ -87,6 +87,35 @@ def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str
     assert ("too few beside" in answer.reason) == (status == "ambiguous")
 
 
+@pytest.mark.parametrize("rivalled", [False, True])
+def test_the_ratio_passed_is_the_largest_that_accepts(rivalled: bool) -> None:
+    """Without repetition and rivals any ratio is passed; with another motion, half the evidence."""
+    pairs, (said, refined) = match(A, B), verdict(A, B)
+    sought = Registration(Clique()).on(A, B, pairs)
+    assert sought.verifier is not None
+    known = sought.verifier.evidence
+    assert known is not None
+    assert said.log10_ratio_passed == math.inf
+    if rivalled:
+        none = RepeatedLandmarks.none(len(A), len(B))
+        away = refined.T_a_b + np.array([0.0, 30.0, 0.0])
+        rival = RivalMotion(BETWEEN, away, -5.0, 9, 0, 3, 3, -4.0, none)
+        known = replace(known, motions=(*known.motions, rival))
+
+    def judged(log10_ratio: float) -> Verdict:
+        asked = Verifier(evidence=EvidenceParameters(least_ratio=10**log10_ratio))
+        registration = Registration(Clique(), verifier=asked).on(A, B, pairs, known)
+        return registration.register(np.random.default_rng(0)).verdict
+
+    if not rivalled:
+        assert judged(12.0).accepted
+        return
+    passed = judged(0.0).log10_ratio_passed
+    assert passed == pytest.approx(said.log10_evidence - np.log10(2))
+    assert judged(passed - 1e-6).accepted
+    assert not judged(passed + 1e-6).accepted
+
+
 def walls_with_one_picture(first_x: float, last_x: float) -> tuple[Wall, Wall]:
     """Two walls share one texture only."""
     first, second = Wall(16, seed=1), Wall(16, seed=8)
