@@ -15,7 +15,7 @@ the number of candidates.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -236,15 +236,15 @@ def guarantee(runs: Runs, alpha: float, delta: float) -> Guarantee:
         }
         for place, (t, k) in enumerate(zip(judged, n_false, strict=True))
     ]
-    tables = [
-        pd.DataFrame(rows, columns=pd.Index(of.names))
-        for rows, of in ((shares, SHARES), (thresholds, THRESHOLDS))
-    ]
-    return Guarantee(alpha, delta, *tables, least_ratio, answers, len(runs.failed))
+    of_thresholds = pd.DataFrame(thresholds, columns=pd.Index(THRESHOLDS.names))
+    n_failed = len(runs.failed)
+    parts = (pd.DataFrame(shares), of_thresholds, least_ratio, answers, n_failed)
+    return Guarantee(alpha, delta, *parts)
 
 
-def _share(name: str, own: pd.DataFrame, delta: float) -> dict[str, object]:
+def _share(name: str, own: pd.DataFrame, delta: float) -> dict[str, Any]:
+    """Return the row of SHARES of some runs."""
     n, k = len(own), int(np.count_nonzero(own["false_passes"] > -math.inf))
     row = {"scenario": name, "n_runs": n, "n_false_runs": k}
-    row["false_runs_upper"] = upper_bound(k, n, delta)
-    return row | own[["n_right", "n_right_accepted"]].sum().to_dict()
+    row |= {"false_runs_upper": upper_bound(k, n, delta)}
+    return row | {each: int(own[each].sum()) for each in ("n_right", "n_right_accepted")}

@@ -2,10 +2,10 @@
 
     python -m tests.benchmarks.runs_without_common_ground FOLDER --seeds 2000..2042 --jobs 4
 
-43 seeds of each of the seven scenarios `scenarios/*apart.yaml` are 301 independent runs. They accept
-with `align.evidence.least_ratio=1`, so that `mapfusion study verdicts` can judge every threshold; its
-tables go to FOLDER/guarantee. The same command continues an interrupted sweep. Every verdict on these
-maps but a refusal is wrong. Pictures are small and drives short: a run takes about a minute.
+43 seeds of each of the seven scenarios `scenarios/*apart.yaml` are 301 independent runs, with small
+pictures and short drives. They accept with `align.evidence.least_ratio=1`, so that `mapfusion study
+verdicts` can judge every threshold; its tables go to FOLDER/guarantee. The same command continues
+an interrupted sweep. On these maps every accepted alignment is wrong.
 """
 
 import argparse
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 _SCENARIOS = Path(__file__).parents[2] / "scenarios"
-# The focal length keeps the field of view of the default camera at half its width.
+# The focal length is that of the default camera at half its resolution.
 _SETTINGS = (
     "drive.frames=120",
     "render.renderer=raycast",
