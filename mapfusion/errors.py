@@ -156,7 +156,7 @@ _FORMER_MODULES = {
     "verification.visibility": "evidence.watch evidence.expected",
     "verification.regions": "evidence.found evidence.regions evidence.parameters",
     "verification.rivals": "evidence.copies evidence.twins evidence.rivals",
-    "verification.likelihood": "evidence.likelihood evidence.probability",
+    "verification.likelihood": "evidence.likelihood",
     "verification.registration": (
         "registration align.registration align.supported align.completion"
     ),

@@ -42,15 +42,12 @@ def refusal(
     Maps of different worlds have no common ground. For example, after a sweep of these worlds:
     `mapfusion study refusal full --seeds 0..2 -o refusal`.
     """
-    import numpy as np
-
     from experiments.cli.options import require_folder
     from experiments.reports.study_files import draw_refusals, write_kinds
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.seeds import parse_seeds
     from experiments.studies import refusal_rates, refusal_trial
     from experiments.studies.refusal_cases import worlds_of
-    from experiments.studies.refusal_rates import answers_with_probability, reliability
     from experiments.studies.refusal_trial import PairsDrawn
 
     require_folder(output, worlds)
@@ -61,12 +58,39 @@ def refusal(
     study_screen.print_refusals(refusal_rates.summary(refusals), false_alarms)
     kinds = refusal_rates.by_kind(refusals)
     study_screen.print_kinds(kinds)
-    answers = answers_with_probability(refusals)
-    held = reliability(answers, np.random.default_rng(0)) if len(answers) else None
-    if held is not None:
-        study_screen.print_reliability(held)
-    pictures = draw_refusals(output, refusals, calibration, false_alarms, held)
+    pictures = draw_refusals(output, refusals, calibration, false_alarms)
     layout.print_paths(output, [write_kinds(output, refusals, kinds), *pictures])
+
+
+@studies.command()
+def verdicts(
+    paths: Annotated[list[Path], typer.Argument(metavar="RESULT...", help="Results or sweeps.")],
+    *,
+    output: options.OutputFolder = None,
+    alpha: Annotated[
+        float, typer.Option(help="Largest share of runs with a false merge.", min=1e-6, max=0.5)
+    ] = 0.02,
+    delta: Annotated[
+        float, typer.Option(help="One minus the confidence.", min=1e-9, max=0.5)
+    ] = 0.05,
+) -> None:
+    """Bound the share of runs with a false merge, and certify a threshold of the verdict.
+
+    Runs must be independent: other seeds, one setting. Runs with `--set
+    align.evidence.least_ratio=1` can certify any threshold: `mapfusion study verdicts
+    results/sweeps/calibration -o guarantee`.
+    """
+    from experiments.cli.options import require_folder
+    from experiments.reports.study_files import write_guarantee
+    from experiments.reports.terminal import layout, study_screen
+    from experiments.studies.run_tables import find_runs
+    from experiments.studies.verdict_guarantee import guarantee
+
+    require_folder(output, paths)
+    found = guarantee(find_runs(paths), alpha, delta)
+    study_screen.print_guarantee(found)
+    if output is not None:
+        layout.print_paths(output, write_guarantee(output, found))
 
 
 @app.command(rich_help_panel=options.RUN)

@@ -41,7 +41,7 @@ _OTHER_TYPES = {
     "fused_history": dict.fromkeys(_PLAN, pa.float32()),
     "true_pairs": {"true_pair": pa.binary()},
 }
-_VERSIONS = {"errors": 5}  # of the others: 1
+_VERSIONS = {"errors": 6}  # of the others: 1
 UNKNOWN = -1  # a count that needs the truth, without truth
 _POINT = " ".join(POSITION_FIELDS + COVARIANCE_FIELDS)
 _COLUMNS = {
@@ -49,15 +49,16 @@ _COLUMNS = {
     # The aligner "oracle" is given the true pairs and has one repetition. rotation_error_rad is
     # signed: estimate minus truth. Columns from verdict to acceptance_reason belong to the refined
     # alignment (mapfusion/verification). oracle_distance: distance of the refined alignment from
-    # the oracle's. n_true: true pairs among the correspondences. n_common: common landmarks of the
-    # maps. precision, recall: of the refined inliers. alignment_nees: NEES of the refined
-    # alignment, 3 degrees of freedom. lower_bound: its covariance excludes errors that the
-    # landmarks of a map share.
+    # the oracle's. log10_ratio_passed: log10 of the largest `align.evidence.least_ratio` that the
+    # alignment passes, infinite if it passes any. n_true: true pairs among the correspondences.
+    # n_common: common landmarks of the maps. precision, recall: of the refined inliers.
+    # alignment_nees: NEES of the refined alignment, 3 degrees of freedom. lower_bound: its
+    # covariance excludes errors that the landmarks of a map share.
     "errors": """robot_a robot_b iteration aligner repetition status reason
         translation_error_m rotation_error_rad
         refined_status refined_reason refined_translation_error_m refined_rotation_error_rad
-        verdict accepted log10_false_alarms log10_evidence n_confirmed n_contradicted
-        probability acceptance_reason oracle_distance_m oracle_distance_rad
+        verdict accepted log10_false_alarms log10_evidence log10_ratio_passed
+        n_confirmed n_contradicted acceptance_reason oracle_distance_m oracle_distance_rad
         n_correspondences n_true n_common n_inliers precision recall alignment_nees lower_bound""",
     # One row per (robot, iteration): online path of the best particle and odometry, both from the
     # true start without a fit. spread_m: root of the trace of the particles' weighted position

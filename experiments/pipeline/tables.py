@@ -65,7 +65,7 @@ _ANSWER = {"status": TEXT, "reason": TEXT} | dict.fromkeys(MOTION, FLOAT)
 # Estimates of the aligners, written by the align stage.
 ESTIMATES = schema(
     "result.estimates",
-    4,
+    5,
     fields(
         **_MAPS,
         aligner=TEXT,
@@ -78,9 +78,9 @@ ESTIMATES = schema(
         accepted=BOOL,
         log10_false_alarms=FLOAT,
         log10_evidence=FLOAT,
+        log10_ratio_passed=FLOAT,  # infinite if the alignment passes any `least_ratio`
         n_confirmed=INT,
         n_contradicted=INT,
-        probability=FLOAT,
         acceptance_reason=TEXT,
         drift_sigma_m=FLOAT,
         # upper triangle of the refined alignment's covariance

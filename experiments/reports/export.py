@@ -134,7 +134,7 @@ def alignment_document(
         answer |= {"estimated_status": row["status"], "estimated_reason": row["reason"] or None}
         answer |= {"refined": refined if accepted else None}
         numbers = ("n_inliers", "n_correspondences", "log10_false_alarms", "log10_evidence")
-        numbers += ("n_confirmed", "n_contradicted", "probability", "elapsed_s")
+        numbers += ("n_confirmed", "n_contradicted", "elapsed_s")
         aligners.append(answer | {name: row[name] for name in numbers})
     head = {"map_a": maps[0], "map_b": maps[1], "seed": seed, "note": note or None}
     return {**head, "aligners": aligners}

@@ -33,13 +33,13 @@ from experiments.studies.paper_claims import CROSSING, READINGS, VALUES, crossin
 from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,
-    Reliability,
     first_right_answers,
     of_any_method,
     ordinary,
 )
 from experiments.studies.run_tables import find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, Summary, configurations, summarise
+from experiments.studies.verdict_guarantee import SHARES, THRESHOLDS, Guarantee
 from mapfusion.align.alignment import Status
 from mapfusion.errors import InputError
 from mapfusion.files import schema, write_json
@@ -303,7 +303,6 @@ def draw_refusals(
     refusals: pd.DataFrame,
     calibration: pd.DataFrame,
     false_alarms: float,
-    held: Reliability | None,
 ) -> list[Path]:
     """Draw the figures that have data, and return their files."""
     place, files = folder / "figures", []
@@ -312,9 +311,18 @@ def draw_refusals(
         files += save_figure(place, "refusal", study_figures.draw_refusal, *data)
     files += save_figure(place, "refusal_kinds", study_figures.draw_refusal_kinds, refusals)
     files += save_figure(place, "refusal_roc", study_figures.draw_refusal_roc, refusals)
-    if held is not None:
-        draw = study_figures.draw_refusal_reliability
-        files += save_figure(place, "refusal_reliability", draw, held)
+    return files
+
+
+def write_guarantee(folder: Path, found: Guarantee) -> list[Path]:
+    """Write the tables `shares` and `thresholds` (Parquet and CSV), and return their files."""
+    stated = {"alpha": f"{found.alpha:g}", "delta": f"{found.delta:g}"}
+    files = []
+    for name, schema_of in (("shares", SHARES), ("thresholds", THRESHOLDS)):
+        rows = getattr(found, name)
+        files += [folder / f"{name}.parquet", folder / f"{name}.csv"]
+        write_rows(files[-2], schema_of, rows, stated)
+        write_text(files[-1], rows.to_csv(index=False))
     return files
 
 

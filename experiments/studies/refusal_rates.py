@@ -1,19 +1,13 @@
-"""Rates of the refusal study: false and missed merges, by kind of world, and reliability.
+"""Rates of the refusal study: false and missed merges, by kind of world.
 
 False merges are counted per run and per pair of maps: maps of one run at several iterations depend
 on each other. Pairs of maps of different seeds count as pairs of maps only.
-
-Reliability compares the stated probabilities of answers that beat chance with the share of right
-answers. The bootstrap resamples whole runs, or whole pairs of worlds. A logistic curve over the
-logarithm of the false alarms, fitted to the other kinds of worlds, serves as reference.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import minimize
-from scipy.special import expit, log_expit
 
 from experiments.evaluation import criteria
 from experiments.evaluation.criteria import (
@@ -22,7 +16,7 @@ from experiments.evaluation.criteria import (
     is_false_merge,
     right_refined,
 )
-from experiments.studies.intervals import Interval, percentile_interval, wilson
+from experiments.studies.intervals import wilson
 from experiments.studies.refusal_cases import APART, COMMON, FEW, POSTER_RADII_M
 from mapfusion.geometry.numerics import Float
 
@@ -214,114 +208,3 @@ def worst(rows: list[dict[str, Any]], name: str) -> tuple[str, Rate]:
 def pooled(rows: list[dict[str, Any]], name: str) -> Rate:
     """Return the rate over the answers of all aligners."""
     return Rate(sum(row[name].hits for row in rows), sum(row[name].n for row in rows))
-
-
-N_BINS = 10  # of equal count
-RESAMPLES = 500  # a dozen lie outside each end of a 95 % interval
-
-
-class Reliability(NamedTuple):
-    """Reliability of stated probabilities.
-
-    Attributes:
-        bins: one row for each bin of equal count: `n`, mean `stated`, share `right` with its ends.
-        calibration_error: mean absolute difference of stated and right, over bins.
-        brier: mean squared difference of the stated probability and the outcome (0 or 1).
-        brier_of_support: Brier score of a probability from the support, for kinds of worlds that
-            were not used to fit it; NaN for a single kind, or if the others allow no fit.
-        n: number of answers.
-        n_wrong: number of wrong answers.
-    """
-
-    bins: pd.DataFrame
-    calibration_error: Interval
-    brier: Interval
-    brier_of_support: float
-    n: int
-    n_wrong: int
-
-
-def answers_with_probability(refusals: pd.DataFrame) -> pd.DataFrame:
-    """Return the answers that beat chance and have a probability, with `right` and `run`."""
-    rows = unchanged_pairs(refusals)
-    rows = rows[rows["beats_chance"] & rows["probability"].notna()]
-    return rows.assign(run=rows["world_a"] + " " + rows["world_b"])
-
-
-def reliability(answers: pd.DataFrame, rng: np.random.Generator) -> Reliability:
-    """Compare the probabilities of `answers_with_probability` (at least one) with the truth."""
-    codes, runs = pd.factorize(answers["run"])
-    stated = answers["probability"].to_numpy(float)
-    right = answers["right"].to_numpy(float)
-    # Random order of equal probabilities: the table is sorted by kind.
-    place = _bins_of(np.lexsort([rng.permutation(len(stated)), stated]))
-    sums = {name: np.zeros((len(runs), N_BINS)) for name in ("n", "stated", "right")}
-    for name, values in (("n", np.ones(len(stated))), ("stated", stated), ("right", right)):
-        np.add.at(sums[name], (codes, place), values)
-
-    def error(counts: Float) -> Float:
-        n, stated, held = (np.einsum("bc,ck->bk", counts, sums[name]) for name in sums)
-        return np.sum(np.abs(stated - held), axis=1) / np.sum(n, axis=1)
-
-    squared = np.bincount(codes, (stated - right) ** 2, len(runs))
-    n_of_run = np.bincount(codes, minlength=len(runs))
-
-    def brier(counts: Float) -> Float:
-        return (counts @ squared) / (counts @ n_of_run)
-
-    rows = []
-    for k in range(N_BINS):
-        n, held = sums["n"][:, k], sums["right"][:, k]
-        if not n.sum():
-            continue
-
-        def share(counts: Float, n: Float = n, held: Float = held) -> Float:
-            total = counts @ n
-            return counts @ held / np.where(total > 0, total, np.nan)
-
-        found = percentile_interval(share, len(n), rng, RESAMPLES)
-        row = {"n": int(n.sum()), "stated": float(sums["stated"][:, k].sum() / n.sum())}
-        rows.append(row | found.columns("right"))
-    return Reliability(
-        pd.DataFrame(rows),
-        percentile_interval(error, len(runs), rng, RESAMPLES),
-        percentile_interval(brier, len(runs), rng, RESAMPLES),
-        _brier_of_support(answers),
-        len(answers),
-        int(np.count_nonzero(right == 0)),
-    )
-
-
-def calibration_error(stated: Float, right: Float) -> float:
-    """Return the mean absolute difference of stated (n,) and right (n,), over equal bins."""
-    place = _bins_of(np.argsort(stated, kind="stable"))
-    apart = np.bincount(place, stated - right, N_BINS)
-    return float(np.sum(np.abs(apart))) / len(stated)
-
-
-def _bins_of(order: np.ndarray) -> np.ndarray:
-    """Return the bin of each item, shape (n,), for N_BINS of equal count in an order (n,)."""
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order)) * N_BINS // len(order)
-    return place
-
-
-def _brier_of_support(answers: pd.DataFrame) -> float:
-    """Return the Brier score of a logistic curve over the support, fitted to the other kinds."""
-    support = -answers["log10_false_alarms"].to_numpy(float)
-    x = np.log10(np.maximum(support, 1e-3))  # diminishing certainty of large support
-    right, squares = answers["right"].to_numpy(bool), 0.0
-    for kind in answers["kind"].unique():
-        own = (answers["kind"] == kind).to_numpy()
-        if right[~own].all() or not right[~own].any():
-            return np.nan
-        x_fit, sign = x[~own], np.where(right[~own], 1.0, -1.0)
-
-        def cost(line: Float, x_fit: Float = x_fit, sign: Float = sign) -> float:
-            # The weak prior keeps the curve finite if x separates right from wrong.
-            weak_prior = 1e-3 * float(line @ line)
-            return weak_prior - float(np.sum(log_expit(sign * (line[0] * x_fit + line[1]))))
-
-        slope, offset = map(float, minimize(cost, np.zeros(2)).x)
-        squares += float(np.sum((expit(slope * x[own] + offset) - right[own]) ** 2))
-    return squares / len(answers)

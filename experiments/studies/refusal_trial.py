@@ -94,7 +94,7 @@ TABLES = {
     # One row per (pair of maps, aligner); errors are NaN for maps of two worlds.
     "refusals": schema(
         "refusal.refusals",
-        2,
+        3,
         fields(
             kind=TEXT,  # scenario of both worlds; crossed or crossed_repeating, of two
             repeats=BOOL,  # pictures of either world occur in several places
@@ -109,7 +109,6 @@ TABLES = {
             accepted=BOOL,
             beats_chance=BOOL,  # passes the test against chance
             log10_false_alarms=FLOAT,
-            probability=FLOAT,  # stated probability that it is right; NaN if unknown
             refined_translation_error_m=FLOAT,
             refined_rotation_error_rad=FLOAT,
         ),
@@ -318,7 +317,6 @@ def _answers(
             "accepted": verdict.accepted,
             "beats_chance": bool(verdict.log10_false_alarms <= bound),
             "log10_false_alarms": verdict.log10_false_alarms,
-            "probability": verdict.probability,
             "refined_translation_error_m": np.hypot(error[0], error[1]),
             "refined_rotation_error_rad": float(se2.wrap(error[2])),
         }

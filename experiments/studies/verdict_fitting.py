@@ -8,34 +8,28 @@
 - `twins`: `mapfusion/verification/fitted_twins.py`, how often a region that a wrong motion lays on
   a copy is repeated completely. Wrong motions are those with most support between maps without a
   common landmark, in worlds with repetition.
-- `probability`: `mapfusion/verification/fitted.py`, the probability that an alignment is right. The
-  command also prints how well the model predicts kinds of world that were left out of the fit.
 """
 
 import argparse
 import itertools
 import sys
-import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
-from experiments.evaluation.criteria import MERGEABLE_PAIRS, RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
-from experiments.scenario.seeds import generator, parse_seeds
+from experiments.evaluation.criteria import MERGEABLE_PAIRS
+from experiments.scenario.seeds import parse_seeds
 from experiments.studies import refusal_cases
 from experiments.studies.refusal_cases import Case, MappedWorld, worlds_of
-from experiments.studies.refusal_rates import calibration_error
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Oracle
 from mapfusion.files import write_whole
-from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.verification import fitted, fitted_rates, fitted_twins
+from mapfusion.verification import fitted_rates, fitted_twins
 from mapfusion.verification.likelihood import (
     COPIED,
     OWN,
@@ -57,12 +51,7 @@ from mapfusion.verification.verdict import N_RIVALS
 
 # Step between the evaluated iterations that are used: maps of neighbouring iterations are similar.
 EVERY = 3
-# The same for the probability in worlds with repetition. In other worlds all iterations are used:
-# right alignments are least certain when the first common landmarks appear, which happens once.
-_EVERY_IF_REPEATED = 2
 _ROUNDS = 500  # of expectation and maximisation: the shares converge to the fourth digit
-# Weight of the squared coefficients of scaled features; some kinds have a constant feature.
-_RIDGE = 1e-3
 _FOUR = 2, 2  # shape of the parameters of two rates
 
 
@@ -225,105 +214,6 @@ def write_twins(worlds: Sequence[MappedWorld], source: dict[str, str]) -> None:
     _write(fitted_twins, _TWINS.format(**numbers, **source))
 
 
-# Probability that an alignment is right
-
-_PROBABILITY = '''"""Coefficients of `probability.py`.
-
-As `python -m experiments.studies.verdict_fitting probability` fits them.
-
-{source}
-"""
-
-VERSION = {version}
-INTERCEPT = {intercept:.3f}
-WEIGHTS = ({weights})
-'''
-
-
-class Answers(NamedTuple):
-    """Alignments that beat chance: (n, F) features, (n,) right, (n,) kind of world."""
-
-    features: Float
-    right: Float
-    kind: np.ndarray
-
-
-def answers_of(worlds: Sequence[MappedWorld]) -> Answers:
-    """Return every aligner's refined estimate at the evaluated iterations of all worlds."""
-    rows = list[tuple[Float, bool, str]]()
-    for world in worlds:
-        scenario, settings = world.scenario, world.scenario.align
-        for k, case in cases_of(world, _EVERY_IF_REPEATED if world.repeats else 1):
-            verifier = settings.verifier.on(Pairs(case.map_a, case.map_b, case.pairs))
-            names = (world.name, case.map_a.name, case.map_b.name, k)
-            for entry in settings.aligners:
-                rng = generator(scenario.seed, "fit", *names, entry.name)
-                refined = case.refined_estimate(entry, settings.refinement, rng)
-                if not np.isfinite(verifier.verify(refined).probability):
-                    continue
-                signs = verifier.features(refined)
-                if signs is not None:
-                    x_m, y_m, theta_rad = refined.T_a_b - case.T_true
-                    right = np.hypot(x_m, y_m) < RIGHT_WITHIN_M
-                    right &= abs(se2.wrap(theta_rad)) < RIGHT_WITHIN_RAD
-                    rows.append((signs.vector(), bool(right), scenario.name))
-    features, right, kind = zip(*rows, strict=True)
-    return Answers(np.array(features), np.array(right, float), np.array(kind))
-
-
-def fit_probability(features: Float, right: Float) -> Float:
-    """Return intercept and weights (1 + F,) of the most likely logistic model with a ridge.
-
-    Args:
-        features: (n, F).
-        right: (n,) 0 or 1.
-    """
-    mean, scale = features.mean(axis=0), features.std(axis=0) + 1e-9
-    Z = np.column_stack([np.ones(len(features)), (features - mean) / scale])
-    sign = 2 * right - 1
-
-    def cost(w: Float) -> float:
-        return float(np.logaddexp(0, -sign * (Z @ w)).mean() + _RIDGE * np.sum(w[1:] ** 2))
-
-    w = minimize(cost, np.zeros(Z.shape[1]), method="BFGS").x
-    weights = w[1:] / scale
-    return np.array([w[0] - weights @ mean, *weights])
-
-
-def stated(model: Float, features: Float) -> Float:
-    """Return the probabilities (n,) that a model (1 + F,) states."""
-    return 1 / (1 + np.exp(-(model[0] + features @ model[1:])))
-
-
-def left_out(answers: Answers) -> Float:
-    """Return each answer's probability (n,) by a model fitted without worlds of its kind."""
-    p = np.empty(len(answers.right))
-    for kind in np.unique(answers.kind):
-        own = answers.kind == kind
-        model = fit_probability(answers.features[~own], answers.right[~own])
-        p[own] = stated(model, answers.features[own])
-    return p
-
-
-def write_probability(worlds: Sequence[MappedWorld], source: dict[str, str]) -> None:
-    """Fit and write the logistic model, and print its errors for kinds of world left out."""
-    answers = answers_of(worlds)
-    intercept, *weights = fit_probability(answers.features, answers.right)
-    n, n_right = len(answers.right), int(answers.right.sum())
-    fitted_to = f"Of {n} alignments, {n_right} of them right, of seeds {{seeds}} of {{worlds}}."
-    text = _PROBABILITY.format(
-        source=textwrap.fill(fitted_to.format(**source), width=100),
-        version=fitted.VERSION,
-        intercept=intercept,
-        weights=", ".join(f"{w:.3f}" for w in weights),
-    )
-    _write(fitted, text)
-    p = left_out(answers)
-    brier = float(np.mean((p - answers.right) ** 2))
-    errors = f"calibration error {calibration_error(p, answers.right):.4f}, Brier score {brier:.4f}"
-    sys.stdout.write(f"kinds left out one at a time: {errors}\n")
-
-
 def _write(module: ModuleType, text: str) -> None:
     """Replace the source of a module, and print it."""
     write_whole(Path(str(module.__file__)), lambda path: path.write_text(text, encoding="utf-8"))
@@ -332,7 +222,7 @@ def _write(module: ModuleType, text: str) -> None:
 
 def main() -> None:
     """Fit what the arguments of this process ask for."""
-    fits = {"rates": write_rates, "twins": write_twins, "probability": write_probability}
+    fits = {"rates": write_rates, "twins": write_twins}
     parser = argparse.ArgumentParser(description="Fit the constants of the verdict.")
     parser.add_argument("what", choices=fits)
     parser.add_argument("worlds", nargs="+")

@@ -345,18 +345,19 @@ class Verdict:
         reason: reason of a refusal, or a remark on an accepted alignment; else empty.
         log10_evidence: log10 likelihood ratio of the regions that both robots must have seen; NaN
             without evidence.
+        log10_ratio_passed: log10 of the largest `least_ratio` that these regions pass; infinite if
+            they pass any; NaN without evidence.
         n_confirmed: number of these regions that are in both maps.
         n_contradicted: number of these regions that are missing from one map.
-        probability: probability that the alignment is right; NaN without evidence.
     """
 
     status: Status
     log10_false_alarms: float
     reason: str = ""
     log10_evidence: float = math.nan
+    log10_ratio_passed: float = math.nan
     n_confirmed: int = 0
     n_contradicted: int = 0
-    probability: float = math.nan
 
     @property
     def accepted(self) -> bool:

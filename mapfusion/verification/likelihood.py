@@ -1,4 +1,4 @@
-"""Likelihood ratio of shared regions, and the probability that an alignment is right.
+"""Likelihood ratio of shared regions.
 
 Of n landmarks of a region that are searched for, k are matched. Under a right motion k is
 beta-binomial: the rate differs between regions with light, slant and texture, and is higher for
@@ -9,13 +9,8 @@ Structure that another motion explains as well is a copy much more often, and ha
 
 A motion is only tested because some region led to it. Under a wrong motion this region is a copy;
 it is therefore no evidence, and not a sample of the share of copies.
-
-The probability that an alignment is right (error below 0.5 m and 0.1 rad) is a logistic model of
-the results of all tests. Its coefficients are fitted to simulated worlds, some with repeated
-structure (`fitted.py`).
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +18,6 @@ import scipy
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.verification import fitted_rates, fitted_twins
-from mapfusion.verification.fitted import INTERCEPT, WEIGHTS
 
 
 class BetaRate(NamedTuple):
@@ -173,56 +167,3 @@ def log10_without_discovery(log10_ratios: Float) -> float:
         len(log10_ratios)
     )
     return float(np.sum(log10_ratios) - one)
-
-
-# Limits of the features (log10 likelihood ratio, -log10 NFA, extent of the support): beyond them
-# the model has no data.
-_MOST_EVIDENCE, _LEAST_CHANCE, _MOST_EXTENT_M = 3.0, 10.0, 12.0
-_CONTRADICTION = 3.0  # weight of a contradicting region relative to a confirming one
-_FEW = 2.0  # regions; pulls the share of few regions towards 0
-
-
-class EvidenceFeatures(NamedTuple):
-    """Results of all tests of one alignment.
-
-    Attributes:
-        log10_false_alarms: log10 NFA of the test against chance; infinite if it is not defined.
-        log10_evidence: log10 likelihood ratio of the regions.
-        n_confirmed: number of confirmed regions.
-        n_contradicted: number of contradicted regions.
-        n_support: number of supporting correspondences.
-        extent_m: longer side of the bounding box of the supporters.
-        repeats: True if either map has repeated structure.
-        one_place: True if the maps show little beyond the place that they share.
-    """
-
-    log10_false_alarms: float
-    log10_evidence: float
-    n_confirmed: int
-    n_contradicted: int
-    n_support: int
-    extent_m: float
-    repeats: bool
-    one_place: bool
-
-    def vector(self) -> Float:
-        """Return the features of the logistic model, shape (7,)."""
-        against = _CONTRADICTION * self.n_contradicted
-        net = (self.n_confirmed - against) / (self.n_confirmed + against + _FEW)
-        return np.array(
-            [
-                np.clip(-self.log10_false_alarms, 0.0, _LEAST_CHANCE),
-                np.clip(self.log10_evidence, -_MOST_EVIDENCE, _MOST_EVIDENCE),
-                net,
-                # more supporters at equal extent are denser, as in the copy of one texture
-                math.log10(self.n_support + 1),
-                min(self.extent_m, _MOST_EXTENT_M),
-                float(self.repeats),
-                float(self.one_place),
-            ]
-        )
-
-
-def probability_correct(features: EvidenceFeatures) -> float:
-    """Return the probability that the alignment is right."""
-    return float(1 / (1 + np.exp(-(INTERCEPT + features.vector() @ np.array(WEIGHTS)))))

@@ -57,7 +57,6 @@ class EvidenceParameters:
             runs with 20 evaluated pairs of maps.
         most_against: inverse of the likelihood ratio below which an alignment is contradicted; at
             most one right motion in this number falls below it.
-        least_probability: smallest probability that the alignment is right.
         max_sigma_m: largest standard deviation of the other map's landmarks under the alignment,
             RMS. Two standard deviations (95 %) are 0.5 m, the limit of a useful merged map.
         max_sigma_rad: largest standard deviation of the rotation; two standard deviations move a
@@ -70,7 +69,6 @@ class EvidenceParameters:
     place_m: Annotated[float, Range(0, 1000, "m")] = 6.0
     least_ratio: Annotated[float, Range(1, 1e12, "1")] = 1000.0
     most_against: Annotated[float, Range(1, 1e12, "1")] = 10.0
-    least_probability: Annotated[float, Range(0, 1, "1")] = 0.5
     max_sigma_m: Annotated[float, Range(1e-3, 1e6, "m")] = 0.25
     max_sigma_rad: Annotated[float, Range(1e-4, 10, "rad")] = 0.05
 

@@ -19,13 +19,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.likelihood import (
-    COPIED,
-    OWN,
-    EvidenceFeatures,
-    TwinShares,
-    probability_correct,
-)
+from mapfusion.verification.likelihood import COPIED, OWN, TwinShares
 from mapfusion.verification.regions import (
     EvidenceParameters,
     RegionGrid,
@@ -306,9 +300,9 @@ class PairVerifier:
             regions = self.regions(alignment, evidence)
             log10_evidence = regions.log10_evidence(evidence.shares)
             told = {"log10_evidence": log10_evidence, "n_confirmed": regions.n_confirmed}
-            features = self._features(alignment, regions, evidence, by_chance.log10_false_alarms)
-            p = probability_correct(features)
-            told |= {"n_contradicted": regions.n_contradicted, "probability": p}
+            rival = self._best_rival(alignment, evidence)
+            passed = self._log10_ratio_passed(alignment, regions, evidence, rival)
+            told |= {"n_contradicted": regions.n_contradicted, "log10_ratio_passed": passed}
             # a contradiction counts even together with the region that led to the alignment
             settings = self._settings.evidence
             counts = f"{regions.n_confirmed} of {len(regions)} regions that both must have seen"
@@ -317,11 +311,8 @@ class PairVerifier:
                 status = Status.REFUSED
                 missing = regions.n_contradicted
                 reason = f"contradicted: {counts}, {missing} are missing from one"
-            elif doubt := self._doubt(alignment, regions, evidence):
+            elif doubt := self._doubt(alignment, regions, evidence, rival, passed):
                 status, reason = Status.AMBIGUOUS, doubt.format(told=counts)
-            elif p < settings.least_probability:
-                status = Status.AMBIGUOUS
-                reason = f"right with probability {p:.2g} alone, by all that speaks for and against"
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
             if rival := self._equal_rival(alignment):
@@ -396,14 +387,6 @@ class PairVerifier:
                 )
         return ""
 
-    def features(self, alignment: Alignment) -> EvidenceFeatures | None:
-        """Return the features of an alignment; None if the maps carry no evidence."""
-        if self.evidence is None:
-            return None
-        by_chance = self._chance.verify(alignment).log10_false_alarms
-        regions = self.regions(alignment, self.evidence)
-        return self._features(alignment, regions, self.evidence, by_chance)
-
     def regions(self, alignment: Alignment, evidence: PairEvidence) -> Regions:
         """Return the regions that both robots must have seen under an alignment."""
         T_a_b, p_b = alignment.T_a_b, self._pairs.map_b.position_m[:, :2]
@@ -416,44 +399,62 @@ class PairVerifier:
         none = RepeatedLandmarks.none(len(self._pairs.map_a), len(self._pairs.map_b))
         return self._viewed_maps.regions(BETWEEN, T_a_b, squares, none.joined(others))
 
-    def _features(
+    def _best_rival(self, alignment: Alignment, evidence: PairEvidence) -> RivalMotion | None:
+        """Return the other motion beyond chance with the most evidence; None without one.
+
+        The regions count as well, since two copies of a texture share the correspondences. Under a
+        wrong motion the likelihood ratio of the regions exceeds 10^r with probability at most 10^-r
+        (Markov), which lowers the NFA by r decades.
+        """
+        rivals = [
+            each
+            for each in self._others(alignment.T_a_b, evidence)
+            if each.log10_false_alarms - max(each.log10_evidence, 0.0) <= self._bound
+        ]
+        return max(rivals, key=lambda each: each.log10_evidence, default=None)
+
+    def _log10_ratio_passed(
         self,
         alignment: Alignment,
         regions: Regions,
         evidence: PairEvidence,
-        log10_false_alarms: float,
-    ) -> EvidenceFeatures:
-        told = log10_false_alarms, regions.log10_evidence(evidence.shares)
-        counts = (regions.n_confirmed, regions.n_contradicted, int(alignment.inlier.sum()))
-        extent_m = self._extent_m(alignment)
-        one_place = self._is_one_place(alignment, extent_m)
-        repeats = evidence.repeats(self._bound)
-        return EvidenceFeatures(*told, *counts, extent_m, repeats, one_place)
+        rival: RivalMotion | None,
+    ) -> float:
+        """Return log10 of the largest `least_ratio` that the regions pass; infinite without limit.
 
-    def _doubt(self, alignment: Alignment, regions: Regions, evidence: PairEvidence) -> str:
+        Maps without repeated structure and without another motion need little evidence.
+        """
+        ratio = regions.log10_evidence(evidence.shares)
+        # the best of n wrong motions reaches the threshold n times as often (Boole)
+        passed = ratio - math.log10(evidence.n_motions(self._bound))
+        if rival is not None or evidence.repeats(self._bound):
+            return passed
+        if ratio < 0 and regions.n_contradicted:
+            return passed
+        if regions.n_confirmed <= 1 and self._extent_m(alignment) < evidence.region_m:
+            return max(passed, regions.log10_ratio(evidence.shares))
+        return math.inf
+
+    def _doubt(
+        self,
+        alignment: Alignment,
+        regions: Regions,
+        evidence: PairEvidence,
+        rival: RivalMotion | None,
+        log10_ratio_passed: float,
+    ) -> str:
         """Return why another motion may be the right one; empty if none may.
 
         The text contains the placeholder `{told}` for the counts of regions.
         """
         settings, extent_m = self._settings.evidence, self._extent_m(alignment)
         ratio = regions.log10_evidence(evidence.shares)
-        # Other motions beyond chance. Their regions count as well, since two copies of a texture
-        # share the correspondences. Under a wrong motion the likelihood ratio of the regions
-        # exceeds 10^r with probability at most 10^-r (Markov), which lowers the NFA by r decades.
-        rivals = [
-            each
-            for each in self._others(alignment.T_a_b, evidence)
-            if each.log10_false_alarms - max(each.log10_evidence, 0.0) <= self._bound
-        ]
-        rival = max(rivals, key=lambda each: each.log10_evidence, default=None)
         if rival is not None and rival.log10_evidence > ratio - math.log10(settings.most_against):
             return f"{{told}}; so do {_named(rival)}"
         if self._is_one_place(alignment, extent_m):
             what = f"the maps show little else than this place of {extent_m:.2g} m"
             return f"{what}; what lies around it tells whether it is another's like"
-        # the best of n wrong motions reaches the threshold n times as often (Boole)
-        n_motions = evidence.n_motions(self._bound)
-        if ratio >= math.log10(settings.least_ratio * n_motions):
+        if math.log10(settings.least_ratio) <= log10_ratio_passed:
             return ""
         if rival is not None:
             return f"{{told}}, too few beside {_named(rival)}"
@@ -461,13 +462,10 @@ class PairVerifier:
             return "{told}, too few for maps that hold things twice"
         # No structure repeats and no other motion fits. One contradicting region is then a reason
         # for doubt if the regions, without the one that led to the motion, do not favour it.
-        if ratio < 0 and regions.n_contradicted:
+        if ratio < 0 < regions.n_contradicted:
             return "{told}; beside the one that led to it they speak against it"
-        few = regions.log10_ratio(evidence.shares) < math.log10(settings.least_ratio)
-        if few and regions.n_confirmed <= 1 and extent_m < evidence.region_m:
-            what = f"all that agrees lies within {evidence.region_m:.2g} m"
-            return f"{what} and could hang elsewhere too; no other region confirms it"
-        return ""
+        what = f"all that agrees lies within {evidence.region_m:.2g} m"
+        return f"{what} and could hang elsewhere too; no other region confirms it"
 
     def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
         """Return the rivals that differ from a motion."""

@@ -20,7 +20,6 @@ from experiments.studies.refusal_cases import FEW, POSTER_RADII_M
 from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,
-    Reliability,
     mergeable,
     ordinary,
     right_answers,
@@ -68,7 +67,6 @@ _MM_PER_M = 1000.0
 _LEAST_SPAN = 3.0  # ratio of the ends of a logarithmic axis: keeps differences of a few % small
 
 # Refusal
-_SCORE = "log10_false_alarms"
 _THRESHOLDS = np.linspace(-100, 8, 500)  # on log10 of the false alarms
 _POSTER_COLOURS = (style.ORANGE, style.VERMILLION, style.PURPLE)
 _SUPPORT_OF = "ransac"  # aligner whose number of inliers is swept for comparison
@@ -240,7 +238,7 @@ def draw_refusal(refusals: pd.DataFrame, calibration: pd.DataFrame, false_alarms
     figure = Figure(figsize=(style.PAGE_WIDTH_IN, 6.2))
     (curve, rates), (calibrated, key) = figure.subplots(2, 2)
     first = refusals["aligner"].iloc[0]
-    _draw_roc_curves(curve, refusals, _SCORE)
+    _draw_roc_curves(curve, refusals)
     # For comparison: the curve of a threshold on the number of inliers.
     own = refusals[refusals["aligner"] == _SUPPORT_OF]
     label = f"{_SUPPORT_OF}, number of inliers alone"
@@ -316,64 +314,33 @@ def draw_refusal_kinds(refusals: pd.DataFrame) -> Figure:
 
 
 def draw_refusal_roc(refusals: pd.DataFrame) -> Figure:
-    """Draw false against missed merges, in ordinary worlds and in worlds with repetition.
+    """Draw false against missed merges as the number of false alarms moves.
 
-    The first row sweeps the number of false alarms, the second one the stated probability, if any.
+    The panels show ordinary worlds and worlds with repetition.
     """
-    scores = {"log10_false_alarms": "by false alarms"}
-    if refusals["probability"].notna().any():
-        scores["doubt"] = "by probability"
-    refusals = refusals.assign(doubt=-refusals["probability"])
     worlds = {
         "ordinary worlds": ordinary(refusals),
         "worlds that repeat themselves": refusals[refusals["repeats"]],
     }
-    figure = Figure(figsize=(style.PAGE_WIDTH_IN, 0.8 + 2.9 * len(scores)))
-    panels = figure.subplots(len(scores), 2, squeeze=False)
-    for row, (score, by) in zip(panels, scores.items(), strict=True):
-        for axes, (title, own) in zip(row, worlds.items(), strict=True):
-            if len(own):
-                _draw_roc_curves(axes, own, score)
-            axes.set_title(f"{title}, {by}")
-    labelled = [axes.get_legend_handles_labels() for axes in panels.flat]
+    figure = Figure(figsize=(style.PAGE_WIDTH_IN, 3.7))
+    panels = figure.subplots(1, 2)
+    for axes, (title, own) in zip(panels, worlds.items(), strict=True):
+        if len(own):
+            _draw_roc_curves(axes, own)
+        axes.set_title(title)
+    labelled = [axes.get_legend_handles_labels() for axes in panels]
     legend = {"loc": "outside upper center", "ncols": 5, "handlelength": 3.2}
     figure.legend(*max(labelled, key=lambda both: len(both[1])), **legend)
     return figure
 
 
-def draw_refusal_reliability(found: Reliability) -> Figure:
-    """Draw the share of right answers against the stated probability, in bins of equal count."""
-    figure = Figure(figsize=(style.PAGE_WIDTH_IN / 2, 3.4))
-    axes = figure.subplots()
-    axes.plot([0, 1], [0, 1], color=style.PALE_GRAY, linewidth=2.5, label="as stated")
-    bins = found.bins
-    off = np.abs(bins[["right_low", "right_high"]].to_numpy().T - bins["right"].to_numpy())
-    label = f"{found.n} answers, {found.n_wrong} wrong"
-    axes.errorbar(
-        bins["stated"],
-        bins["right"],
-        yerr=off,
-        color=style.BLUE,
-        marker="o",
-        linestyle="",
-        label=label,
-    )
-    error = found.calibration_error.value
-    axes.set_title(f"calibration error {error:.3f}, Brier score {found.brier.value:.4f}")
-    axes.set(xlabel="probability stated (mean of a tenth)", ylabel="share that is right")
-    axes.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal")
-    axes.legend(loc="upper left")
-    return figure
+def _draw_roc_curves(axes: Axes, refusals: pd.DataFrame) -> None:
+    """Draw false against missed merges for each method, as the number of false alarms moves.
 
-
-def _draw_roc_curves(axes: Axes, refusals: pd.DataFrame, score: str) -> None:
-    """Draw false against missed merges for each method, as a threshold on a column moves.
-
-    A small value of the column `score` means a certain verdict. A point with Wilson intervals
-    marks the threshold in use.
+    A point with Wilson intervals marks the threshold in use.
     """
     floor = _floor(refusals)
-    scored = refusals.assign(score=refusals[score])
+    scored = refusals.assign(score=refusals["log10_false_alarms"])
     styles = style.aligner_styles(refusals["aligner"].unique().tolist())
     for name, own in scored.groupby("aligner", sort=False):
         line = styles[str(name)] | {"marker": None, "label": name}

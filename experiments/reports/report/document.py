@@ -155,7 +155,6 @@ def verdicts_and_places(data: ResultTables) -> Iterator[dict[str, Any]]:
         yield {
             "robots": f"{robot_a} – {robot_b}",
             "verdict": str(answer["verdict"]).replace("_", " "),
-            "probability": answer["probability"],
             "n_confirmed": answer["n_confirmed"],
             "n_contradicted": answer["n_contradicted"],
             "reason": answer["acceptance_reason"] or answer["refined_reason"] or answer["reason"],

@@ -364,7 +364,7 @@ _MOTIONS |= columns(">", sigma_m="sigma\nm", sigma_rad="\nrad")
 _VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
 _VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
 _VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
-_VERDICTS |= columns(".2f", probability="prob.\nright") | columns(">", time="time\nms")
+_VERDICTS |= columns(">", time="time\nms")
 
 
 def print_verdict(row: dict[str, Any]) -> None:

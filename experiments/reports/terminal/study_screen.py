@@ -3,7 +3,7 @@
 import itertools
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_RAD,
 )
 from experiments.evaluation.single_steps import filter_settings
-from experiments.reports.formatting import interval, two_digits
+from experiments.reports.formatting import two_digits
 from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
@@ -29,7 +29,7 @@ from experiments.reports.terminal.layout import (
     print_table,
 )
 from experiments.studies.independence_trial import STRATEGIES
-from experiments.studies.refusal_rates import VERDICTS, Rate, Reliability, pooled, worst
+from experiments.studies.refusal_rates import VERDICTS, Rate, pooled, worst
 from experiments.studies.sweep import Survey, SweepProgress
 from experiments.studies.sweep_tables import (
     ERRORS,
@@ -38,6 +38,7 @@ from experiments.studies.sweep_tables import (
     SweepRun,
     medians_over_runs,
 )
+from experiments.studies.verdict_guarantee import Guarantee, clean_runs_needed
 from mapfusion.align.alignment import Status
 from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
 from mapfusion.smoother.odometry_calibration import Calibration
@@ -271,17 +272,55 @@ def _hits(rate: Rate) -> str:
     return f"{rate.hits}/{rate.n}" if rate.n else "–"
 
 
-def print_reliability(found: Reliability) -> None:
-    """Print the stated probabilities beside the shares of right answers."""
-    support, wrong = found.brier_of_support, f"{found.n_wrong} of {found.n} wrong"
-    print_frame(
-        found.bins,
-        {"n": ("answers", "d"), "stated": ("stated", ".3f"), "right": ("right", ".3f")},
-        f"Probability that an answer is right ({wrong})",
-        f"calibration error {interval(*found.calibration_error, layout='.3f')}; Brier score "
-        f"{interval(*found.brier, layout='.4f')}"
-        + ("" if math.isnan(support) else f", of support alone {support:.4f}"),
+def print_guarantee(found: Guarantee) -> None:
+    """Print the shares of false runs, and the lowest threshold with a guarantee."""
+    confidence = f"{1 - found.delta:.4g}"
+    uppers = found.shares["false_runs_upper"].map("{:.2%}".format)
+    cells = [
+        (row["scenario"], row["n_runs"], row["n_false_runs"], row["upper"], _accepted(row))
+        for row in found.shares.assign(upper=uppers).to_dict("records")
+    ]
+    shown = columns(
+        ">", runs="runs", false="false\nruns", upper="at most", right="right answers\naccepted"
     )
+    note = f"at most: Clopper-Pearson, one-sided, confidence {confidence}; false: any method merges"
+    print_table([("scenario", ""), *shown.values()], cells, "Runs with a false merge", note)
+    print_lines(_guarantee_lines(found, confidence))
+
+
+def _accepted(row: Mapping[Any, Any] | pd.Series) -> str:
+    """Return the share of right answers that are accepted; a dash without any."""
+    n = int(row["n_right"])
+    return f"{row['n_right_accepted'] / n:.1%} of {n}" if n else "–"
+
+
+def _guarantee_lines(found: Guarantee, confidence: str) -> Iterator[str]:
+    """Yield the certified threshold, and what limits it, in words."""
+    aim = f"at most {found.alpha:.2%} of runs have a false merge (confidence {confidence})"
+    best, n_runs = found.certified, len(found.answers.runs)
+    if best is None:
+        needed = clean_runs_needed(found.alpha, found.delta)
+        k = int(found.thresholds["n_false_runs"].iloc[0]) if len(found.thresholds) else 0
+        why = f"{k} of {n_runs} runs are false at the highest threshold"
+        yield f"no threshold is certified: {why}; {needed} runs without a false one are needed"
+    else:
+        yield f"lowest certified align.evidence.least_ratio: {best['least_ratio']:.4g}; {aim}"
+        if best["n_right"]:
+            yield f"  right answers accepted with it: {_accepted(best)}"
+    if found.least_ratio > 1:
+        yield (
+            f"made with least_ratio {found.least_ratio:g}: lower thresholds cannot be judged; "
+            "runs with --set align.evidence.least_ratio=1 tell"
+        )
+    if n := found.answers.n_without_evidence:
+        yield f"accepted without viewing evidence, so with any threshold: {n} answers"
+    if found.answers.is_approximate:
+        yield (
+            "made by an earlier version: thresholds are compared with log10_evidence, although "
+            "maps without repetition pass with less"
+        )
+    if found.n_failed:
+        yield f"failed and not counted: {found.n_failed} runs"
 
 
 def _print_rates(

@@ -193,14 +193,14 @@ def test_a_scenario_with_the_example_and_peers(
 
 
 def assert_judged_as(estimates: pd.DataFrame, theirs: str, own: str) -> None:
-    """Methods that are refined to one motion get one verdict: status, probability, reason."""
+    """Methods that are refined to one motion get one verdict: status, reason, evidence."""
     first = estimates[estimates["repetition"] == 0].set_index("iteration")
     two = [first[first["aligner"] == name] for name in (theirs, own)]
     motion = ["refined_tx_m", "refined_ty_m", "refined_theta_rad"]
     apart = (two[0][motion] - two[1][motion]).abs().max(axis=1)
-    same = apart.index[(apart < 1e-6) & two[0]["probability"].notna()]
+    same = apart.index[(apart < 1e-6) & two[0]["log10_evidence"].notna()]
     assert len(same), f"{theirs} never agrees with {own}"
-    words, numbers = ["verdict", "acceptance_reason"], ["probability", "log10_evidence"]
+    words, numbers = ["verdict", "acceptance_reason"], ["log10_false_alarms", "log10_evidence"]
     assert two[0].loc[same, words].equals(two[1].loc[same, words])
     np.testing.assert_allclose(two[0].loc[same, numbers], two[1].loc[same, numbers], rtol=1e-4)
 

@@ -1,4 +1,4 @@
-"""Verdicts by kind of world, worked out by hand; probabilities held against their law."""
+"""Verdicts by kind of world, worked out by hand."""
 
 import math
 from dataclasses import dataclass
@@ -9,21 +9,14 @@ import pandas as pd
 import pytest
 
 from experiments.reports.figures.drawing import save_figure
-from experiments.reports.figures.study_figures import (
-    draw_refusal_kinds,
-    draw_refusal_reliability,
-    draw_refusal_roc,
-)
-from experiments.reports.terminal.study_screen import print_kinds, print_reliability
+from experiments.reports.figures.study_figures import draw_refusal_kinds, draw_refusal_roc
+from experiments.reports.terminal.study_screen import print_kinds
 from experiments.studies.refusal_rates import (
-    N_BINS,
     Rate,
-    answers_with_probability,
     by_kind,
     first_right_answers,
     of_any_method,
     pooled,
-    reliability,
     worst,
 )
 from experiments.studies.refusal_trial import crossings_of
@@ -52,7 +45,6 @@ def table(kind: str = "k", aligner: str = "ransac") -> pd.DataFrame:
     rows["accepted"] = rows["status"] == "accepted"
     rows = rows.assign(kind=kind, aligner=aligner, robot_a="R1", robot_b="R2", repeats=True)
     rows["poster_radius_m"], rows["n_inliers"], rows["log10_false_alarms"] = math.nan, 9, -5.0
-    rows["probability"] = np.where(rows["beats_chance"], 0.5, math.nan)
     return rows.assign(refined_rotation_error_rad=0.0)
 
 
@@ -127,47 +119,6 @@ def test_kinds_and_methods_stay_apart() -> None:
     assert pooled(rows[1:], "false_runs") == Rate(1, 4)
 
 
-def answers(stated: np.ndarray, right: np.ndarray, n_runs: int) -> pd.DataFrame:
-    runs = np.char.add("w-", (np.arange(len(stated)) % n_runs).astype(str))
-    rows = pd.DataFrame({"probability": stated, "world_a": runs, "world_b": runs})
-    rows["refined_translation_error_m"] = np.where(right, 0.1, 5.0)
-    rows["kind"] = np.where(np.arange(len(stated)) % 2, "a", "b")
-    rows = rows.assign(ground="common", n_common=9, accepted=True, status="accepted")
-    rows = rows.assign(refined_rotation_error_rad=0.0, beats_chance=True, n_true=30)
-    return answers_with_probability(rows.assign(log10_false_alarms=-5.0, aligner="ransac"))
-
-
-def test_a_probability_that_holds_errs_by_what_chance_gives() -> None:
-    rng = np.random.default_rng(0)
-    stated = rng.uniform(0, 1, 20_000)
-    right = rng.random(len(stated)) < stated
-    found = reliability(answers(stated, right, 200), rng)
-    assert found.calibration_error.value < 0.015
-    # E (p - y)^2 = E p (1 - p) = 1/6 for p uniform; a constant 1/2 gives 1/4
-    assert found.brier.value == pytest.approx(1 / 6, abs=0.005)
-    assert found.brier.low < 1 / 6 < found.brier.high
-    assert found.brier_of_support == pytest.approx(0.25, abs=0.005)
-    assert (found.bins["n"] == len(stated) // N_BINS).all()
-    assert ((found.bins["right_low"] < found.bins["stated"]).mean()) > 0.7
-
-
-def test_one_that_is_too_sure_errs_by_as_much() -> None:
-    rng = np.random.default_rng(1)
-    right = rng.random(5000) < 0.7
-    found = reliability(answers(np.full(5000, 0.9), right, 50), rng)
-    assert found.calibration_error.value == pytest.approx(0.9 - right.mean(), abs=1e-9)
-    assert found.n_wrong == np.count_nonzero(~right)
-
-
-def test_runs_are_resampled_whole() -> None:
-    """If all answers of a run are equal, the interval is that of the runs."""
-    rng = np.random.default_rng(2)
-    of_run = rng.random(40) < 0.5
-    rows = answers(np.full(4000, 0.5), of_run[np.arange(4000) % 40], 40)
-    share = reliability(rows, rng).bins["right_high"] - reliability(rows, rng).bins["right_low"]
-    assert share.mean() > 0.2  # 2 * 1.96 * sqrt(0.25 / 40) = 0.31; of answers 0.1 / sqrt(...)
-
-
 @dataclass(frozen=True)
 class _World:
     kind: str
@@ -200,17 +151,9 @@ def test_worlds_are_crossed_within_kinds_and_between_them() -> None:
 def test_what_is_shown_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = pd.concat([table("first"), table("second").assign(repeats=False)])
     print_kinds(by_kind(rows))
-    rng = np.random.default_rng(0)
-    stated = rng.uniform(0, 1, 300)
-    found = reliability(answers(stated, rng.random(300) < stated, 30), rng)
-    print_reliability(found)
     shown = capsys.readouterr().out
-    for word in ("first", "second", "1/2", "2/3", "calibration error", "Brier"):
+    for word in ("first", "second", "1/2", "2/3"):
         assert word in shown
-    for name, draw, data in (
-        ("kinds", draw_refusal_kinds, rows),
-        ("roc", draw_refusal_roc, rows),
-        ("reliability", draw_refusal_reliability, found),
-    ):
-        one, other = (save_figure(tmp_path / part, name, draw, data)[0] for part in "ab")
+    for name, draw in (("kinds", draw_refusal_kinds), ("roc", draw_refusal_roc)):
+        one, other = (save_figure(tmp_path / part, name, draw, rows)[0] for part in "ab")
         assert one.read_bytes() == other.read_bytes()

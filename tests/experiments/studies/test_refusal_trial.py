@@ -94,7 +94,7 @@ def rows_of(*entries: tuple) -> pd.DataFrame:
     frame = pd.DataFrame(list(entries), columns=pd.Index([*names, "log10_false_alarms"]))
     ground = frame["ground"]
     frame["aligner"] = "ransac"
-    frame["kind"], frame["repeats"], frame["probability"] = "tiny", False, math.nan
+    frame["kind"], frame["repeats"] = "tiny", False
     frame["world_a"], frame["world_b"] = "tiny-1", np.where(ground == "apart", "tiny-2", "tiny-1")
     frame["robot_a"], frame["robot_b"], frame["iteration"] = "R1", "R2", np.arange(len(frame))
     frame["status"] = np.where(frame["accepted"], "accepted", "refused")

@@ -3,20 +3,11 @@
 import numpy as np
 import pytest
 
-from experiments.studies.refusal_rates import calibration_error
-from experiments.studies.verdict_fitting import (
-    Answers,
-    fit_probability,
-    fit_rates,
-    fit_twins,
-    left_out,
-    stated,
-)
+from experiments.studies.verdict_fitting import fit_rates, fit_twins
 from mapfusion.verification import likelihood
 from mapfusion.verification.likelihood import BetaRate, Rates
 from mapfusion.verification.regions import Regions
 
-MODEL = np.array([-0.5, 1.5, -2.0])
 RIGHT = BetaRate(12.0, 2.5), BetaRate(1.8, 2.9)
 WRONG = BetaRate(1.0, 15.0), BetaRate(0.9, 16.0)
 SHARES = 0.15, 0.25, 0.6
@@ -58,40 +49,3 @@ def drawn_motions(n: int, seed: int) -> list[Regions]:
 
 def test_known_shares_are_found_without_the_regions_that_led_to_the_motions() -> None:
     assert fit_twins(drawn_motions(600, 0)) == pytest.approx(SHARES, abs=0.03)
-
-
-def drawn_answers(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw features (n, 2) and outcomes (n,) of `MODEL`."""
-    rng = np.random.default_rng(seed)
-    features = rng.normal([3, 0], [1, 0.5], (n, 2))
-    return features, (rng.random(n) < stated(MODEL, features)).astype(float)
-
-
-def test_known_coefficients_are_found() -> None:
-    assert fit_probability(*drawn_answers(40_000, 0)) == pytest.approx(MODEL, abs=0.3)
-
-
-def test_the_true_model_is_calibrated_and_half_of_its_probability_is_not() -> None:
-    features, right = drawn_answers(40_000, 1)
-    p = stated(MODEL, features)
-    assert calibration_error(p, right) < 0.02
-    assert calibration_error(p / 2, right) > 0.1
-
-
-def test_a_kind_left_out_is_predicted_from_the_others() -> None:
-    features, right = drawn_answers(4000, 2)
-    kind = np.array(["a", "b"])[np.arange(4000) % 2]
-    p = left_out(Answers(features, right, kind))
-    of_b = fit_probability(features[kind == "b"], right[kind == "b"])
-    np.testing.assert_allclose(p[kind == "a"], stated(of_b, features[kind == "a"]))
-
-
-def test_units_and_origin_of_a_feature_do_not_change_the_probability() -> None:
-    """In thousandths of the unit a weight is a thousandth; the probability stays the same."""
-    features, right = drawn_answers(2000, 3)
-    in_mm = 1e3 * (features + np.array([5.0, -2.0]))
-    one, other = fit_probability(features, right), fit_probability(in_mm, right)
-    np.testing.assert_allclose(1e3 * other[1:], one[1:], rtol=1e-3)
-    np.testing.assert_allclose(stated(other, in_mm), stated(one, features), atol=1e-4)
-    # the intercept makes the mean probability that of the answers
-    assert stated(other, in_mm).mean() == pytest.approx(right.mean(), abs=1e-3)

@@ -43,15 +43,6 @@ def test_common_ground_is_accepted_with_evidence() -> None:
     assert said.log10_evidence > 1.5
 
 
-def test_what_is_likelier_wrong_is_not_accepted_whatever_else_speaks_for_it() -> None:
-    said, _ = verdict(A, B)
-    bound = {"least_probability": min(1.0, said.probability + 1e-6)}
-    asked, _ = verdict(A, B, Verifier(evidence=EvidenceParameters(**bound)))
-    assert asked.status is Status.AMBIGUOUS
-    assert f"probability {said.probability:.2g}" in asked.reason
-    assert asked.log10_evidence == said.log10_evidence
-
-
 @pytest.mark.parametrize(("log10_by_chance", "status"), [(4.0, "accepted"), (-0.5, "ambiguous")])
 def test_a_rival_is_more_than_chance_by_pairs_and_regions_together(
     log10_by_chance: float, status: str
@@ -96,6 +87,35 @@ def test_the_best_of_more_motions_needs_more_evidence(n_others: int, status: str
     assert ("too few beside" in answer.reason) == (status == "ambiguous")
 
 
+@pytest.mark.parametrize("rivalled", [False, True])
+def test_the_ratio_passed_is_the_largest_that_accepts(rivalled: bool) -> None:
+    """Without repetition and rivals any ratio is passed; with another motion, half the evidence."""
+    pairs, (said, refined) = match(A, B), verdict(A, B)
+    sought = Registration(Clique()).on(A, B, pairs)
+    assert sought.verifier is not None
+    known = sought.verifier.evidence
+    assert known is not None
+    assert said.log10_ratio_passed == math.inf
+    if rivalled:
+        none = RepeatedLandmarks.none(len(A), len(B))
+        away = refined.T_a_b + np.array([0.0, 30.0, 0.0])
+        rival = RivalMotion(BETWEEN, away, -5.0, 9, 0, 3, 3, -4.0, none)
+        known = replace(known, motions=(*known.motions, rival))
+
+    def judged(log10_ratio: float) -> Verdict:
+        asked = Verifier(evidence=EvidenceParameters(least_ratio=10**log10_ratio))
+        registration = Registration(Clique(), verifier=asked).on(A, B, pairs, known)
+        return registration.register(np.random.default_rng(0)).verdict
+
+    if not rivalled:
+        assert judged(12.0).accepted
+        return
+    passed = judged(0.0).log10_ratio_passed
+    assert passed == pytest.approx(said.log10_evidence - np.log10(2))
+    assert judged(passed - 1e-6).accepted
+    assert not judged(passed + 1e-6).accepted
+
+
 def walls_with_one_picture(first_x: float, last_x: float) -> tuple[Wall, Wall]:
     """Two walls share one texture only."""
     first, second = Wall(16, seed=1), Wall(16, seed=8)
@@ -109,8 +129,7 @@ def walls_with_one_picture(first_x: float, last_x: float) -> tuple[Wall, Wall]:
 def test_what_is_missing_makes_doubt_though_nothing_repeats() -> None:
     """A texture covers several regions, one of which led to the motion; as many are missing."""
     first, second = walls_with_one_picture(4, 8)
-    anyhow = Verifier(evidence=EvidenceParameters(least_probability=0.0))
-    said, _ = verdict(mapped(first, 4, 12, seed=4), mapped(second, 4, 12, seed=5), anyhow)
+    said, _ = verdict(mapped(first, 4, 12, seed=4), mapped(second, 4, 12, seed=5))
     assert said.status is Status.AMBIGUOUS
     assert (said.n_confirmed, said.n_contradicted) == (3, 2)
     assert "beside the one that led to it they speak against it" in said.reason

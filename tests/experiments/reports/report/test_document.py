@@ -178,7 +178,8 @@ def test_verdicts_and_places_are_of_the_last_maps(trio_result: Path) -> None:
     assert [each["robots"] for each in found] == ["R1 – R2", "R1 – R3", "R2 – R3"]
     last = estimates[estimates["iteration"] == estimates["iteration"].max()]
     ransac = last[(last["aligner"] == "ransac") & (last["repetition"] == 0)]
-    assert [each["probability"] for each in found] == ransac["probability"].tolist()
+    counts = [each["n_confirmed"] for each in found]
+    assert counts == ransac["n_confirmed"].tolist()
     for each in found:
         a, b = each["robots"].split(" – ")
         own = rivals[(rivals["robot_a"] == a) & (rivals["robot_b"] == b) & (rivals["of"] == "a b")]

@@ -1,0 +1,250 @@
+"""Finite-sample guarantee of verdicts: share of runs with a false merge, with a confidence.
+
+The unit is a run, i.e. a scenario with a seed. A run is false if any accepted alignment of any
+method, of the filter's maps or of the smoothed maps, is a false merge. Of n independent runs k are
+false, and the upper bound of their share is the one of Clopper and Pearson (1934).
+
+A higher `align.evidence.least_ratio` accepts less. Runs with a low one tell which alignments each
+higher one would accept (column `log10_ratio_passed`). The lowest ratio with a guarantee is found by
+fixed-sequence testing (Angelopoulos et al. 2021, "Learn then test", section 4): candidates are
+tested in a fixed order, the highest first, until one fails. The probability of certifying a
+candidate whose share of false runs is above alpha is then at most delta, without a correction for
+the number of candidates.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.special import betaincinv
+
+from experiments.evaluation.criteria import (
+    ORACLE,
+    RUN_KEYS,
+    is_false_merge,
+    mergeable,
+    right_refined,
+)
+from experiments.evaluation.tables import UNKNOWN, read_scenario
+from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields
+from experiments.studies.run_tables import Runs
+from mapfusion.errors import InputError
+from mapfusion.files import schema
+from mapfusion.geometry.numerics import Float
+from mapfusion.verification.regions import EvidenceParameters
+
+_SETTING = "align.evidence.least_ratio"
+_PASSED, _EVIDENCE = "log10_ratio_passed", "log10_evidence"
+_TABLES = ("errors", "smoothed_errors")
+_ERRORS = ("refined_translation_error_m", "refined_rotation_error_rad")
+_COLUMNS = ("aligner", "accepted", *_ERRORS, "n_true", "n_common", _EVIDENCE)
+# Candidates, log10: fixed before the runs are seen. At the highest, no answer by chance is left
+# according to the model of the regions; a step is a factor of 1.26, finer than runs can tell apart.
+CANDIDATES = tuple(step / 10 for step in range(60, -1, -1))
+TOTAL = "all scenarios"
+
+# One row for each scenario, and one for all.
+SHARES = schema(
+    "verdicts.shares",
+    1,
+    fields(
+        scenario=TEXT,
+        n_runs=INT,
+        n_false_runs=INT,
+        false_runs_upper=FLOAT,  # one-sided bound of the share of false runs
+        n_right=INT,  # right answers of all methods on mergeable pairs of maps
+        n_right_accepted=INT,
+    ),
+)
+# One row for each candidate, the highest first.
+THRESHOLDS = schema(
+    "verdicts.thresholds",
+    1,
+    fields(
+        least_ratio=FLOAT,
+        n_runs=INT,
+        n_false_runs=INT,
+        false_runs_upper=FLOAT,
+        certified=BOOL,
+        n_right=INT,
+        n_right_accepted=INT,
+    ),
+)
+
+
+def upper_bound(k: int, n: int, delta: float) -> float:
+    """Return the one-sided Clopper-Pearson upper bound of a share, for k of n, at 1 - delta.
+
+    It is the share p at which k or fewer of n have the probability delta, a quantile of the beta
+    distribution with parameters k + 1 and n - k.
+    """
+    return 1.0 if k >= n else float(betaincinv(k + 1, n - k, 1 - delta))
+
+
+def clean_runs_needed(alpha: float, delta: float) -> int:
+    """Return the least n at which no false run of n has an upper bound of at most alpha."""
+    return math.ceil(math.log(delta) / math.log1p(-alpha))
+
+
+def lowest_certified(n_false: Sequence[int], n: int, alpha: float, delta: float) -> int | None:
+    """Return the place of the last candidate that fixed-sequence testing certifies; None if none.
+
+    Args:
+        n_false: number of false runs with each candidate, in the order of the tests.
+        n: number of runs.
+        alpha: largest share of false runs.
+        delta: largest probability of certifying a candidate with a larger share.
+    """
+    last = None
+    for place, k in enumerate(n_false):
+        if upper_bound(k, n, delta) > alpha:
+            break
+        last = place
+    return last
+
+
+class Answers(NamedTuple):
+    """Accepted false answers, and right answers, of runs.
+
+    Attributes:
+        runs: RUN_KEYS, n_right, n_right_accepted, and `false_passes`: log10 of the largest
+            `least_ratio` that a false answer passes; -inf without one.
+        right_passes: the same ratio of each right answer; -inf of those that are not accepted.
+        n_without_evidence: number of accepted answers that pass every ratio without evidence.
+        is_approximate: True if a table lacks `log10_ratio_passed`.
+    """
+
+    runs: pd.DataFrame
+    right_passes: Float
+    n_without_evidence: int
+    is_approximate: bool
+
+
+def read_answers(runs: Runs) -> Answers:
+    """Read the answers of all methods apart from the oracle.
+
+    Raises:
+        InputError: the truth of a run is unknown, or a scenario and seed occur in several runs.
+    """
+    parts, right_passes, n_without_evidence, is_approximate = [], [], 0, False
+    for table in filter(runs.has, _TABLES):
+        for rows in runs.batches(table, _COLUMNS, (_PASSED,)):
+            rows = rows[rows["aligner"] != ORACLE]
+            if len(unknown := rows[rows["n_common"] == UNKNOWN]):
+                run_id = unknown["run_id"].iloc[0]
+                raise InputError(f"run {run_id}: no truth is known, so false merges are not either")
+            accepted = rows["accepted"] == 1
+            n_without_evidence += int((accepted & rows[_EVIDENCE].isna()).sum())
+            lacks = rows[_PASSED].isna() & rows[_EVIDENCE].notna()
+            is_approximate |= bool(lacks.any())
+            # an answer without evidence is accepted with any least_ratio
+            passes = (
+                rows[_PASSED].fillna(rows[_EVIDENCE]).fillna(math.inf).where(accepted, -math.inf)
+            )
+            right = rows.index.isin(mergeable(rows).index) & right_refined(rows)
+            right_passes.append(passes[right].to_numpy(float))
+            columns = {
+                "n_right": right.astype(int),
+                "n_right_accepted": (right & accepted).astype(int),
+                "false_passes": passes.where(is_false_merge(rows), -math.inf),
+            }
+            groups = rows[list(RUN_KEYS)].assign(**columns).groupby(list(RUN_KEYS), sort=False)
+            parts.append(_of_runs(groups))
+    if not parts:
+        raise InputError("no table errors in these results (expected those of `run` or `sweep`)")
+    joined = pd.concat(parts).groupby(list(RUN_KEYS), sort=False)
+    found = _of_runs(joined).sort_values(["scenario", "seed"], ignore_index=True)
+    again = found[found.duplicated(["scenario", "seed"])]
+    if len(again):
+        name, seed = again[["scenario", "seed"]].iloc[0]
+        what = "occurs in several runs, which are not independent; give those of one setting"
+        raise InputError(f"scenario {name}, seed {seed}: {what}")
+    return Answers(found, np.concatenate(right_passes), n_without_evidence, is_approximate)
+
+
+def _of_runs(groups: "pd.api.typing.DataFrameGroupBy") -> pd.DataFrame:
+    sums = {name: (name, "sum") for name in ("n_right", "n_right_accepted")}
+    return groups.agg(**sums, false_passes=("false_passes", "max")).reset_index()
+
+
+def least_ratio_of(runs: Runs) -> float:
+    """Return the largest `least_ratio` of the runs; the default if a sweep does not state it."""
+    default = EvidenceParameters().least_ratio
+    stated = [default]
+    if _SETTING in runs.described:
+        stated = runs.described[_SETTING].dropna().astype(float).tolist()
+    elif runs.results and not runs.sweeps:
+        stated = []
+    for result in runs.results:
+        settings = read_scenario(result.path / "scenario.json")
+        stated.append(settings["align"].get("evidence", {}).get("least_ratio", default))
+    return max(stated)
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """Shares of false runs, and the thresholds that are certified.
+
+    Attributes:
+        alpha: largest share of runs with a false merge.
+        delta: one minus the confidence.
+        shares: rows of SHARES.
+        thresholds: rows of THRESHOLDS.
+        least_ratio: that of the runs; lower thresholds cannot be judged.
+        answers: what the rows were computed from.
+        n_failed: number of runs that failed and are not counted.
+    """
+
+    alpha: float
+    delta: float
+    shares: pd.DataFrame
+    thresholds: pd.DataFrame
+    least_ratio: float
+    answers: Answers
+    n_failed: int
+
+    @property
+    def certified(self) -> pd.Series | None:
+        """Row of the lowest certified threshold; None if there is none."""
+        rows = self.thresholds[self.thresholds["certified"]]
+        return rows.iloc[-1] if len(rows) else None
+
+
+def guarantee(runs: Runs, alpha: float, delta: float) -> Guarantee:
+    """Compute the upper bounds of the shares of false runs, and the certified thresholds."""
+    answers, least_ratio = read_answers(runs), least_ratio_of(runs)
+    of_runs = answers.runs
+    groups = [(str(name), own) for name, own in of_runs.groupby("scenario")]
+    shares = [_share(name, own, delta) for name, own in [*groups, (TOTAL, of_runs)]]
+    # thresholds below the one in use would accept answers that these runs refused
+    judged = [t for t in CANDIDATES if t >= math.log10(least_ratio) - 1e-9]
+    passes, n = of_runs["false_passes"].to_numpy(float), len(of_runs)
+    n_false = [int(np.count_nonzero(passes >= t)) for t in judged]
+    last = lowest_certified(n_false, n, alpha, delta)
+    thresholds = [
+        {
+            "least_ratio": 10.0**t,
+            "n_runs": n,
+            "n_false_runs": k,
+            "false_runs_upper": upper_bound(k, n, delta),
+            "certified": last is not None and place <= last,
+            "n_right": len(answers.right_passes),
+            "n_right_accepted": int(np.count_nonzero(answers.right_passes >= t)),
+        }
+        for place, (t, k) in enumerate(zip(judged, n_false, strict=True))
+    ]
+    of_thresholds = pd.DataFrame(thresholds, columns=pd.Index(THRESHOLDS.names))
+    n_failed = len(runs.failed)
+    parts = (pd.DataFrame(shares), of_thresholds, least_ratio, answers, n_failed)
+    return Guarantee(alpha, delta, *parts)
+
+
+def _share(name: str, own: pd.DataFrame, delta: float) -> dict[str, Any]:
+    """Return the row of SHARES of some runs."""
+    n, k = len(own), int(np.count_nonzero(own["false_passes"] > -math.inf))
+    row = {"scenario": name, "n_runs": n, "n_false_runs": k}
+    row |= {"false_runs_upper": upper_bound(k, n, delta)}
+    return row | {each: int(own[each].sum()) for each in ("n_right", "n_right_accepted")}
