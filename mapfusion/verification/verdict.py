@@ -62,6 +62,8 @@ def landmark_sigma_m(T_a_b: Float, covariance: Float, p_b: Float) -> float:
 N_RIVALS, N_SELF_MOTIONS = 4, 3  # motions searched between two maps, and of each map onto itself
 # Significance of the test that an alignment has more supporters of its own than a rival.
 _EQUAL = 0.01
+# Regions of the grid that a copy of the size of one region may touch along an axis.
+_TOUCHED = 2
 # Size of the residuals in stated sigmas from which on a verdict says it. Chance does not reach it
 # with the fewest pairs that pass the test against chance.
 _OVERCONFIDENT = 3.0
@@ -431,7 +433,7 @@ class PairVerifier:
             return passed
         if ratio < 0 and regions.n_contradicted:
             return passed
-        if regions.n_confirmed <= 1 and self._extent_m(alignment) < evidence.region_m:
+        if self._extent_m(alignment) < _TOUCHED * evidence.region_m:
             return max(passed, regions.log10_ratio(evidence.shares))
         return math.inf
 
@@ -464,8 +466,8 @@ class PairVerifier:
         # for doubt if the regions, without the one that led to the motion, do not favour it.
         if ratio < 0 < regions.n_contradicted:
             return "{told}; beside the one that led to it they speak against it"
-        what = f"all that agrees lies within {evidence.region_m:.2g} m"
-        return f"{what} and could hang elsewhere too; no other region confirms it"
+        what = f"all that agrees lies within {_TOUCHED * evidence.region_m:.2g} m"
+        return f"{what} and could be a copy; too few regions around confirm it"
 
     def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
         """Return the rivals that differ from a motion."""
