@@ -134,7 +134,9 @@ def _draw_error_curves(data: ResultTables, quantity: str, label: str) -> tuple[F
     errors = errors[pd.MultiIndex.from_frame(errors[["robot_a", "robot_b"]]).isin(pairs)]
     bands = error_bands(errors)
     kinds = {"as estimated": (bands, quantity), "refined": (bands, f"refined_{quantity}")}
-    if len(smoothed := data.rows("smoothed_errors")):
+    smoothed = data.rows("smoothed_errors")
+    smoothed = smoothed[pd.MultiIndex.from_frame(smoothed[["robot_a", "robot_b"]]).isin(pairs)]
+    if len(smoothed):
         kinds["refined, smoothed maps"] = (error_bands(smoothed), f"refined_{quantity}")
     ends = ("_low", "", "_high")
     parts = [own[f"{column}{end}"].to_numpy() for own, column in kinds.values() for end in ends]

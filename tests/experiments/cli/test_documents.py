@@ -138,6 +138,7 @@ def test_statistics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "smoother",
         "fusers",
         "fusion",
+        "smoothed_errors",
     ]
     assert found["missing_tables"] == unknown
     rows = found["tables"]["error_over_oracle"]

@@ -33,7 +33,7 @@ fuse: {every: 40}
 """
 NEED_THE_TRUTH = {"errors", "fusion", "true_pairs", "path_statistics", "map_fits", "landmark_nees"}
 SOUND = {"tracks", "findings"}  # of logs without pictures that agree with themselves
-NEED_THE_TRUTH |= {"team", "team_pairs", "fusers", "fuser_coverage"}
+NEED_THE_TRUTH |= {"team", "team_pairs", "fusers", "fuser_coverage", "smoothed_errors"}
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ def test_every_file_of_a_run_is_told(
 def test_kind_version_rows_and_columns_are_those_of_the_table(tiny_result: Path) -> None:
     path = tables.table_path(tiny_result, "errors")
     rows, found = tables.read(path, "errors"), contents_of(path)
-    assert (found.kind, found.facts["schema_version"]) == ("result.errors", "5")
+    assert (found.kind, found.facts["schema_version"]) == ("result.errors", "6")
     assert found.facts["rows"] == len(rows)
     assert [name for name, _ in found.columns] == ["column", "type", "unit"]
     told = {name: (kind, unit) for name, kind, unit in found.rows}

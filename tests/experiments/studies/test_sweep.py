@@ -595,6 +595,7 @@ def greeting(address: str, context: ssl.SSLContext | None) -> bytes:
 
 
 def test_nobody_without_the_credentials_speaks_with_the_cluster(client: Client) -> None:
+    client.wait_for_workers(2, timeout=120)  # another test may have killed one
     speaking, places = listening(client)
     assert {host for host, _ in places} == {"127.0.0.1"}
     assert len(places) > len(speaking) >= 5  # the rest are web servers

@@ -67,7 +67,8 @@ def test_smoothing_runs_on_one_thread(monkeypatch):
 
 def test_joint_fusion_runs_on_one_thread(monkeypatch):
     monkeypatch.setattr(mapfusion.fusion.joint, "cluster_landmarks", reached)
-    component: Any = SimpleNamespace(planar=False, drift_sigma_m=[], members=[], maps=[], pairs=[])
+    sigma: dict[str, Any] = {"drift_sigma_m": [], "height_sigma_m": []}
+    component: Any = SimpleNamespace(planar=False, members=[], maps=[], pairs=[], **sigma)
     with threadpool_limits(2, user_api="blas"), pytest.raises(ReachedError) as found:
         mapfusion.fusion.joint.JointFuser().fuse(component, MergeParameters())
     assert set(found.value.args[0]) == {1}
