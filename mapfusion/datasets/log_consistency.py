@@ -2,6 +2,8 @@
 
 - Odometry or truth that contradicts the observed motion in most of a log (`disagreement`) gives a
   finding with the likely cause.
+- Such odometry may be sound, and noisier than stated (`odometry_noise`): it agrees with observed
+  motions that exceed the larger noise.
 - Single increments of the odometry that contradict the observations are jumps (`find_jumps`). The
   rest of such a log is sound: `without_jumps` replaces these increments by the observed motion.
 - `outside_gate` counts the observations outside the gate of the landmark that they are known to
@@ -25,6 +27,7 @@ from mapfusion.datasets.motion_agreement import (
     odometry_mistakes,
     pose_mistakes,
 )
+from mapfusion.datasets.odometry_noise import UNKNOWN, OdometryNoise, estimate_odometry_noise
 from mapfusion.datasets.relative_motion import PLANAR, Motions, observed_spans
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float, chi_square_bound
@@ -52,7 +55,7 @@ class Finding(NamedTuple):
     """Contradiction within a log.
 
     Attributes:
-        kind: "odometry", "truth", "jump" or "gate".
+        kind: "odometry", "truth", "jump", "noise" or "gate".
         frame: frame of a jump, else -1.
         text: one line without the robot's name.
     """
@@ -123,6 +126,16 @@ def disagreement(
     cause = likely_cause(spans[most], mistakes, stated.noise)
     text = f"{subject} in most frames (agreement of {', '.join(shown)}; 1 is full): {cause}"
     return Finding(kind, -1, text)
+
+
+def _agrees(spans: Sequence[Motions], stated: Stated) -> bool:
+    """Return True if shifts and rotations agree in most spans, and enough motions are known."""
+    comparisons = [compare(observed, stated) for observed in spans]
+    for name, limit in MIN_AGREEMENT.items():
+        medians = [found.median for found in (getattr(c, name) for c in comparisons) if found.known]
+        if 2 * sum(median >= limit for median in medians) <= len(medians):
+            return False
+    return True
 
 
 def truth_finding(reference: str, spans: Sequence[Motions], poses: Float) -> Finding | None:
@@ -214,12 +227,12 @@ class LogConsistency(NamedTuple):
     Attributes:
         findings: contradictions; empty for a sound log.
         jumps: single increments that are not used.
-        observed: observed motions over spans of several lengths.
+        noise: noise of the odometry; unknown if the odometry as a whole is wrong.
     """
 
     findings: tuple[Finding, ...]
     jumps: tuple[Jump, ...]
-    observed: Sequence[Motions]
+    noise: OdometryNoise
 
 
 def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
@@ -234,10 +247,13 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
     mistakes = odometry_mistakes(log.odometry)
     subject = "the odometry contradicts the motion that the observations show"
     finding = disagreement("odometry", subject, spans, Stated(mistakes[""], noise), mistakes)
+    found = estimate_odometry_noise(log, spans, noise)
     if finding is not None:
-        return LogConsistency((finding,), (), spans)
+        noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
+        if not (noisier and _agrees(spans, noisier)):
+            return LogConsistency((finding,), (), UNKNOWN)
     jumps = tuple(find_jumps(log, spans[0], noise))
-    return LogConsistency(tuple(jump.finding for jump in jumps), jumps, spans)
+    return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found)
 
 
 def outside_gate(log: RobotLog, landmark: np.ndarray) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """Motion model: odometry noise and sampling of poses (eq. 3)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -71,6 +71,30 @@ class MotionNoise:
         )
         variance = np.array([along, across, rotation])
         return np.sqrt(variance + self._floor**2)
+
+    def scaled(self, factor: float) -> "MotionNoise":
+        """Return the noise whose standard deviations are `factor` times as large.
+
+        The random walks of the result include the systematic errors.
+        """
+        if factor == 1:
+            return self
+        along = np.hypot(self.translation_m_per_sqrt_m, self.scale_error * np.sqrt(self.horizon_m))
+        turned = np.hypot(
+            self.rotation_rad_per_sqrt_rad, self.track_error * np.sqrt(self.horizon_rad)
+        )
+        return replace(
+            self,
+            translation_m_per_sqrt_m=factor * float(along),
+            rotation_rad_per_sqrt_m=factor * self.rotation_rad_per_sqrt_m,
+            rotation_rad_per_sqrt_rad=factor * float(turned),
+            scale_error=0.0,
+            track_error=0.0,
+            lateral_m_per_sqrt_m=factor * self.lateral_m_per_sqrt_m,
+            lateral_slip_m_per_rad=factor * self.lateral_slip_m_per_rad,
+            floor_m=factor * self.floor_m,
+            floor_rad=factor * self.floor_rad,
+        )
 
     def with_floor(self, covariance: Float) -> Float:
         """Return the standard deviations (3,) of a known covariance (3, 3) plus the floor."""

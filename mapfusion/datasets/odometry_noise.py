@@ -1,0 +1,165 @@
+"""Factor by which the odometry of a log is noisier than stated, from the observed motions.
+
+The difference r of an odometry motion and the observed motion over the same span of frames has the
+covariance S + f^2 C, with the covariance S of the observed motion, the stated covariance C of the
+odometry, and the unknown factor f on the odometry's standard deviations. Half of the squared
+distances
+
+    r' (S + f^2 C)^-1 r
+
+exceed the median of the chi-square distribution. The factor is the f at which their median equals
+it. So half of the motions may be outliers, such as false links or wheels that spin. At f = 1 the
+number of larger squared distances is binomial with probability 1/2, whatever the other half is
+(sign test). The sign test decides whether the stated noise is too small.
+
+Only the distances ahead and the rotations are compared, because wheels do not measure the motion
+across. Only spans count in which the observed motion is more accurate than the odometry, so
+covariances of observations that are too large or too small have little effect. Errors of
+observations and of clocks do not grow with the length of a span. Spans of several lengths are
+therefore compared, and the smallest factor counts.
+"""
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from mapfusion.datasets.relative_motion import PLANAR, Motions
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.se2 import compose, rotation, wrap
+from mapfusion.robot_log import RobotLog
+
+_MEASURED = [0, 2]  # of x, y and the rotation: what wheels measure
+# Probability of a larger noise for a log whose odometry is as noisy as stated.
+_FALSE_ALARM = 0.01
+# Largest factor that is ignored. It is small, because the stated noise includes systematic errors
+# (`MotionNoise`), which hardly show over a few frames.
+_IGNORED_FACTOR = 1.2
+# Number of motions that the factor of a span length needs. Its relative standard error is
+# 0.72 / sqrt(n) for normal errors of two coordinates, or 0.11.
+_LEAST_MOTIONS = 40
+
+
+class NoiseSource(StrEnum):
+    """Odometry noise of the filter and the smoother."""
+
+    FROM_LOG = "from_log"  # the larger one of the stated and the estimated noise
+    STATED = "stated"
+
+
+class OdometryNoise(NamedTuple):
+    """Noise of a log's odometry, relative to the stated noise.
+
+    Attributes:
+        factor: estimated factor on the stated standard deviations; NaN if unknown.
+        is_larger: true if the noise is larger than stated.
+        stated: medians of the stated standard deviations of the increments, in m and rad.
+    """
+
+    factor: float
+    is_larger: bool
+    stated: Float
+
+    @property
+    def text(self) -> str:
+        """One line with the estimated and the stated noise."""
+        stated, found = (
+            "{:.2g} m and {:.2g} rad".format(*k * self.stated) for k in (1, self.factor)
+        )
+        what = f"odometry is {self.factor:.1f} times as noisy as stated"
+        return f"{what}: {found} a frame, stated are {stated}"
+
+
+UNKNOWN = OdometryNoise(np.nan, False, np.full(2, np.nan))
+
+
+def estimate_odometry_noise(
+    log: RobotLog, spans: Sequence[Motions], noise: MotionNoise
+) -> OdometryNoise:
+    """Compare the odometry's noise with the stated one.
+
+    Args:
+        log: log whose odometry is independent of its observations.
+        spans: observed motions over spans of several lengths (`observed_spans`).
+        noise: stated noise of the odometry.
+
+    Returns:
+        The factor; it is unknown if fewer than `_LEAST_MOTIONS` observed motions of each length
+        are more accurate than the odometry.
+    """
+    sigma = np.array([noise.standard_deviations(each) for each in log.odometry]).reshape(-1, 3)
+    factors, exceeds = list[float](), False
+    for observed in spans:
+        off, S, C = _differences(log.odometry, sigma, observed)
+        is_accurate = np.all(_diagonal(S) < _diagonal(C), axis=1)
+        off, S, C = off[is_accurate], S[is_accurate], C[is_accurate]
+        if len(off) < _LEAST_MOTIONS:
+            continue
+        if not factors:  # the shortest spans are the most
+            exceeds = _exceeds_stated(off, S + C)
+            moved = sigma[observed.end[is_accurate]][:, _MEASURED]
+            stated = np.median(moved, axis=0)
+        factors.append(_factor(off, S, C))
+    if not factors:
+        return UNKNOWN
+    factor = min(factors)
+    return OdometryNoise(factor, exceeds and factor > _IGNORED_FACTOR, stated)
+
+
+def _differences(odometry: Float, sigma: Float, observed: Motions) -> tuple[Float, Float, Float]:
+    """Return the differences (N, 2) from observed motions, and the covariances S and C (N, 2, 2).
+
+    The covariance of an odometry motion is propagated to first order from frame to frame.
+    """
+    n = len(observed.start)
+    T, C = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    for k in range(1, int(np.max(observed.end - observed.start, initial=0)) + 1):
+        frame = observed.start + k
+        R = np.tile(np.eye(3), (n, 1, 1))
+        R[:, :2, :2] = rotation(T[:, 2])
+        moved = compose(T, odometry[frame])
+        by_heading = np.tile(np.eye(3), (n, 1, 1))
+        by_heading[:, 0, 2], by_heading[:, 1, 2] = T[:, 1] - moved[:, 1], moved[:, 0] - T[:, 0]
+        C = by_heading @ C @ np.swapaxes(by_heading, 1, 2)
+        C += (R * sigma[frame, None] ** 2) @ np.swapaxes(R, 1, 2)
+        T = moved
+    off = observed.motion[:, PLANAR] - T
+    off[:, 2] = wrap(off[:, 2])
+    S, measured = (
+        observed.covariance[:, PLANAR][:, :, PLANAR],
+        np.ix_(range(n), _MEASURED, _MEASURED),
+    )
+    return off[:, _MEASURED], S[measured], C[measured]
+
+
+def _diagonal(covariance: Float) -> Float:
+    return np.diagonal(covariance, axis1=1, axis2=2)
+
+
+def _squared_distances(off: Float, covariance: Float) -> Float:
+    return np.sum(off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0], axis=1)
+
+
+_MEDIAN = chi_square_bound(0.5, len(_MEASURED))
+
+
+def _exceeds_stated(off: Float, covariance: Float) -> bool:
+    """Return True if more squared distances than by chance exceed the median (sign test)."""
+    n_larger = int(np.count_nonzero(_squared_distances(off, covariance) > _MEDIAN))
+    return n_larger > 0 and float(scipy.special.bdtrc(n_larger - 1, len(off), 0.5)) < _FALSE_ALARM
+
+
+def _factor(off: Float, S: Float, C: Float) -> float:
+    """Return the factor f at which the median of the squared distances is that of chi-square."""
+
+    def excess(factor: float) -> float:
+        return float(np.median(_squared_distances(off, S + factor**2 * C))) - _MEDIAN
+
+    # Without S the distances are larger, and the factor is known.
+    largest = float(np.sqrt(np.median(_squared_distances(off, C)) / _MEDIAN))
+    if not largest > 0 or excess(0.0) <= 0:
+        return 0.0
+    return float(scipy.optimize.brentq(excess, 0.0, largest))
