@@ -66,11 +66,12 @@ class OdometryNoise(NamedTuple):
     @property
     def text(self) -> str:
         """One line with the estimated and the stated noise."""
-        stated, found = (
-            "{:.2g} m and {:.2g} rad".format(*k * self.stated) for k in (1, self.factor)
+        stated_m, stated_rad = self.stated
+        found_m, found_rad = self.factor * self.stated
+        return (
+            f"odometry is {self.factor:.1f} times as noisy as stated ({found_m:.2g} m and "
+            f"{found_rad:.2g} rad a frame; stated: {stated_m:.2g} m and {stated_rad:.2g} rad)"
         )
-        what = f"odometry is {self.factor:.1f} times as noisy as stated"
-        return f"{what}: {found} a frame, stated are {stated}"
 
 
 UNKNOWN = OdometryNoise(np.nan, False, np.full(2, np.nan))

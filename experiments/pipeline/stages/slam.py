@@ -177,10 +177,10 @@ def checked_log(
     found, factor = check_log(log, stated), 1.0
     findings, noise = found.findings, found.noise
     if odometry_covariance is None and noise.is_larger:
-        used = "the filter uses the stated noise; slam.noise: from_log uses the larger one"
+        used = "the filter uses the stated noise (slam.noise: from_log uses the larger one)"
         if source is NoiseSource.FROM_LOG:
             factor = noise.factor
-            used = "the filter uses the larger noise; slam.noise: stated keeps the stated one"
+            used = "the filter uses the larger noise (slam.noise: stated keeps slam.filter.motion)"
         findings = (*findings, Finding("noise", -1, f"{noise.text}; {used}"))
     used_log, covariance = without_jumps(log, found.jumps, odometry_covariance)
     motion = stated.scaled(factor)
