@@ -129,10 +129,8 @@ def _differences(odometry: Float, sigma: Float, observed: Motions) -> tuple[Floa
         T = moved
     off = observed.motion[:, PLANAR] - T
     off[:, 2] = wrap(off[:, 2])
-    S, measured = (
-        observed.covariance[:, PLANAR][:, :, PLANAR],
-        np.ix_(range(n), _MEASURED, _MEASURED),
-    )
+    S = observed.covariance[:, PLANAR][:, :, PLANAR]
+    measured = np.ix_(range(n), _MEASURED, _MEASURED)
     return off[:, _MEASURED], S[measured], C[measured]
 
 
