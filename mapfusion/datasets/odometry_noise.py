@@ -41,6 +41,9 @@ _IGNORED_FACTOR = 1.2
 # Number of motions that the factor of a span length needs. Its relative standard error is
 # 0.72 / sqrt(n) for normal errors of two coordinates, or 0.11.
 _LEAST_MOTIONS = 40
+# Smaller factors are zero, as a share of the factor for observations without errors. S may be zero,
+# so f must not.
+_SMALLEST_SHARE = 1e-3
 
 
 class NoiseSource(StrEnum):
@@ -157,8 +160,9 @@ def _factor(off: Float, S: Float, C: Float) -> float:
     def excess(factor: float) -> float:
         return float(np.median(_squared_distances(off, S + factor**2 * C))) - _MEDIAN
 
-    # Without S the distances are larger, and the factor is known.
+    # Without S the distances are larger, and f is known.
     largest = float(np.sqrt(np.median(_squared_distances(off, C)) / _MEDIAN))
-    if not largest > 0 or excess(0.0) <= 0:
+    smallest = _SMALLEST_SHARE * largest
+    if not smallest > 0 or excess(smallest) <= 0:
         return 0.0
-    return float(scipy.optimize.brentq(excess, 0.0, largest))
+    return float(scipy.optimize.brentq(excess, smallest, largest))

@@ -176,12 +176,18 @@ def checked_log(
     """
     found, factor = check_log(log, stated), 1.0
     findings, noise = found.findings, found.noise
-    if odometry_covariance is None and noise.is_larger:
+    if odometry_covariance is not None or any(each.kind == "odometry" for each in findings):
+        pass  # the noise is that of the observations, or the odometry has another mistake
+    elif noise.is_larger:
         used = "the filter uses the stated noise (slam.noise: from_log uses the larger one)"
         if source is NoiseSource.FROM_LOG:
             factor = noise.factor
             used = "the filter uses the larger noise (slam.noise: stated keeps slam.filter.motion)"
         findings = (*findings, Finding("noise", -1, f"{noise.text}; {used}"))
+    elif np.isnan(noise.factor) and source is NoiseSource.FROM_LOG:
+        unknown = "the observations do not show how noisy the odometry is"
+        used = "the filter uses the noise of slam.filter.motion"
+        findings = (*findings, Finding("noise", -1, f"{unknown}; {used}"))
     used_log, covariance = without_jumps(log, found.jumps, odometry_covariance)
     motion = stated.scaled(factor)
     return CheckedLog(used_log, covariance, factor, motion, findings, found.jumps)

@@ -1,0 +1,169 @@
+"""The factor of the odometry's noise against logs of known noise, and the law of its error."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapfusion.datasets.log_consistency import check_log
+from mapfusion.datasets.odometry_noise import UNKNOWN, estimate_odometry_noise
+from mapfusion.datasets.relative_motion import PLANAR, Motions
+from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import between, compose, rotation
+from mapfusion.robot_log import Observations, RobotLog
+from tests.mapfusion.contradicting_logs import JUMPS
+
+NOISE = MotionNoise()
+STEP = np.array([0.1, 0.0, 0.04])
+N_FRAMES = 320
+
+
+def path_of(odometry: Float, factor: float, rng: np.random.Generator) -> Float:
+    """Return true poses whose increments differ from the odometry by `factor` times its noise."""
+    path = np.zeros_like(odometry)
+    for k in range(1, len(path)):
+        sigma = factor * NOISE.standard_deviations(odometry[k])
+        path[k] = compose(path[k - 1], odometry[k] + sigma * rng.standard_normal(3))
+    return path
+
+
+def motions_of(path: Float, lag: int, rng: np.random.Generator, sigma: float = 1e-4) -> Motions:
+    """Return the motions over spans of frames, observed with independent errors."""
+    start = np.arange(0, len(path) - lag, lag)
+    motion, covariance = np.zeros((len(start), 6)), np.zeros((len(start), 6, 6))
+    moved = between(path[start], path[start + lag])
+    motion[:, PLANAR] = moved + sigma * rng.standard_normal(moved.shape)
+    covariance[:, PLANAR, PLANAR] = sigma**2
+    none = np.zeros(len(start), dtype=np.int64)
+    return Motions(start, start + lag, motion, covariance, none, none)
+
+
+def log_of(odometry: Float) -> RobotLog:
+    nothing = Observations(np.empty((0, 3)), np.empty((0, 3, 3)))
+    frames = np.empty(0, dtype=np.int64)
+    return RobotLog("R1", True, np.arange(len(odometry)) * 0.2, odometry, frames, nothing)
+
+
+def circling() -> Float:
+    odometry = np.tile(STEP, (N_FRAMES, 1))
+    odometry[0] = 0.0
+    return odometry
+
+
+def seen_log(factor: float, seed: int, tracks: bool = False) -> RobotLog:
+    """Return a log of a robot that circles among points, with labels or with tracks."""
+    rng = np.random.default_rng(seed)
+    odometry = circling()
+    path, sigma_m = path_of(odometry, factor, rng), 0.002
+    points = rng.uniform(-8, 8, (60, 2))
+    frames, positions, names = [], [], []
+    for k, pose in enumerate(path):
+        local = (points - pose[:2]) @ rotation(pose[2])
+        near = np.flatnonzero(np.hypot(*local.T) < 6)
+        frames += [k] * len(near)
+        positions.append(local[near] + rng.normal(0, sigma_m, (len(near), 2)))
+        names.append(near)
+    position = np.concatenate(positions)
+    name = np.concatenate(names).astype(np.int32)
+    seen = Observations(
+        np.column_stack([position, np.zeros(len(position))]),
+        np.tile(np.diag([sigma_m**2, sigma_m**2, 0.0]), (len(position), 1, 1)),
+        label=None if tracks else name,
+        track=name if tracks else None,
+    )
+    time_s = 0.2 * np.arange(len(odometry))
+    return RobotLog("R1", True, time_s, odometry, np.array(frames), seen)
+
+
+@pytest.mark.parametrize("factor", [0.5, 1, 2, 3, 5])
+@pytest.mark.parametrize("lag", [1, 4])
+def test_errors_of_the_factor_have_the_standard_error_of_a_median(factor: float, lag: int) -> None:
+    """The squared distances are exponential, so the log of their median has error 1 / ln 2 / n."""
+    odometry, ratios = circling(), []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        spans = [motions_of(path_of(odometry, factor, rng), lag, rng)]
+        ratios.append(estimate_odometry_noise(log_of(odometry), spans, NOISE).factor / factor)
+    expected = 1 / (2 * np.log(2)) / np.sqrt((N_FRAMES - 1) // lag)
+    assert np.mean(np.log(ratios)) == pytest.approx(0, abs=4 * expected / np.sqrt(60))
+    assert np.std(np.log(ratios)) == pytest.approx(expected, rel=0.35)
+
+
+@pytest.mark.parametrize("tracks", [False, True])
+@pytest.mark.parametrize("factor", [0.5, 1, 2, 3, 5])
+def test_factor_of_a_log(factor: float, tracks: bool) -> None:
+    found = check_log(seen_log(factor, 3, tracks), NOISE)
+    assert not found.findings
+    assert found.noise.factor == pytest.approx(factor, rel=0.25)
+    assert found.noise.is_larger == (factor > 1)
+
+
+def test_noise_as_stated_is_rarely_called_larger() -> None:
+    """Of 100 logs with noise as stated, at most the quantile 0.999 of the binomial law."""
+    odometry, n_larger = circling()[:90], 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        spans = [motions_of(path_of(odometry, 1.0, rng), 1, rng)]
+        n_larger += estimate_odometry_noise(log_of(odometry), spans, NOISE).is_larger
+    assert n_larger <= 5
+
+
+def test_errors_that_do_not_accumulate_count_least_over_the_longest_spans() -> None:
+    """Poses of error sigma, the noise of an increment: the factor is sqrt(1 + 2 / lag)."""
+    odometry, rng = circling(), np.random.default_rng(0)
+    path = path_of(odometry, 1.0, rng)
+    path += NOISE.standard_deviations(STEP) * [0, 0, 1] * rng.standard_normal(path.shape)
+    log, spans = log_of(odometry), [motions_of(path, lag, rng) for lag in (1, 2, 4)]
+    found = [estimate_odometry_noise(log, [span], NOISE) for span in spans]
+    assert found[0].is_larger
+    least = min(each.factor for each in found)
+    assert least == found[-1].factor < found[0].factor
+    assert estimate_odometry_noise(log, spans, NOISE).factor == least
+
+
+def test_jumps_and_false_links_do_not_change_the_factor() -> None:
+    odometry, rng = circling(), np.random.default_rng(0)
+    path = path_of(odometry, 1.0, rng)
+    spans = [motions_of(path, lag, rng) for lag in (1, 2)]
+    sound = estimate_odometry_noise(log_of(odometry), spans, NOISE).factor
+    for change, _ in JUMPS.values():
+        found = estimate_odometry_noise(log_of(change(odometry)), spans, NOISE)
+        assert found.factor == pytest.approx(sound, rel=0.05)
+    spans[0].motion[::10, 0] += 5.0
+    assert not estimate_odometry_noise(log_of(odometry), spans, NOISE).is_larger
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_logs_with_jumps(name: str) -> None:
+    log = seen_log(1.0, 3)
+    found = check_log(replace(log, odometry=JUMPS[name][0](log.odometry)), NOISE)
+    assert [finding.kind for finding in found.findings] == ["jump"] * len(JUMPS[name][1])
+    assert not found.noise.is_larger
+
+
+def test_logs_that_show_no_motion() -> None:
+    """No point is seen twice; or the observations are less accurate than the odometry."""
+    log = seen_log(3.0, 3)
+    own = np.arange(len(log.observations), dtype=np.int32)
+    found = check_log(replace(log, observations=replace(log.observations, label=own)), NOISE)
+    assert found.noise == UNKNOWN
+    odometry, rng = circling(), np.random.default_rng(0)
+    spans = [motions_of(path_of(odometry, 3.0, rng), 1, rng, sigma=0.1)]
+    assert estimate_odometry_noise(log_of(odometry), spans, NOISE) == UNKNOWN
+
+
+def test_observations_without_errors() -> None:
+    odometry, rng = circling(), np.random.default_rng(0)
+    for factor in (0.0, 2.0):
+        spans = [motions_of(path_of(odometry, factor, rng), 1, rng, sigma=0.0)]
+        found = estimate_odometry_noise(log_of(odometry), spans, NOISE)
+        assert found.factor == pytest.approx(factor, rel=0.2, abs=1e-6)
+
+
+def test_text_has_both_figures() -> None:
+    noise = check_log(seen_log(3.0, 3), NOISE).noise
+    stated_m, _, stated_rad = NOISE.standard_deviations(STEP)
+    assert f"{noise.factor:.1f} times as noisy as stated" in noise.text
+    assert f"stated: {stated_m:.2g} m and {stated_rad:.2g} rad" in noise.text
+    assert f"({noise.factor * stated_m:.2g} m and {noise.factor * stated_rad:.2g} rad" in noise.text
