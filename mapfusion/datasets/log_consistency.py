@@ -2,8 +2,8 @@
 
 - Odometry or truth that contradicts the observed motion in most of a log (`disagreement`) gives a
   finding with the likely cause.
-- Such odometry may be sound, and noisier than stated (`odometry_noise`): it agrees with observed
-  motions that exceed the larger noise.
+- Such odometry may be sound, and noisier than stated (`odometry_noise`): it agrees with the
+  observed motion on average.
 - Single increments of the odometry that contradict the observations are jumps (`find_jumps`). The
   rest of such a log is sound: `without_jumps` replaces these increments by the observed motion.
 - `outside_gate` counts the observations outside the gate of the landmark that they are known to
@@ -19,6 +19,7 @@ import numpy as np
 from mapfusion.datasets.motion_agreement import (
     FALSE_ALARM,
     MIN_AGREEMENT,
+    MIN_SIGMAS,
     ORDER_OF_QUATERNIONS,
     UPRIGHT,
     Stated,
@@ -28,7 +29,12 @@ from mapfusion.datasets.motion_agreement import (
     pose_mistakes,
 )
 from mapfusion.datasets.odometry_noise import UNKNOWN, OdometryNoise, estimate_odometry_noise
-from mapfusion.datasets.relative_motion import PLANAR, Motions, observed_spans
+from mapfusion.datasets.relative_motion import (
+    PLANAR,
+    Motions,
+    motions_of_poses,
+    observed_spans,
+)
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import wrap
@@ -128,14 +134,21 @@ def disagreement(
     return Finding(kind, -1, text)
 
 
-def _agrees(spans: Sequence[Motions], stated: Stated) -> bool:
-    """Return True if shifts and rotations agree in most spans, and enough motions are known."""
-    comparisons = [compare(observed, stated) for observed in spans]
-    for name, limit in MIN_AGREEMENT.items():
-        medians = [found.median for found in (getattr(c, name) for c in comparisons) if found.known]
-        if 2 * sum(median >= limit for median in medians) <= len(medians):
-            return False
-    return True
+def _agrees_on_average(observed: Motions, stated: Stated) -> bool:
+    """Return True if noise alone explains the differences between stated and observed motions.
+
+    Noise has the mean zero: the regression u = b m of stated motions u on observed motions m has a
+    slope b of 1. Mistakes change it. Shifts or rotations without information on b do not count.
+    """
+    sigma, slopes = stated.sigma(observed), list[tuple[float, float]]()
+    moved = motions_of_poses(stated.poses, observed.start, observed.end)
+    for axis, (u, limit) in enumerate(zip(moved, MIN_AGREEMENT.values(), strict=True)):
+        m = observed.motion[:, 3 * axis : 3 * axis + 3]
+        squares = np.sum(m**2, axis=1)
+        # The slope of u = 0 must lie outside the interval around 1.
+        if MIN_SIGMAS * np.sqrt(squares @ sigma[:, axis] ** 2) < squares.sum():
+            slopes.append((float(np.sum(m * u) / squares.sum()), limit))
+    return bool(slopes) and all(limit <= slope <= 1 / limit for slope, limit in slopes)
 
 
 def truth_finding(reference: str, spans: Sequence[Motions], poses: Float) -> Finding | None:
@@ -250,7 +263,7 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
     found = estimate_odometry_noise(log, spans, noise)
     if finding is not None:
         noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
-        if not (noisier and _agrees(spans, noisier)):
+        if not (noisier and _agrees_on_average(spans[0], noisier)):
             return LogConsistency((finding,), (), UNKNOWN)
     jumps = tuple(find_jumps(log, spans[0], noise))
     return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found)

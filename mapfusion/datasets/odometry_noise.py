@@ -9,8 +9,12 @@ distances
 
 exceed the median of the chi-square distribution. The factor is the f at which their median equals
 it. So half of the motions may be outliers, such as false links or wheels that spin. At f = 1 the
-number of larger squared distances is binomial with probability 1/2, whatever the other half is
-(sign test). The sign test decides whether the stated noise is too small.
+number of larger squared distances is binomial with probability 1/2. This sign test decides whether
+the stated noise is too small.
+
+The stated noise includes systematic errors (`MotionNoise`), which hardly show over a few frames.
+The sign test therefore uses the covariance C of all the noise, but the factor that of the random
+walks. The systematic errors are assumed to be larger by the same factor.
 
 Only the distances ahead and the rotations are compared, because wheels do not measure the motion
 across. Only spans count in which the observed motion is more accurate than the odometry, so
@@ -20,6 +24,7 @@ therefore compared, and the smallest factor counts.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -35,9 +40,11 @@ from mapfusion.robot_log import RobotLog
 _MEASURED = [0, 2]  # of x, y and the rotation: what wheels measure
 # Probability of a larger noise for a log whose odometry is as noisy as stated.
 _FALSE_ALARM = 0.01
-# Largest factor that is ignored. It is small, because the stated noise includes systematic errors
-# (`MotionNoise`), which hardly show over a few frames.
-_IGNORED_FACTOR = 1.2
+# Largest factor that is ignored; the filter is hardly less accurate with the stated noise.
+_IGNORED_FACTOR = 1.5
+# Least share of the random walks in the stated standard deviations: no factor on a random walk that
+# is zero explains a larger noise.
+_LEAST_RANDOM = 0.5
 # Number of motions that the factor of a span length needs. Its relative standard error is
 # 0.72 / sqrt(n) for normal errors of two coordinates, or 0.11.
 _LEAST_MOTIONS = 40
@@ -94,23 +101,29 @@ def estimate_odometry_noise(
         The factor; it is unknown if fewer than `_LEAST_MOTIONS` observed motions of each length
         are more accurate than the odometry.
     """
-    sigma = np.array([noise.standard_deviations(each) for each in log.odometry]).reshape(-1, 3)
+    sigma = _standard_deviations(log.odometry, noise)
+    walks = _standard_deviations(log.odometry, replace(noise, scale_error=0.0, track_error=0.0))
+    walks = np.maximum(walks, _LEAST_RANDOM * sigma)
     factors, exceeds = list[float](), False
     for observed in spans:
         off, S, C = _differences(log.odometry, sigma, observed)
         is_accurate = np.all(_diagonal(S) < _diagonal(C), axis=1)
-        off, S, C = off[is_accurate], S[is_accurate], C[is_accurate]
-        if len(off) < _LEAST_MOTIONS:
+        if np.count_nonzero(is_accurate) < _LEAST_MOTIONS:
             continue
+        off, S, C = off[is_accurate], S[is_accurate], C[is_accurate]
         if not factors:  # the shortest spans are the most
             exceeds = _exceeds_stated(off, S + C)
-            moved = sigma[observed.end[is_accurate]][:, _MEASURED]
-            stated = np.median(moved, axis=0)
-        factors.append(_factor(off, S, C))
+            stated = np.median(sigma[observed.end[is_accurate]][:, _MEASURED], axis=0)
+        _, _, C_walks = _differences(log.odometry, walks, observed)
+        factors.append(_factor(off, S, C_walks[is_accurate]))
     if not factors:
         return UNKNOWN
     factor = min(factors)
     return OdometryNoise(factor, exceeds and factor > _IGNORED_FACTOR, stated)
+
+
+def _standard_deviations(odometry: Float, noise: MotionNoise) -> Float:
+    return np.array([noise.standard_deviations(each) for each in odometry]).reshape(-1, 3)
 
 
 def _differences(odometry: Float, sigma: Float, observed: Motions) -> tuple[Float, Float, Float]:
@@ -160,9 +173,9 @@ def _factor(off: Float, S: Float, C: Float) -> float:
     def excess(factor: float) -> float:
         return float(np.median(_squared_distances(off, S + factor**2 * C))) - _MEDIAN
 
-    # Without S the distances are larger, and f is known.
+    # Without S the distances are larger, so f is at most this factor.
     largest = float(np.sqrt(np.median(_squared_distances(off, C)) / _MEDIAN))
     smallest = _SMALLEST_SHARE * largest
     if not smallest > 0 or excess(smallest) <= 0:
         return 0.0
-    return float(scipy.optimize.brentq(excess, smallest, largest))
+    return float(scipy.optimize.brentq(excess, smallest, 2 * largest))
