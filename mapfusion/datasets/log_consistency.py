@@ -28,7 +28,7 @@ from mapfusion.datasets.motion_agreement import (
     odometry_mistakes,
     pose_mistakes,
 )
-from mapfusion.datasets.odometry_noise import UNKNOWN, OdometryNoise, estimate_odometry_noise
+from mapfusion.datasets.odometry_noise import OdometryNoise, estimate_odometry_noise
 from mapfusion.datasets.relative_motion import (
     PLANAR,
     Motions,
@@ -240,7 +240,7 @@ class LogConsistency(NamedTuple):
     Attributes:
         findings: contradictions; empty for a sound log.
         jumps: single increments that are not used.
-        noise: noise of the odometry; unknown if the odometry as a whole is wrong.
+        noise: noise of the odometry; meaningless if the odometry as a whole is wrong.
     """
 
     findings: tuple[Finding, ...]
@@ -264,7 +264,7 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
     if finding is not None:
         noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
         if not (noisier and _agrees_on_average(spans[0], noisier)):
-            return LogConsistency((finding,), (), UNKNOWN)
+            return LogConsistency((finding,), (), found)
     jumps = tuple(find_jumps(log, spans[0], noise))
     return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found)
 

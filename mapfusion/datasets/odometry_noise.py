@@ -2,15 +2,17 @@
 
 The difference r of an odometry motion and the observed motion over the same span of frames has the
 covariance S + f^2 C, with the covariance S of the observed motion, the stated covariance C of the
-odometry, and the unknown factor f on the odometry's standard deviations. Half of the squared
-distances
+odometry, and the unknown factor f on the odometry's standard deviations. The squared distances
 
     r' (S + f^2 C)^-1 r
 
-exceed the median of the chi-square distribution. The factor is the f at which their median equals
-it. So half of the motions may be outliers, such as false links or wheels that spin. At f = 1 the
-number of larger squared distances is binomial with probability 1/2. This sign test decides whether
-the stated noise is too small.
+are chi-square distributed. At f = 1 the number of distances above the median is binomial with
+probability 1/2. This sign test decides whether the stated noise is too small. It is not affected
+by outliers, such as jumps and false links.
+
+The factor is the f at which a quantile of the distances equals that of the chi-square distribution.
+The larger factor by the median and by an upper quantile counts: wheels that slip have larger errors
+in some frames than normal ones, and the noise of the filter is normal.
 
 The stated noise includes systematic errors (`MotionNoise`), which hardly show over a few frames.
 The sign test therefore uses the covariance C of all the noise, but the factor that of the random
@@ -42,11 +44,12 @@ _MEASURED = [0, 2]  # of x, y and the rotation: what wheels measure
 _FALSE_ALARM = 0.01
 # Largest factor that is ignored; the filter is hardly less accurate with the stated noise.
 _IGNORED_FACTOR = 1.5
+_UPPER = 0.95  # probability; jumps and false links in a twentieth of the frames are ignored
 # Least share of the random walks in the stated standard deviations: no factor on a random walk that
 # is zero explains a larger noise.
 _LEAST_RANDOM = 0.5
-# Number of motions that the factor of a span length needs. Its relative standard error is
-# 0.72 / sqrt(n) for normal errors of two coordinates, or 0.11.
+# Number of motions that the factor of a span length needs. By either quantile the factor has the
+# relative standard error 0.72 / sqrt(n) for normal errors of two coordinates, or 0.11.
 _LEAST_MOTIONS = 40
 # Smaller factors are zero, as a share of the factor for observations without errors. S may be zero,
 # so f must not.
@@ -67,11 +70,13 @@ class OdometryNoise(NamedTuple):
         factor: estimated factor on the stated standard deviations; NaN if unknown.
         is_larger: true if the noise is larger than stated.
         stated: medians of the stated standard deviations of the increments, in m and rad.
+        n_observed: number of frames whose motion since the frame before is observed.
     """
 
     factor: float
     is_larger: bool
     stated: Float
+    n_observed: int
 
     @property
     def text(self) -> str:
@@ -82,9 +87,6 @@ class OdometryNoise(NamedTuple):
             f"odometry is {self.factor:.1f} times as noisy as stated ({found_m:.2g} m and "
             f"{found_rad:.2g} rad a frame; stated: {stated_m:.2g} m and {stated_rad:.2g} rad)"
         )
-
-
-UNKNOWN = OdometryNoise(np.nan, False, np.full(2, np.nan))
 
 
 def estimate_odometry_noise(
@@ -104,7 +106,7 @@ def estimate_odometry_noise(
     sigma = _standard_deviations(log.odometry, noise)
     walks = _standard_deviations(log.odometry, replace(noise, scale_error=0.0, track_error=0.0))
     walks = np.maximum(walks, _LEAST_RANDOM * sigma)
-    factors, exceeds = list[float](), False
+    medians, factors, exceeds, n_observed = list[float](), list[float](), False, len(spans[0].end)
     for observed in spans:
         off, S, C = _differences(log.odometry, sigma, observed)
         is_accurate = np.all(_diagonal(S) < _diagonal(C), axis=1)
@@ -115,11 +117,13 @@ def estimate_odometry_noise(
             exceeds = _exceeds_stated(off, S + C)
             stated = np.median(sigma[observed.end[is_accurate]][:, _MEASURED], axis=0)
         _, _, C_walks = _differences(log.odometry, walks, observed)
-        factors.append(_factor(off, S, C_walks[is_accurate]))
+        given = off, S, C_walks[is_accurate]
+        medians.append(_factor(*given, 0.5))
+        factors.append(max(medians[-1], _factor(*given, _UPPER)))
     if not factors:
-        return UNKNOWN
-    factor = min(factors)
-    return OdometryNoise(factor, exceeds and factor > _IGNORED_FACTOR, stated)
+        return OdometryNoise(np.nan, False, np.full(2, np.nan), n_observed)
+    is_larger = exceeds and min(medians) > _IGNORED_FACTOR
+    return OdometryNoise(min(factors), is_larger, stated, n_observed)
 
 
 def _standard_deviations(odometry: Float, noise: MotionNoise) -> Float:
@@ -158,23 +162,23 @@ def _squared_distances(off: Float, covariance: Float) -> Float:
     return np.sum(off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0], axis=1)
 
 
-_MEDIAN = chi_square_bound(0.5, len(_MEASURED))
-
-
 def _exceeds_stated(off: Float, covariance: Float) -> bool:
     """Return True if more squared distances than by chance exceed the median (sign test)."""
-    n_larger = int(np.count_nonzero(_squared_distances(off, covariance) > _MEDIAN))
+    median = chi_square_bound(0.5, len(_MEASURED))
+    n_larger = int(np.count_nonzero(_squared_distances(off, covariance) > median))
     return n_larger > 0 and float(scipy.special.bdtrc(n_larger - 1, len(off), 0.5)) < _FALSE_ALARM
 
 
-def _factor(off: Float, S: Float, C: Float) -> float:
-    """Return the factor f at which the median of the squared distances is that of chi-square."""
+def _factor(off: Float, S: Float, C: Float, probability: float) -> float:
+    """Return the factor f at which a quantile of the squared distances is that of chi-square."""
+    wanted = chi_square_bound(probability, len(_MEASURED))
 
     def excess(factor: float) -> float:
-        return float(np.median(_squared_distances(off, S + factor**2 * C))) - _MEDIAN
+        squares = _squared_distances(off, S + factor**2 * C)
+        return float(np.quantile(squares, probability)) - wanted
 
     # Without S the distances are larger, so f is at most this factor.
-    largest = float(np.sqrt(np.median(_squared_distances(off, C)) / _MEDIAN))
+    largest = float(np.sqrt(np.quantile(_squared_distances(off, C), probability) / wanted))
     smallest = _SMALLEST_SHARE * largest
     if not smallest > 0 or excess(smallest) <= 0:
         return 0.0

@@ -15,6 +15,7 @@ from experiments.scenario.seeds import generator
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.log_consistency import Finding, Jump, check_log, gate_finding, without_jumps
 from mapfusion.datasets.odometry_noise import NoiseSource
+from mapfusion.datasets.relative_motion import MIN_MOTIONS
 from mapfusion.fastslam.filter import FastSlamParameters, StepResult
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.fastslam.motion import MotionNoise
@@ -184,8 +185,8 @@ def checked_log(
             factor = noise.factor
             used = "the filter uses the larger noise (slam.noise: stated keeps slam.filter.motion)"
         findings = (*findings, Finding("noise", -1, f"{noise.text}; {used}"))
-    elif np.isnan(noise.factor) and source is NoiseSource.FROM_LOG:
-        unknown = "the observations do not show how noisy the odometry is"
+    elif noise.n_observed < MIN_MOTIONS < len(log) and source is NoiseSource.FROM_LOG:
+        unknown = "frames share no points, which would show how noisy the odometry is"
         used = "the filter uses the noise of slam.filter.motion"
         findings = (*findings, Finding("noise", -1, f"{unknown}; {used}"))
     used_log, covariance = without_jumps(log, found.jumps, odometry_covariance)
