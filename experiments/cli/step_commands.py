@@ -1,7 +1,7 @@
 """Commands that do one step on files: record, slam, align, merge."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -51,6 +51,14 @@ def slam(
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
+    noise: Annotated[
+        Literal["from_log", "stated"] | None,
+        typer.Option(
+            help="Odometry noise: enlarged if the log shows that it is larger, or as stated. "
+            "[default: slam.noise, from_log]",
+            show_default=False,
+        ),
+    ] = None,
     smooth: Annotated[
         bool, typer.Option("--smooth/--no-smooth", help="Write the smoothed map, too.")
     ] = True,
@@ -70,6 +78,7 @@ def slam(
 
     require_map_file(output, [log, scenario])
     options.announce_compilation(as_json)
+    overrides = overrides if noise is None else [*overrides, f"slam.noise={noise}"]
     settings = settings_of(scenario, overrides, seed)
     with layout.progress() as show:
         made = single.slam(log, settings, show, smooth)

@@ -42,7 +42,7 @@ from experiments.pipeline.stages.pipeline import (
     require_memory,
 )
 from experiments.pipeline.stages.robot_maps import RobotFolders, latest_at, stored_maps
-from experiments.pipeline.stages.slam import read_findings
+from experiments.pipeline.stages.slam import noise_factor, read_findings
 from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
@@ -351,7 +351,8 @@ def finding_rows(run: EvaluatedRun) -> list[dict[str, Any]]:
         poses = read_true_poses(folders.log) if recorded else None
         if poses is not None and len(poses) == len(log):
             sound = not (found["check"] == "odometry").any()
-            finding = finding_of_truth(log, poses, run.scenario.slam.filter.motion, sound)
+            motion = run.scenario.slam.filter.motion.scaled(noise_factor(folders.slam))
+            finding = finding_of_truth(log, poses, motion, sound)
             if finding is not None:
                 row = {"robot": robot.name, "check": finding.kind}
                 rows.append(row | {"iteration": finding.frame, "finding": finding.text})

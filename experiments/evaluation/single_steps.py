@@ -16,6 +16,7 @@ from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.pipeline.stages.features import render_frame
 from experiments.pipeline.stages.log import measured_odometry, measured_tilt
 from experiments.pipeline.stages.pipeline import SimulatedRobotStages, smoother_parameters
+from experiments.pipeline.stages.slam import checked_log
 from experiments.pipeline.stages.smooth import SmoothSettings, log_until, smooth_log
 from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tasks import OnProgress
@@ -28,7 +29,7 @@ from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import EXPORTERS, export_drive
-from mapfusion.datasets.log_consistency import Finding, check_log, gate_finding, without_jumps
+from mapfusion.datasets.log_consistency import Finding, gate_finding
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
@@ -121,11 +122,11 @@ def slam(
     if not len(robot_log):
         raise InputError(f"{log}: frames.parquet holds no frame")
     n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
-    checked = check_log(robot_log, settings.slam.filter.motion)
-    stated = read_odometry_covariance(log, n_frames)
-    used_log, covariance = without_jumps(robot_log, checked.jumps, stated)
+    known, stated = read_odometry_covariance(log, n_frames), settings.slam.filter
+    checked = checked_log(robot_log, known, stated.motion, settings.slam.noise)
+    used_log, covariance = checked.log, checked.odometry_covariance
     kept, min_count, last = [n_frames - 1], settings.slam.min_count, None
-    attitude, parameters = read_attitude(log, n_frames), settings.slam.filter
+    attitude, parameters = read_attitude(log, n_frames), replace(stated, motion=checked.motion)
     for frame in run_log(used_log, parameters, rng, kept, min_count, covariance, attitude):
         on_progress("FastSLAM", frame.iteration + 1, n_frames)
         last = frame
@@ -137,13 +138,14 @@ def slam(
     poses = read_true_poses(log)  # only for this check, after the map is complete
     if poses is not None and len(poses) == n_frames:
         sound = not any(finding.kind == "odometry" for finding in findings)
-        truth = finding_of_truth(robot_log, poses, settings.slam.filter.motion, sound)
+        truth = finding_of_truth(robot_log, poses, checked.motion, sound)
         findings += [] if truth is None else [truth]
     if not smoothing or not len(last.landmarks):
         return SlamResult(last.landmarks, tuple(findings))
     assert last.path is not None
+    smoother = smoother_parameters(settings)
     own = SmoothSettings(
-        replace(smoother_parameters(settings), odometry_covariance=covariance),
+        replace(smoother, motion=checked.motion, odometry_covariance=covariance),
         parameters.noise_floor_m,
         (n_frames - 1,),
         settings.smooth.max_memory_gb,

@@ -8,6 +8,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from pydantic.dataclasses import dataclass
 
 from experiments.scenario.seeds import generator
+from mapfusion.datasets.odometry_noise import NoiseSource
 from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fusion.fusers import COMPARED, target_of
 from mapfusion.geometry.numerics import Float
@@ -223,10 +224,13 @@ class Slam(Section):
 
     Attributes:
         filter: settings of the filter.
+        noise: odometry noise of filter and smoother. from_log: `filter.motion`, enlarged if the log
+            shows that its odometry is noisier; stated: `filter.motion`.
         min_count: number of sightings that a landmark in the map needs.
     """
 
     filter: FastSlamParameters = FastSlamParameters()
+    noise: NoiseSource = NoiseSource.FROM_LOG
     min_count: Annotated[int, Range(1, MAX_COUNT, "sightings")] = 3
 
 

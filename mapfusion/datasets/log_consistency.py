@@ -2,6 +2,8 @@
 
 - Odometry or truth that contradicts the observed motion in most of a log (`disagreement`) gives a
   finding with the likely cause.
+- Such odometry may be sound, and noisier than stated (`odometry_noise`): it agrees with the
+  observed motion on average.
 - Single increments of the odometry that contradict the observations are jumps (`find_jumps`). The
   rest of such a log is sound: `without_jumps` replaces these increments by the observed motion.
 - `outside_gate` counts the observations outside the gate of the landmark that they are known to
@@ -17,6 +19,7 @@ import numpy as np
 from mapfusion.datasets.motion_agreement import (
     FALSE_ALARM,
     MIN_AGREEMENT,
+    MIN_SIGMAS,
     ORDER_OF_QUATERNIONS,
     UPRIGHT,
     Stated,
@@ -25,7 +28,13 @@ from mapfusion.datasets.motion_agreement import (
     odometry_mistakes,
     pose_mistakes,
 )
-from mapfusion.datasets.relative_motion import PLANAR, Motions, observed_spans
+from mapfusion.datasets.odometry_noise import OdometryNoise, estimate_odometry_noise
+from mapfusion.datasets.relative_motion import (
+    PLANAR,
+    Motions,
+    motions_of_poses,
+    observed_spans,
+)
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import wrap
@@ -52,7 +61,7 @@ class Finding(NamedTuple):
     """Contradiction within a log.
 
     Attributes:
-        kind: "odometry", "truth", "jump" or "gate".
+        kind: "odometry", "truth", "jump", "noise" or "gate".
         frame: frame of a jump, else -1.
         text: one line without the robot's name.
     """
@@ -123,6 +132,23 @@ def disagreement(
     cause = likely_cause(spans[most], mistakes, stated.noise)
     text = f"{subject} in most frames (agreement of {', '.join(shown)}; 1 is full): {cause}"
     return Finding(kind, -1, text)
+
+
+def _agrees_on_average(observed: Motions, stated: Stated) -> bool:
+    """Return True if noise alone explains the differences between stated and observed motions.
+
+    Noise has the mean zero: the regression u = b m of stated motions u on observed motions m has a
+    slope b of 1. Mistakes change it. Shifts or rotations without information on b do not count.
+    """
+    sigma, slopes = stated.sigma(observed), list[tuple[float, float]]()
+    moved = motions_of_poses(stated.poses, observed.start, observed.end)
+    for axis, (u, limit) in enumerate(zip(moved, MIN_AGREEMENT.values(), strict=True)):
+        m = observed.motion[:, 3 * axis : 3 * axis + 3]
+        squares = np.sum(m**2, axis=1)
+        # The slope of u = 0 must lie outside the interval around 1.
+        if MIN_SIGMAS * np.sqrt(squares @ sigma[:, axis] ** 2) < squares.sum():
+            slopes.append((float(np.sum(m * u) / squares.sum()), limit))
+    return bool(slopes) and all(limit <= slope <= 1 / limit for slope, limit in slopes)
 
 
 def truth_finding(reference: str, spans: Sequence[Motions], poses: Float) -> Finding | None:
@@ -214,12 +240,12 @@ class LogConsistency(NamedTuple):
     Attributes:
         findings: contradictions; empty for a sound log.
         jumps: single increments that are not used.
-        observed: observed motions over spans of several lengths.
+        noise: noise of the odometry; meaningless if the odometry as a whole is wrong.
     """
 
     findings: tuple[Finding, ...]
     jumps: tuple[Jump, ...]
-    observed: Sequence[Motions]
+    noise: OdometryNoise
 
 
 def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
@@ -234,10 +260,13 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
     mistakes = odometry_mistakes(log.odometry)
     subject = "the odometry contradicts the motion that the observations show"
     finding = disagreement("odometry", subject, spans, Stated(mistakes[""], noise), mistakes)
+    found = estimate_odometry_noise(log, spans, noise)
     if finding is not None:
-        return LogConsistency((finding,), (), spans)
+        noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
+        if not (noisier and _agrees_on_average(spans[0], noisier)):
+            return LogConsistency((finding,), (), found)
     jumps = tuple(find_jumps(log, spans[0], noise))
-    return LogConsistency(tuple(jump.finding for jump in jumps), jumps, spans)
+    return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found)
 
 
 def outside_gate(log: RobotLog, landmark: np.ndarray) -> tuple[int, int]:

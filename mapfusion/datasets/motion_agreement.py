@@ -40,7 +40,7 @@ FALSE_ALARM = 0.01
 MIN_AGREEMENT = {"shift": 0.7, "turn": 0.5}
 # A motion counts if its observed or stated length exceeds this many standard deviations; the
 # direction of a shorter motion is dominated by noise.
-_MIN_SIGMAS = 3.0
+MIN_SIGMAS = 3.0
 # Agreement after a mistake is corrected that is nearly as good as that of a sound log.
 _EXPLAINED = 0.8
 _MAX_FRAMES_LATE = 300  # tried offsets of the clocks
@@ -101,7 +101,7 @@ def agreement(
     from scipy.special import bdtr, stdtrit
 
     lengths = np.stack([np.linalg.norm(values, axis=1) for values in (observed, stated)])
-    sure = np.isfinite(lengths).all(axis=0) & (lengths > _MIN_SIGMAS * sigma).any(axis=0)
+    sure = np.isfinite(lengths).all(axis=0) & (lengths > MIN_SIGMAS * sigma).any(axis=0)
     n = int(sure.sum())
     if not n:
         return Agreement(0, np.nan, np.inf, np.nan)

@@ -1,6 +1,6 @@
 """Motion model: odometry noise and sampling of poses (eq. 3)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -8,6 +8,9 @@ import numpy as np
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose
 from mapfusion.parameters import Range, require_in_range
+
+# Largest parameters, far above those of any odometry.
+_MOST_M, _MOST_RAD = 10_000, 10
 
 
 @dataclass(frozen=True)
@@ -40,17 +43,17 @@ class MotionNoise:
         floor_rad: added to the heading in every step, whatever the motion.
     """
 
-    translation_m_per_sqrt_m: Annotated[float, Range(0, 10_000, "m/sqrt(m)")] = 0.02
-    rotation_rad_per_sqrt_m: Annotated[float, Range(0, 10, "rad/sqrt(m)")] = 0.01
-    rotation_rad_per_sqrt_rad: Annotated[float, Range(0, 10, "rad/sqrt(rad)")] = 0.03
+    translation_m_per_sqrt_m: Annotated[float, Range(0, _MOST_M, "m/sqrt(m)")] = 0.02
+    rotation_rad_per_sqrt_m: Annotated[float, Range(0, _MOST_RAD, "rad/sqrt(m)")] = 0.01
+    rotation_rad_per_sqrt_rad: Annotated[float, Range(0, _MOST_RAD, "rad/sqrt(rad)")] = 0.03
     scale_error: Annotated[float, Range(0, 1, "1")] = 0.01
     track_error: Annotated[float, Range(0, 1, "1")] = 0.1
-    horizon_m: Annotated[float, Range(0, 10_000, "m")] = 3.0
+    horizon_m: Annotated[float, Range(0, _MOST_M, "m")] = 3.0
     horizon_rad: Annotated[float, Range(0, 1000, "rad")] = 0.2
-    lateral_m_per_sqrt_m: Annotated[float, Range(0, 10_000, "m/sqrt(m)")] = 0.005
-    lateral_slip_m_per_rad: Annotated[float, Range(0, 10_000, "m/rad")] = 0.01
-    floor_m: Annotated[float, Range(0, 10_000, "m")] = 0.0
-    floor_rad: Annotated[float, Range(0, 10, "rad")] = 0.0
+    lateral_m_per_sqrt_m: Annotated[float, Range(0, _MOST_M, "m/sqrt(m)")] = 0.005
+    lateral_slip_m_per_rad: Annotated[float, Range(0, _MOST_M, "m/rad")] = 0.01
+    floor_m: Annotated[float, Range(0, _MOST_M, "m")] = 0.0
+    floor_rad: Annotated[float, Range(0, _MOST_RAD, "rad")] = 0.0
 
     def __post_init__(self) -> None:
         require_in_range(self)
@@ -71,6 +74,33 @@ class MotionNoise:
         )
         variance = np.array([along, across, rotation])
         return np.sqrt(variance + self._floor**2)
+
+    def scaled(self, factor: float) -> "MotionNoise":
+        """Return the noise whose standard deviations are `factor` times as large.
+
+        The random walks of the result include the systematic errors. No parameter exceeds its
+        range.
+        """
+        if factor == 1:
+            return self
+        along = np.hypot(self.translation_m_per_sqrt_m, self.scale_error * np.sqrt(self.horizon_m))
+        turned = np.hypot(
+            self.rotation_rad_per_sqrt_rad, self.track_error * np.sqrt(self.horizon_rad)
+        )
+        in_m = {
+            "translation_m_per_sqrt_m": float(along),
+            "lateral_m_per_sqrt_m": self.lateral_m_per_sqrt_m,
+            "lateral_slip_m_per_rad": self.lateral_slip_m_per_rad,
+            "floor_m": self.floor_m,
+        }
+        in_rad = {
+            "rotation_rad_per_sqrt_m": self.rotation_rad_per_sqrt_m,
+            "rotation_rad_per_sqrt_rad": float(turned),
+            "floor_rad": self.floor_rad,
+        }
+        changed = {name: min(factor * value, _MOST_M) for name, value in in_m.items()}
+        changed |= {name: min(factor * value, _MOST_RAD) for name, value in in_rad.items()}
+        return replace(self, scale_error=0.0, track_error=0.0, **changed)
 
     def with_floor(self, covariance: Float) -> Float:
         """Return the standard deviations (3,) of a known covariance (3, 3) plus the floor."""

@@ -17,8 +17,8 @@ from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages import align
 from experiments.pipeline.stages.align import alignment_of, correspondences_of
 from experiments.pipeline.stages.robot_maps import RobotFolders, latest_at, maps_of
-from experiments.pipeline.stages.slam import log_as_filtered
 from experiments.pipeline.stages.smooth import (
+    log_to_smooth,
     log_until,
     read_smoothed_path,
     smoothed_owners,
@@ -149,17 +149,14 @@ def given_teams(settings: FuseSettings, job: Job) -> Iterator[tuple[int, GivenTe
                 recordings.append(None)
                 continue
             smooth, slam = (job.inputs[f"{stage} {name}"] for stage in ("smooth", "slam"))
-            log, covariance = log_as_filtered(job.inputs[f"log {name}"], slam)
+            log, smoother = log_to_smooth(job.inputs[f"log {name}"], slam, settings.smoother)
             log = log_until(log, max(known), settings.noise_floor_m)
             landmark = smoothed_owners(smooth, slam, max(known), len(log.observations))
             path = paths[name][max(known)]
-            smoother = replace(settings.smoother, odometry_covariance=covariance)
             recordings.append(AssociatedLog(log, landmark, path, smoother))
         pairs = [pair for each in alignments if (pair := each.at(k)) is not None]
-        yield (
-            k,
-            GivenTeam([latest_at(maps[name], k) for name in settings.robots], pairs, recordings),
-        )
+        given = [latest_at(maps[name], k) for name in settings.robots]
+        yield k, GivenTeam(given, pairs, recordings)
 
 
 class _Alignments:

@@ -1,8 +1,9 @@
 """Stage: FastSLAM of one robot over its log, with its map at each evaluated iteration."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -13,8 +14,11 @@ from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_row
 from experiments.scenario.seeds import generator
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.log_consistency import Finding, Jump, check_log, gate_finding, without_jumps
+from mapfusion.datasets.odometry_noise import NoiseSource
+from mapfusion.datasets.relative_motion import MIN_MOTIONS
 from mapfusion.fastslam.filter import FastSlamParameters, StepResult
 from mapfusion.fastslam.mapping import run_log
+from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import (
     POSE_FIELDS,
     column,
@@ -76,6 +80,7 @@ class SlamSettings:
 
     seed: int
     filter: FastSlamParameters
+    noise: NoiseSource
     min_count: int
     every: int
     clouds_every: int
@@ -88,19 +93,19 @@ def evaluated_iterations(n_frames: int, every: int) -> list[int]:
 
 def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
-    log = read_log(job.inputs["log"])
-    checked = check_log(log, settings.filter.motion)
-    known = read_odometry_covariance(job.inputs["log"], len(log))
-    log, covariance = without_jumps(log, checked.jumps, known)
+    recorded = read_log(job.inputs["log"])
+    known = read_odometry_covariance(job.inputs["log"], len(recorded))
+    checked = checked_log(recorded, known, settings.filter.motion, settings.noise)
+    log, parameters = checked.log, replace(settings.filter, motion=checked.motion)
     last = len(log) - 1
     steps = list[dict[str, float]]()
     maps, associations, clouds, paths = _Rows(), _Rows(), _Rows(), _Rows()
     counted = np.empty(0, dtype=np.int64)
     iterations = evaluated_iterations(len(log), settings.every)
     rng = generator(settings.seed, "slam", log.robot)
-    measured = covariance, read_attitude(job.inputs["log"], len(log))
+    measured = checked.odometry_covariance, read_attitude(job.inputs["log"], len(log))
     filtered = run_log(
-        log, settings.filter, rng, iterations, settings.min_count, *measured, viewing=False
+        log, parameters, rng, iterations, settings.min_count, *measured, viewing=False
     )
     for frame in filtered:
         k, result = frame.iteration, frame.result
@@ -132,14 +137,70 @@ def run(settings: SlamSettings, job: Job) -> None:
         write_table(job.output / file, rows, table_schema, evaluated)
     gate = gate_finding(log, counted)
     findings = [*checked.findings, *([] if gate is None else [gate])]
-    write_findings(job.output, findings, checked.jumps)
+    write_findings(job.output, findings, checked.jumps, checked.noise_factor)
 
 
 SLAM_STAGE = StageKind("slam", "FastSLAM", run, WRITES)
 
 
-def write_findings(slam: Path, findings: Sequence[Finding], jumps: Sequence[Jump]) -> None:
-    """Write the findings about a robot's log, with the observed motion of jumps."""
+class CheckedLog(NamedTuple):
+    """Input of the filter and of the smoother, after the checks of a log.
+
+    Attributes:
+        log: log without jumps.
+        odometry_covariance: covariance of its odometry, shape (T, 3, 3); None: the motion noise.
+        noise_factor: factor of the motion noise over the stated one.
+        motion: motion noise.
+        findings: findings about the log.
+        jumps: increments of the odometry that are not used.
+    """
+
+    log: RobotLog
+    odometry_covariance: Float | None
+    noise_factor: float
+    motion: MotionNoise
+    findings: tuple[Finding, ...]
+    jumps: tuple[Jump, ...]
+
+
+def checked_log(
+    log: RobotLog, odometry_covariance: Float | None, stated: MotionNoise, source: NoiseSource
+) -> CheckedLog:
+    """Check a log, remove the jumps of its odometry, and choose the motion noise.
+
+    Args:
+        log: recorded log.
+        odometry_covariance: covariance of visual odometry, shape (T, 3, 3), whose noise is not
+            estimated; else None.
+        stated: stated motion noise.
+        source: source of the motion noise.
+    """
+    found, factor = check_log(log, stated), 1.0
+    findings, noise = found.findings, found.noise
+    if odometry_covariance is not None or any(each.kind == "odometry" for each in findings):
+        pass  # the noise is that of the observations, or the odometry has another mistake
+    elif noise.is_larger:
+        used = "the filter uses the stated noise (slam.noise: from_log uses the larger one)"
+        if source is NoiseSource.FROM_LOG:
+            factor = noise.factor
+            used = "the filter uses the larger noise (slam.noise: stated keeps slam.filter.motion)"
+        findings = (*findings, Finding("noise", -1, f"{noise.text}; {used}"))
+    elif noise.n_observed < MIN_MOTIONS < len(log) and source is NoiseSource.FROM_LOG:
+        unknown = "frames share no points, which would show how noisy the odometry is"
+        used = "the filter uses the noise of slam.filter.motion"
+        findings = (*findings, Finding("noise", -1, f"{unknown}; {used}"))
+    used_log, covariance = without_jumps(log, found.jumps, odometry_covariance)
+    motion = stated.scaled(factor)
+    return CheckedLog(used_log, covariance, factor, motion, findings, found.jumps)
+
+
+def write_findings(
+    slam: Path, findings: Sequence[Finding], jumps: Sequence[Jump], noise_factor: float
+) -> None:
+    """Write the findings about a robot's log, with the observed motion of jumps.
+
+    The factor of the motion noise over the stated one is an attribute of the table.
+    """
     observed = np.full((len(findings), 3), np.nan)
     covariance = np.full((len(findings), 3, 3), np.nan)
     row = {finding.frame: n for n, finding in enumerate(findings) if finding.kind == "jump"}
@@ -152,12 +213,18 @@ def write_findings(slam: Path, findings: Sequence[Finding], jumps: Sequence[Jump
         **named_columns(_OBSERVED, observed),
         **covariance_columns(_OBSERVED_COVARIANCE, covariance),
     }
-    write_table(slam / WRITES[-1], rows, FINDINGS)
+    write_table(slam / WRITES[-1], rows, FINDINGS, {"noise_factor": repr(noise_factor)})
 
 
 def read_findings(slam: Path) -> pd.DataFrame:
     """Read the findings about a robot's log."""
     return read_rows(slam / WRITES[-1], FINDINGS)
+
+
+def noise_factor(slam: Path) -> float:
+    """Return the factor of the filter's motion noise over the stated one."""
+    _, attributes = read_table(slam / WRITES[-1], FINDINGS)
+    return float(attributes["noise_factor"])
 
 
 def log_as_filtered(log: Path, slam: Path) -> tuple[RobotLog, Float | None]:

@@ -17,6 +17,7 @@ from experiments.pipeline.stages.slam import (
     evaluated_iterations,
     final_path,
     log_as_filtered,
+    noise_factor,
 )
 from experiments.pipeline.tables import INT, fields
 from mapfusion.attitude import Attitude, read_attitude
@@ -92,9 +93,9 @@ def run(settings: SmoothSettings, job: Job) -> None:
 
     If the log cannot be smoothed, there is no map and an empty path with the reason.
     """
-    log, covariance = log_as_filtered(job.inputs["log"], job.inputs["slam"])
+    log, smoother = log_to_smooth(job.inputs["log"], job.inputs["slam"], settings.smoother)
     given = smoother_inputs(job, log, int(job.part), settings.noise_floor_m)
-    own = replace(settings, smoother=replace(settings.smoother, odometry_covariance=covariance))
+    own = replace(settings, smoother=smoother)
     made = smooth_log(own, *given, read_attitude(job.inputs["log"]))
     landmarks, path, landmark, ended = made
     if landmarks is not None:
@@ -109,6 +110,15 @@ def run(settings: SmoothSettings, job: Job) -> None:
 
 
 SMOOTH_STAGE = StageKind("smooth", "smooth the logs", run, WRITES)
+
+
+def log_to_smooth(
+    log: Path, slam: Path, stated: SmootherParameters
+) -> tuple[RobotLog, SmootherParameters]:
+    """Return the filter's input log, and the smoother's parameters with the filter's noise."""
+    filtered, covariance = log_as_filtered(log, slam)
+    motion = stated.motion.scaled(noise_factor(slam))
+    return filtered, replace(stated, motion=motion, odometry_covariance=covariance)
 
 
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:

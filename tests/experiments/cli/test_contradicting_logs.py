@@ -3,16 +3,17 @@
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from mapfusion.datasets.log_consistency import check_log
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import read_map
-from mapfusion.robot_log import read_log, write_log, write_truth_poses
+from mapfusion.robot_log import first_frames, read_log, write_log, write_truth_poses
 from mapfusion.tables import HEIGHT
 from tests.helpers.tiny_scenario import Reply, assert_refused, command
 from tests.mapfusion.contradicting_logs import JUMPS, MISTAKES, circling_log, true_poses
@@ -25,6 +26,7 @@ from tests.mapfusion.datasets.written_layouts import (
     write_calibration,
     write_images,
 )
+from tests.mapfusion.noisy_odometry import NOISE, seen_log
 
 OWN = ("--set", "slam.filter.association=label", "--set", "slam.filter.n_particles=20")
 VISION = ("--vision", "tracks.min_length=1", "--jobs", 1)
@@ -81,6 +83,53 @@ def test_truth_that_contradicts_a_log_is_told_by_slam(
     write_truth_poses(tmp_path / "log", true_poses(60))
     assert not mapped(np.array, tmp_path, capsys).complaints
     assert (tmp_path / "m.parquet").read_bytes() == before  # the truth decides no number
+
+
+def test_noisy_odometry_is_filtered_and_smoothed_with_its_own_noise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The maps are those of a scenario that states this noise."""
+    log = seen_log(3.0, 3)
+    write_log(tmp_path / "log", log)
+    maps = [tmp_path / f"{name}.parquet" for name in ("log", "stated", "told")]
+    motion = replace(NOISE, lateral_slip_m_per_rad=0.01)
+    factor = check_log(log, motion).noise.factor
+    own = [*OWN, "--set", "slam.filter.motion.scale_error=0"]
+    own += ["--set", "slam.filter.motion.track_error=0"]
+    larger = [
+        argument
+        for name, value in asdict(motion.scaled(factor)).items()
+        for argument in ("--set", f"slam.filter.motion.{name}={value!r}")
+    ]
+    replies = [
+        command(capsys, "slam", tmp_path / "log", "-o", path, *own, *more)
+        for path, more in zip(maps, ([], ["--noise", "stated"], larger), strict=True)
+    ]
+    assert replies[0].code == replies[2].code == 0
+    (used,), (kept,), none = (
+        [line for line in reply.complaints if "noisy" in line] for reply in replies
+    )
+    for line in (used, kept):
+        assert f"odometry is {factor:.1f} times as noisy as stated" in line
+    assert "the filter uses the larger noise (slam.noise: stated" in used
+    assert "the filter uses the stated noise (slam.noise: from_log" in kept
+    assert not none
+    for name in ("{}.parquet", "{}.smoothed.parquet"):
+        ours, stated, told = (tmp_path / name.format(path.stem) for path in maps)
+        assert ours.read_bytes() == told.read_bytes() != stated.read_bytes()
+
+
+@pytest.mark.parametrize("n_frames", [3, 320])
+def test_logs_whose_frames_share_no_points(
+    n_frames: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The line about the noise comes once, unless the log is too short for any."""
+    log = first_frames(seen_log(3.0, 3), n_frames)
+    label = np.arange(len(log.observations), dtype=np.int32)
+    write_log(tmp_path / "log", replace(log, observations=replace(log.observations, label=label)))
+    reply = command(capsys, "slam", tmp_path / "log", "-o", tmp_path / "m.parquet", *OWN)
+    said = [line for line in reply.complaints if "how noisy the odometry is" in line]
+    assert len(said) == (n_frames > 4)
 
 
 def test_a_sound_log_is_mapped_without_a_word(

@@ -74,6 +74,7 @@ TOLD = {
     "vision.usurf": "features",
     "slam": "slam",
     "slam.filter.motion": "slam smooth fuse",
+    "slam.noise": "slam",
     "slam.filter.noise_floor_m": "slam smooth fuse",
     "slam.min_count": "slam smooth fuse",
     "smooth": "smooth",
@@ -111,7 +112,7 @@ NO_OTHER_VALUE = {
     *(f"fuse.fusers.{i}" for i in range(len(FUSERS))),
 }
 WORDS = ("motion", "informed", "label", "descriptor", "solved", "ransac", "svd")
-WORDS += ("other", "raycast", "pixels", "drop")
+WORDS += ("other", "raycast", "pixels", "drop", "stated")
 
 
 def stages_of(scenario: Simulation) -> list[Stage]:

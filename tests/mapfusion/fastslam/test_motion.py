@@ -85,3 +85,24 @@ def test_wrong_values_are_named(name):
     for value in (-1.0, np.nan):
         with pytest.raises(ValueError, match=name):
             MotionNoise(**{name: value})
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
+def test_scaled_noise_has_scaled_standard_deviations(factor: float) -> None:
+    noise = replace(NOISE, lateral_slip_m_per_rad=0.02, floor_m=0.001, floor_rad=0.002)
+    for odometry in np.random.default_rng(0).normal(0, 0.3, (20, 3)):
+        np.testing.assert_allclose(
+            noise.scaled(factor).standard_deviations(odometry),
+            factor * noise.standard_deviations(odometry),
+            rtol=1e-12,
+        )
+    assert noise.scaled(1.0) is noise
+
+
+def test_noise_is_scaled_by_any_factor() -> None:
+    """Parameters have ranges, which large factors would exceed."""
+    step = np.array([0.1, 0, 0.1])
+    small = MotionNoise(1e-6, 1e-6, 1e-6, 1e-6, 1e-6)
+    expected = 1e4 * small.standard_deviations(step)
+    np.testing.assert_allclose(small.scaled(1e4).standard_deviations(step), expected)
+    assert np.isfinite(NOISE.scaled(1e6).standard_deviations(step)).all()

@@ -56,7 +56,7 @@ def filtered(folder: Path, log: RobotLog, owner: np.ndarray) -> dict[str, Path]:
     poses = pd.DataFrame(dead_reckoned(log), columns=[f"final_{name}" for name in POSE_FIELDS])
     poses = poses.assign(iteration=np.arange(len(poses)), resampled=False, n_landmarks=0)
     write_rows(folder / "slam" / "poses.parquet", POSES, poses)
-    write_rows(folder / "slam" / "findings.parquet", FINDINGS, [])
+    write_rows(folder / "slam" / "findings.parquet", FINDINGS, [], {"noise_factor": "1.0"})
     return {"log": folder / "log", "slam": folder / "slam"}
 
 
