@@ -23,8 +23,8 @@ def path_of(
     return path
 
 
-def circling() -> Float:
-    odometry = np.tile(STEP, (N_FRAMES, 1))
+def circling(step: Float = STEP) -> Float:
+    odometry = np.tile(step, (N_FRAMES, 1))
     odometry[0] = 0.0
     return odometry
 
@@ -50,5 +50,5 @@ def seen_log(factor: float, seed: int, tracks: bool = False) -> RobotLog:
         label=None if tracks else name,
         track=name if tracks else None,
     )
-    time_s = 0.2 * np.arange(len(odometry))
+    time_s = np.linspace(0, 0.2 * (len(odometry) - 1), len(odometry))
     return RobotLog("R1", True, time_s, odometry, np.array(frames), seen)

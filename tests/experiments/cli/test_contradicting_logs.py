@@ -107,7 +107,7 @@ def test_noisy_odometry_is_filtered_and_smoothed_with_its_own_noise(
     ]
     assert replies[0].code == replies[2].code == 0
     (used,), (kept,), none = (
-        [line for line in reply.complaints if "noisy" in line] for reply in replies
+        [line for line in reply.complaints if "times as noisy" in line] for reply in replies
     )
     for line in (used, kept):
         assert f"odometry is {factor:.1f} times as noisy as stated" in line

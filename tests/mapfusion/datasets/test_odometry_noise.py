@@ -12,7 +12,7 @@ from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, compose
 from mapfusion.robot_log import Observations, RobotLog
-from tests.mapfusion.contradicting_logs import JUMPS
+from tests.mapfusion.contradicting_logs import JUMPS, MISTAKES
 from tests.mapfusion.noisy_odometry import N_FRAMES, NOISE, STEP, circling, path_of, seen_log
 
 
@@ -30,19 +30,29 @@ def motions_of(path: Float, lag: int, rng: np.random.Generator, sigma: float = 1
 def log_of(odometry: Float) -> RobotLog:
     nothing = Observations(np.empty((0, 3)), np.empty((0, 3, 3)))
     frames = np.empty(0, dtype=np.int64)
-    return RobotLog("R1", True, np.arange(len(odometry)) * 0.2, odometry, frames, nothing)
+    return RobotLog(
+        "R1",
+        True,
+        np.linspace(0, 0.2 * (len(odometry) - 1), len(odometry)),
+        odometry,
+        frames,
+        nothing,
+    )
 
 
+@pytest.mark.parametrize("turn_rad", [0.04, 0.4])
 @pytest.mark.parametrize("factor", [0.5, 1, 2, 3, 5])
 @pytest.mark.parametrize("lag", [1, 4])
-def test_factor_has_the_law_of_the_larger_of_two_quantiles(factor: float, lag: int) -> None:
+def test_factor_has_the_law_of_the_larger_of_two_quantiles(
+    factor: float, lag: int, turn_rad: float
+) -> None:
     """Mean and spread of the larger of two normal variables (Clark 1961).
 
     The logarithm of the factor by the quantile p of n squared distances, which are exponential,
     has the standard error sqrt(p / (1 - p) / n) / (-2 ln(1 - p)): 0.72 / sqrt(n) for the median,
     0.73 / sqrt(n) for p = 0.95. The correlation of both is sqrt(0.05 / 0.95).
     """
-    odometry, ratios, n_logs = circling(), [], 60
+    odometry, ratios, n_logs = circling(np.array([0.1, 0, turn_rad])), [], 60
     for seed in range(n_logs):
         rng = np.random.default_rng(seed)
         spans = [motions_of(path_of(odometry, factor, rng), lag, rng)]
@@ -53,6 +63,21 @@ def test_factor_has_the_law_of_the_larger_of_two_quantiles(factor: float, lag: i
     spread = error * np.sqrt(1 - (1 - correlation) / np.pi)
     assert np.mean(np.log(ratios)) == pytest.approx(mean, abs=4 * spread / np.sqrt(n_logs))
     assert np.std(np.log(ratios)) == pytest.approx(spread, rel=4 / np.sqrt(2 * n_logs))
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_mistakes_are_no_noise(name: str) -> None:
+    log = seen_log(1.0, 3)
+    (finding,) = check_log(replace(log, odometry=MISTAKES[name][0](log.odometry)), NOISE).findings
+    assert finding.kind == "odometry"
+
+
+def test_odometry_of_another_run_is_no_noise() -> None:
+    log = seen_log(1.0, 3)
+    turns = 0.15 * np.sign(np.sin(np.arange(len(log)) / 3))
+    other = np.column_stack([np.full(len(log), 0.1), np.zeros(len(log)), turns])
+    (finding,) = check_log(replace(log, odometry=other), NOISE).findings
+    assert finding.kind == "odometry"
 
 
 def test_slip_in_some_frames_counts_if_the_noise_is_larger() -> None:
@@ -115,7 +140,9 @@ def test_errors_that_do_not_accumulate_count_least_over_the_longest_spans() -> N
     assert found[0].is_larger
     least = min(each.factor for each in found)
     assert least == found[-1].factor < found[0].factor
-    assert estimate_odometry_noise(log, spans, NOISE).factor == least
+    together = estimate_odometry_noise(log, spans, NOISE)
+    assert together.factor == least
+    assert not together.is_larger
 
 
 def test_jumps_and_false_links_do_not_change_the_factor() -> None:

@@ -24,6 +24,7 @@ from experiments.pipeline.stages.smooth import (
 )
 from experiments.pipeline.tables import write_rows
 from mapfusion.errors import DamagedFileError
+from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import POSE_FIELDS
 from mapfusion.robot_log import (
     RobotLog,
@@ -35,6 +36,7 @@ from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
 from tests.mapfusion.smoother.white_noise_logs import dead_reckoned, white_noise_log
 
 N_FRAMES, CHANGED_AT = 40, 20
+STATED = MotionNoise()
 
 
 def owners(log: RobotLog) -> np.ndarray:
@@ -44,7 +46,9 @@ def owners(log: RobotLog) -> np.ndarray:
     return first[inverse]
 
 
-def filtered(folder: Path, log: RobotLog, owner: np.ndarray) -> dict[str, Path]:
+def filtered(
+    folder: Path, log: RobotLog, owner: np.ndarray, noise_factor: float = 1.0
+) -> dict[str, Path]:
     """A log and what a filter left of it, which till `CHANGED_AT` took all for one landmark."""
     write_log(folder / "log", log)
     at = np.maximum(log.iteration, CHANGED_AT)
@@ -56,14 +60,20 @@ def filtered(folder: Path, log: RobotLog, owner: np.ndarray) -> dict[str, Path]:
     poses = pd.DataFrame(dead_reckoned(log), columns=[f"final_{name}" for name in POSE_FIELDS])
     poses = poses.assign(iteration=np.arange(len(poses)), resampled=False, n_landmarks=0)
     write_rows(folder / "slam" / "poses.parquet", POSES, poses)
-    write_rows(folder / "slam" / "findings.parquet", FINDINGS, [], {"noise_factor": "1.0"})
+    write_rows(
+        folder / "slam" / "findings.parquet", FINDINGS, [], {"noise_factor": str(noise_factor)}
+    )
     return {"log": folder / "log", "slam": folder / "slam"}
 
 
 def smoothed_at(
-    inputs: dict[str, Path], folder: Path, *iterations: int, max_memory_gb: float = 1.0
+    inputs: dict[str, Path],
+    folder: Path,
+    *iterations: int,
+    max_memory_gb: float = 1.0,
+    motion: MotionNoise = STATED,
 ) -> None:
-    settings = SmoothSettings(SmootherParameters(), 0.0, iterations, max_memory_gb)
+    settings = SmoothSettings(SmootherParameters(motion), 0.0, iterations, max_memory_gb)
     for part in parts(iterations):
         run(settings, Job(inputs, folder, part))
 
@@ -90,6 +100,20 @@ def test_it_is_the_smoother_on_the_log_so_far(tmp_path: Path) -> None:
     assert last_whole[N_FRAMES - 1].joint is not None
     assert len(maps[N_FRAMES - 1]) >= len(maps[k]) > 5
     assert read_endings(tmp_path / "out")["n_steps"].min() >= 1
+
+
+def test_smoother_has_the_motion_noise_of_the_filter(tmp_path: Path) -> None:
+    log = white_noise_log(np.random.default_rng(0), N_FRAMES, 25).log
+    last, given = N_FRAMES - 1, {}
+    for name, factor in (("estimated", 3.0), ("stated", 1.0)):
+        given[name] = filtered(tmp_path / name, log, owners(log), factor)
+        smoothed_at(given[name], tmp_path / name / "out", last)
+    told = STATED.scaled(3.0)
+    smoothed_at(given["stated"], tmp_path / "told" / "out", last, motion=told)
+    names = ("estimated", "told", "stated")
+    paths = [read_smoothed_path(tmp_path / name / "out")[last] for name in names]
+    np.testing.assert_array_equal(paths[0], paths[1])
+    assert not np.array_equal(paths[0], paths[2])
 
 
 def test_associations_are_those_of_the_filter_at_that_time(tmp_path: Path) -> None:
