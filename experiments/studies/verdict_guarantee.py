@@ -30,21 +30,24 @@ from experiments.evaluation.criteria import (
 )
 from experiments.evaluation.tables import UNKNOWN, read_scenario
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields
+from experiments.studies.intervals import Interval, clusters_of, weighted_mean_interval
 from experiments.studies.run_tables import Runs
 from mapfusion.errors import InputError
 from mapfusion.files import schema
-from mapfusion.geometry.numerics import Float
 from mapfusion.verification.regions import EvidenceParameters
 
 _SETTING = "align.evidence.least_ratio"
-_PASSED, _EVIDENCE = "log10_ratio_passed", "log10_evidence"
+_PASSED = "log10_ratio_passed"
 _TABLES = ("errors", "smoothed_errors")
 _ERRORS = ("refined_translation_error_m", "refined_rotation_error_rad")
-_COLUMNS = ("aligner", "accepted", *_ERRORS, "n_true", "n_common", _EVIDENCE)
+_COLUMNS = ("aligner", "accepted", *_ERRORS, "n_true", "n_common")
 # Candidates, log10: fixed before the runs are seen. At the highest, no answer by chance is left
 # according to the model of the regions; a step is a factor of 1.26, finer than runs can tell apart.
 CANDIDATES = tuple(step / 10 for step in range(60, -1, -1))
 TOTAL = "all scenarios"
+# Right answers of all methods on mergeable pairs of maps, and the share that is accepted with its
+# 95 % interval; whole runs are resampled.
+_RIGHT = {"n_right": INT, **dict.fromkeys(("accepted", "accepted_low", "accepted_high"), FLOAT)}
 
 # One row for each scenario, and one for all.
 SHARES = schema(
@@ -55,8 +58,7 @@ SHARES = schema(
         n_runs=INT,
         n_false_runs=INT,
         false_runs_upper=FLOAT,  # one-sided bound of the share of false runs
-        n_right=INT,  # right answers of all methods on mergeable pairs of maps
-        n_right_accepted=INT,
+        **_RIGHT,
     ),
 )
 # One row for each candidate, the highest first.
@@ -69,8 +71,7 @@ THRESHOLDS = schema(
         n_false_runs=INT,
         false_runs_upper=FLOAT,
         certified=BOOL,
-        n_right=INT,
-        n_right_accepted=INT,
+        **_RIGHT,
     ),
 )
 
@@ -110,17 +111,22 @@ class Answers(NamedTuple):
     """Accepted false answers, and right answers, of runs.
 
     Attributes:
-        runs: RUN_KEYS, n_right, n_right_accepted, and `false_passes`: log10 of the largest
-            `least_ratio` that a false answer passes; -inf without one.
-        right_passes: the same ratio of each right answer; -inf of those that are not accepted.
-        n_without_evidence: number of accepted answers that pass every ratio without evidence.
-        is_approximate: True if a table lacks `log10_ratio_passed`.
+        runs: RUN_KEYS and `passes`: log10 of the largest `least_ratio` that a false answer of the
+            run passes; -inf without one.
+        right: RUN_KEYS and `passes` of each right answer; -inf of those that are not accepted.
+        n_with_any_ratio: number of accepted answers that count with every ratio: maps without
+            viewing evidence, and tables of versions without the column.
     """
 
     runs: pd.DataFrame
-    right_passes: Float
-    n_without_evidence: int
-    is_approximate: bool
+    right: pd.DataFrame
+    n_with_any_ratio: int
+
+    @property
+    def shared_seeds(self) -> list[int]:
+        """Seeds of several scenarios, whose worlds may have parts in common."""
+        seeds = self.runs["seed"]
+        return sorted(set(seeds[seeds.duplicated()]))
 
 
 def read_answers(runs: Runs) -> Answers:
@@ -129,7 +135,7 @@ def read_answers(runs: Runs) -> Answers:
     Raises:
         InputError: the truth of a run is unknown, or a scenario and seed occur in several runs.
     """
-    parts, right_passes, n_without_evidence, is_approximate = [], [], 0, False
+    false, right, n_with_any_ratio = [], [], 0
     for table in filter(runs.has, _TABLES):
         for rows in runs.batches(table, _COLUMNS, (_PASSED,)):
             rows = rows[rows["aligner"] != ORACLE]
@@ -137,47 +143,40 @@ def read_answers(runs: Runs) -> Answers:
                 run_id = unknown["run_id"].iloc[0]
                 raise InputError(f"run {run_id}: no truth is known, so false merges are not either")
             accepted = rows["accepted"] == 1
-            n_without_evidence += int((accepted & rows[_EVIDENCE].isna()).sum())
-            lacks = rows[_PASSED].isna() & rows[_EVIDENCE].notna()
-            is_approximate |= bool(lacks.any())
-            # an answer without evidence is accepted with any least_ratio
-            passes = (
-                rows[_PASSED].fillna(rows[_EVIDENCE]).fillna(math.inf).where(accepted, -math.inf)
-            )
-            right = rows.index.isin(mergeable(rows).index) & right_refined(rows)
-            right_passes.append(passes[right].to_numpy(float))
-            columns = {
-                "n_right": right.astype(int),
-                "n_right_accepted": (right & accepted).astype(int),
-                "false_passes": passes.where(is_false_merge(rows), -math.inf),
-            }
-            groups = rows[list(RUN_KEYS)].assign(**columns).groupby(list(RUN_KEYS), sort=False)
-            parts.append(_of_runs(groups))
-    if not parts:
+            n_with_any_ratio += int((accepted & rows[_PASSED].isna()).sum())
+            passes = rows[_PASSED].fillna(math.inf).where(accepted, -math.inf)
+            answers = rows[list(RUN_KEYS)].assign(passes=passes)
+            is_right = rows.index.isin(mergeable(rows).index) & right_refined(rows)
+            right.append(answers[is_right])
+            of_false = answers.assign(passes=passes.where(is_false_merge(rows), -math.inf))
+            false.append(_largest_of_runs(of_false))
+    if not false:
         raise InputError("no table errors in these results (expected those of `run` or `sweep`)")
-    joined = pd.concat(parts).groupby(list(RUN_KEYS), sort=False)
-    found = _of_runs(joined).sort_values(["scenario", "seed"], ignore_index=True)
+    found = _largest_of_runs(pd.concat(false)).sort_values(["scenario", "seed"], ignore_index=True)
     again = found[found.duplicated(["scenario", "seed"])]
     if len(again):
         name, seed = again[["scenario", "seed"]].iloc[0]
         what = "occurs in several runs, which are not independent; give those of one setting"
         raise InputError(f"scenario {name}, seed {seed}: {what}")
-    return Answers(found, np.concatenate(right_passes), n_without_evidence, is_approximate)
+    return Answers(found, pd.concat(right, ignore_index=True), n_with_any_ratio)
 
 
-def _of_runs(groups: "pd.api.typing.DataFrameGroupBy") -> pd.DataFrame:
-    sums = {name: (name, "sum") for name in ("n_right", "n_right_accepted")}
-    return groups.agg(**sums, false_passes=("false_passes", "max")).reset_index()
+def _largest_of_runs(answers: pd.DataFrame) -> pd.DataFrame:
+    return answers.groupby(list(RUN_KEYS), sort=False)["passes"].max().reset_index()
 
 
 def least_ratio_of(runs: Runs) -> float:
-    """Return the largest `least_ratio` of the runs; the default if a sweep does not state it."""
+    """Return the largest `least_ratio` of the runs.
+
+    Sweeps that do not set it are taken to have the default.
+    """
     default = EvidenceParameters().least_ratio
-    stated = [default]
-    if _SETTING in runs.described:
-        stated = runs.described[_SETTING].dropna().astype(float).tolist()
-    elif runs.results and not runs.sweeps:
-        stated = []
+    described = runs.described
+    of_results = [result.run["run_id"] for result in runs.results]
+    of_sweeps = described[~described["run_id"].isin(of_results)]
+    # runs of a sweep with the setting and of one without it are read together
+    varied = of_sweeps.get(_SETTING, pd.Series(default, of_sweeps.index, float))
+    stated = varied.astype(float).fillna(default).tolist()
     for result in runs.results:
         settings = read_scenario(result.path / "scenario.json")
         stated.append(settings["align"].get("evidence", {}).get("least_ratio", default))
@@ -216,13 +215,21 @@ class Guarantee:
 def guarantee(runs: Runs, alpha: float, delta: float) -> Guarantee:
     """Compute the upper bounds of the shares of false runs, and the certified thresholds."""
     answers, least_ratio = read_answers(runs), least_ratio_of(runs)
-    of_runs = answers.runs
-    groups = [(str(name), own) for name, own in of_runs.groupby("scenario")]
-    shares = [_share(name, own, delta) for name, own in [*groups, (TOTAL, of_runs)]]
+    of_runs, right = answers.runs, answers.right
+    groups = [
+        (str(name), own, right[right["scenario"] == name])
+        for name, own in of_runs.groupby("scenario")
+    ]
+    shares = []
+    for name, own, own_right in [*groups, (TOTAL, of_runs, right)]:
+        n, k = len(own), int(np.count_nonzero(own["passes"] > -math.inf))
+        row = {"scenario": name, "n_runs": n, "n_false_runs": k}
+        row |= {"false_runs_upper": upper_bound(k, n, delta)}
+        shares.append(row | accepted_share(own_right, own_right["passes"] > -math.inf))
     # thresholds below the one in use would accept answers that these runs refused
     judged = [t for t in CANDIDATES if t >= math.log10(least_ratio) - 1e-9]
-    passes, n = of_runs["false_passes"].to_numpy(float), len(of_runs)
-    n_false = [int(np.count_nonzero(passes >= t)) for t in judged]
+    n = len(of_runs)
+    n_false = [int(np.count_nonzero(of_runs["passes"] >= t)) for t in judged]
     last = lowest_certified(n_false, n, alpha, delta)
     thresholds = [
         {
@@ -231,8 +238,7 @@ def guarantee(runs: Runs, alpha: float, delta: float) -> Guarantee:
             "n_false_runs": k,
             "false_runs_upper": upper_bound(k, n, delta),
             "certified": last is not None and place <= last,
-            "n_right": len(answers.right_passes),
-            "n_right_accepted": int(np.count_nonzero(answers.right_passes >= t)),
+            **accepted_share(right, right["passes"] >= t),
         }
         for place, (t, k) in enumerate(zip(judged, n_false, strict=True))
     ]
@@ -242,9 +248,10 @@ def guarantee(runs: Runs, alpha: float, delta: float) -> Guarantee:
     return Guarantee(alpha, delta, *parts)
 
 
-def _share(name: str, own: pd.DataFrame, delta: float) -> dict[str, Any]:
-    """Return the row of SHARES of some runs."""
-    n, k = len(own), int(np.count_nonzero(own["false_passes"] > -math.inf))
-    row = {"scenario": name, "n_runs": n, "n_false_runs": k}
-    row |= {"false_runs_upper": upper_bound(k, n, delta)}
-    return row | {each: int(own[each].sum()) for each in ("n_right", "n_right_accepted")}
+def accepted_share(right: pd.DataFrame, accepted: pd.Series) -> dict[str, Any]:
+    """Return the columns of right answers: their number, the share accepted and its interval."""
+    share = Interval(np.nan, np.nan, np.nan)
+    if len(right):
+        rng, weights = np.random.default_rng(0), np.ones(len(right))
+        share = weighted_mean_interval(accepted.to_numpy(float), weights, clusters_of(right), rng)
+    return {"n_right": len(right)} | share.columns("accepted")

@@ -17,7 +17,7 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_RAD,
 )
 from experiments.evaluation.single_steps import filter_settings
-from experiments.reports.formatting import two_digits
+from experiments.reports.formatting import interval, two_digits
 from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
 from experiments.reports.terminal.layout import (
     NO_ESTIMATE,
@@ -275,23 +275,13 @@ def _hits(rate: Rate) -> str:
 def print_guarantee(found: Guarantee) -> None:
     """Print the shares of false runs, and the lowest threshold with a guarantee."""
     confidence = f"{1 - found.delta:.4g}"
-    uppers = found.shares["false_runs_upper"].map("{:.2%}".format)
-    cells = [
-        (row["scenario"], row["n_runs"], row["n_false_runs"], row["upper"], _accepted(row))
-        for row in found.shares.assign(upper=uppers).to_dict("records")
-    ]
-    shown = columns(
-        ">", runs="runs", false="false\nruns", upper="at most", right="right answers\naccepted"
-    )
+    shown = {"scenario": ("scenario", "")}
+    shown |= columns("d", n_runs="runs", n_false_runs="false\nruns")
+    shown |= columns(".2%", false_runs_upper="at most")
+    shown |= columns("d", n_right="right\nanswers") | columns(".1%", accepted="accepted\n95 %")
     note = f"at most: Clopper-Pearson, one-sided, confidence {confidence}; false: any method merges"
-    print_table([("scenario", ""), *shown.values()], cells, "Runs with a false merge", note)
+    print_frame(found.shares, shown, "Runs with a false merge", note)
     print_lines(_guarantee_lines(found, confidence))
-
-
-def _accepted(row: Mapping[Any, Any] | pd.Series) -> str:
-    """Return the share of right answers that are accepted; a dash without any."""
-    n = int(row["n_right"])
-    return f"{row['n_right_accepted'] / n:.1%} of {n}" if n else "–"
 
 
 def _guarantee_lines(found: Guarantee, confidence: str) -> Iterator[str]:
@@ -306,18 +296,21 @@ def _guarantee_lines(found: Guarantee, confidence: str) -> Iterator[str]:
     else:
         yield f"lowest certified align.evidence.least_ratio: {best['least_ratio']:.4g}; {aim}"
         if best["n_right"]:
-            yield f"  right answers accepted with it: {_accepted(best)}"
+            share = interval(*best[["accepted", "accepted_low", "accepted_high"]], layout=".1%")
+            yield f"  right answers accepted with it: {share} of {best['n_right']}"
     if found.least_ratio > 1:
         yield (
             f"made with least_ratio {found.least_ratio:g}: lower thresholds cannot be judged; "
             "runs with --set align.evidence.least_ratio=1 tell"
         )
-    if n := found.answers.n_without_evidence:
-        yield f"accepted without viewing evidence, so with any threshold: {n} answers"
-    if found.answers.is_approximate:
+    if n := found.answers.n_with_any_ratio:
+        why = "maps without viewing evidence, or tables of an earlier version"
+        yield f"accepted with any threshold: {n} answers ({why})"
+    if seeds := found.answers.shared_seeds:
+        what = f"seed {seeds[0]}" + (f" and {len(seeds) - 1} more" if seeds[1:] else "")
         yield (
-            "made by an earlier version: thresholds are compared with log10_evidence, although "
-            "maps without repetition pass with less"
+            f"{what}: of several scenarios, whose worlds may have parts in common; bounds over all "
+            "scenarios need a seed of its own for each run"
         )
     if found.n_failed:
         yield f"failed and not counted: {found.n_failed} runs"

@@ -1,5 +1,6 @@
 """The guarantee of the verdicts: bounds against the binomial law, choices against drawn runs."""
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from scipy.stats import binom
 
 from experiments.pipeline.tables import read_rows
+from experiments.scenario.seeds import parse_seeds
 from experiments.studies.run_tables import find_runs
 from experiments.studies.verdict_guarantee import (
     CANDIDATES,
@@ -18,6 +20,7 @@ from experiments.studies.verdict_guarantee import (
     TOTAL,
     clean_runs_needed,
     guarantee,
+    least_ratio_of,
     lowest_certified,
     upper_bound,
 )
@@ -116,18 +119,18 @@ def test_runs_are_false_by_any_method_on_either_kind_of_maps(tmp_path: Path) -> 
     found = guarantee(find_runs(swept(tmp_path / "s", made)), 0.9, 0.05)
     for row, name in zip(found.shares.to_dict("records"), ("world", TOTAL), strict=True):
         assert (row["scenario"], row["n_runs"], row["n_false_runs"]) == (name, 4, 3)
-        assert (row["n_right"], row["n_right_accepted"]) == (8, 8)
+        assert (row["n_right"], row["accepted"]) == (8, 1.0)
         assert row["false_runs_upper"] == upper_bound(3, 4, 0.05)
     at = found.thresholds.set_index(np.round(np.log10(found.thresholds["least_ratio"]), 1))
     assert at["n_false_runs"].loc[[4.1, 4.0, 2.1, 2.0, 0.0]].tolist() == [0, 1, 1, 3, 3]
-    assert at["n_right_accepted"].loc[[2.6, 2.5]].tolist() == [0, 8]
+    assert at["accepted"].loc[[2.6, 2.5]].tolist() == [0, 1]
     best = found.certified
     assert best is not None
     assert best["least_ratio"] == pytest.approx(10**2.1)  # 3 of 4 allow up to 98.7 %
 
 
 def test_what_has_no_evidence_counts_with_any_threshold(tmp_path: Path) -> None:
-    """So do maps that need none; tables without the ratio are compared by their evidence."""
+    """So do maps that need none, and answers in tables of versions without the ratio."""
     made = {
         0: {"errors": answers(("icp", True, 9.0, NAN, NAN, 0))},
         1: {"errors": answers(("icp", True, 9.0, INF, 0.5, 0))},
@@ -135,9 +138,8 @@ def test_what_has_no_evidence_counts_with_any_threshold(tmp_path: Path) -> None:
     }
     found = guarantee(find_runs(swept(tmp_path / "s", made)), 0.9, 0.05)
     at = found.thresholds.set_index(np.round(np.log10(found.thresholds["least_ratio"]), 1))
-    assert at["n_false_runs"].loc[[6.0, 2.4, 2.3]].tolist() == [2, 2, 3]
-    assert found.answers.n_without_evidence == 1
-    assert found.answers.is_approximate
+    assert (at["n_false_runs"] == 3).all()
+    assert found.answers.n_with_any_ratio == 3  # both accepted answers of run 2
 
 
 def test_lower_thresholds_than_that_of_the_runs_are_not_judged(tmp_path: Path) -> None:
@@ -150,6 +152,41 @@ def test_lower_thresholds_than_that_of_the_runs_are_not_judged(tmp_path: Path) -
         assert best["least_ratio"] == pytest.approx(lowest)
         assert found.least_ratio == float(least_ratio)
     assert len(CANDIDATES) == 61
+
+
+def test_a_sweep_without_the_setting_has_the_default(tmp_path: Path) -> None:
+    """Also beside a sweep that states a lower ratio, or a result that does."""
+    made = {seed: {"errors": CLEAN} for seed in range(200)}
+    low = swept(tmp_path / "low", made)
+    other = write_sweep(tmp_path / "default", [0], scenarios=["other"], made=made)
+    assert least_ratio_of(find_runs(low)) == 1
+    assert least_ratio_of(find_runs([low, other])) == 1000
+    place = write_result(tmp_path, 3, {"errors": CLEAN}, "third")
+    assert least_ratio_of(find_runs([low, place])) == 1000
+    scenario = json.loads((place / "scenario.json").read_text())
+    scenario["align"]["evidence"] = {"least_ratio": 5}
+    (place / "scenario.json").write_text(json.dumps(scenario))
+    assert least_ratio_of(find_runs([low, place])) == 5
+
+
+def test_right_answers_are_resampled_by_runs(tmp_path: Path) -> None:
+    """Of 40 runs half accept all of their 50 right answers, the other half none."""
+    refused = ("ransac", False, 0.1, 2.5, 2.5, 30)
+    made = {s: {"errors": answers(*([RIGHT if s % 2 else refused] * 50))} for s in range(40)}
+    row = guarantee(find_runs(swept(tmp_path / "s", made)), 0.1, 0.05).shares.iloc[-1]
+    assert (row["n_right"], row["accepted"]) == (2000, 0.5)
+    half = 1.96 * math.sqrt(0.25 / 40)  # of answers: a seventh of it
+    assert row["accepted_high"] - row["accepted"] == pytest.approx(half, rel=0.15)
+    assert row["accepted"] - row["accepted_low"] == pytest.approx(half, rel=0.15)
+
+
+def test_runs_of_one_seed_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = {seed: {"errors": CLEAN} for seed in range(4)}
+    sweep = write_sweep(tmp_path / "s", [*made], [{SETTING: "1"}], ["one", "two"], made)
+    reply = command(capsys, "study", "verdicts", sweep)
+    assert "seed 0 and 3 more: of several scenarios" in reply.out
+    alone = command(capsys, "study", "verdicts", swept(tmp_path / "t", made))
+    assert "of several scenarios" not in alone.out
 
 
 def test_the_setting_of_a_result_is_in_its_scenario(tmp_path: Path) -> None:
@@ -186,9 +223,11 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_the_calibration_set_has_all_kinds() -> None:
-    sweep, study = commands(Path("made"), "2000..2042", 2)
-    names = [Path(word).stem for word in sweep if word.endswith(".yaml")]
-    assert len(names) == 7
-    assert "apart" in names
-    assert "align.evidence.least_ratio=1" in sweep
-    assert study[2] == sweep[sweep.index("-o") + 1]
+    *sweeps, study = commands(Path("made"), range(2000, 2301), 2)
+    assert len({Path(sweep[1]).stem for sweep in sweeps}) == len(sweeps) == 7
+    seeds = [parse_seeds(sweep[sweep.index("--seeds") + 1]) for sweep in sweeps]
+    assert {len(own) for own in seeds} == {43}
+    assert sorted(itertools.chain(*seeds)) == [*range(2000, 2301)]  # none in two scenarios
+    for sweep in sweeps:
+        assert "align.evidence.least_ratio=1" in sweep
+        assert study[2] == sweep[sweep.index("-o") + 1]
