@@ -59,7 +59,8 @@ def short_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     asked = SHORT.replace("    - {name: icp, method: icp}\n", "")
     # so that all runs have something to fuse: small maps of few particles, which see one place
     asked = asked.replace("frames: 12", "frames: 16")
-    asked = asked.replace("align:", "align:\n  evidence: {place_m: 0, least_ratio: 1, max_sigma_rad: 1}")
+    evidence = "{place_m: 0, least_ratio: 1, max_sigma_rad: 1}"
+    asked = asked.replace("align:", f"align:\n  evidence: {evidence}")
     path.write_text(asked, encoding="utf-8")
     return path
 
