@@ -52,9 +52,10 @@ class EvidenceParameters:
             the smaller map lies in such a place and agrees, its surroundings were not compared.
         least_ratio: smallest likelihood ratio of the regions, right motion over wrong motion, if
             maps repeat structure or another motion fits; multiplied by the number of motions that
-            pass the test against chance. At most one pair of maps in this number has a wrong motion
-            that reaches it (Markov's and Boole's inequalities). By default this is at most 2 % of
-            runs with 20 evaluated pairs of maps.
+            pass the test against chance. In other maps only supporters within two regions need it.
+            At most one pair of maps in this number has a wrong motion that reaches it (Markov's and
+            Boole's inequalities). By default this is at most 2 % of runs with 20 evaluated pairs of
+            maps.
         most_against: inverse of the likelihood ratio below which an alignment is contradicted; at
             most one right motion in this number falls below it.
         max_sigma_m: largest standard deviation of the other map's landmarks under the alignment,

@@ -424,7 +424,8 @@ class PairVerifier:
     ) -> float:
         """Return log10 of the largest `least_ratio` that the regions pass; infinite without limit.
 
-        Maps without repeated structure and without another motion need little evidence.
+        Maps without repeated structure and without another motion need no evidence if the
+        supporters extend over two regions or more.
         """
         ratio = regions.log10_evidence(evidence.shares)
         # the best of n wrong motions reaches the threshold n times as often (Boole)

@@ -170,7 +170,7 @@ def test_a_sweep_without_the_setting_has_the_default(tmp_path: Path) -> None:
 
 
 def test_right_answers_are_resampled_by_runs(tmp_path: Path) -> None:
-    """Of 40 runs half accept all of their 50 right answers, the other half none."""
+    """Half of 40 runs accept all of their 50 right answers, and the others accept none."""
     refused = ("ransac", False, 0.1, 2.5, 2.5, 30)
     made = {s: {"errors": answers(*([RIGHT if s % 2 else refused] * 50))} for s in range(40)}
     row = guarantee(find_runs(swept(tmp_path / "s", made)), 0.1, 0.05).shares.iloc[-1]
