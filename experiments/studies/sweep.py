@@ -384,6 +384,9 @@ class SweepDriver:
 
     def _task_ended(self, future: Future) -> None:
         """Take the result or the failure of a task, and end the runs that waited for the task."""
+        if future.status in ("lost", "pending"):  # its worker died since it had ended
+            self._ended.add(future)  # Dask performs the task again
+            return
         label, name = _label_and_name(future.key)
         waiting = [each for each, waits_for in self._open.items() if name in waits_for]
         own = [plan.run for plan in waiting if plan.last == name]

@@ -441,9 +441,11 @@ def test_killed_workers_are_replaced_and_only_the_killer_gives_up(
     assert deaths.read_text().split() == ["died"] * 4
 
 
+@pytest.mark.parametrize("is_noticed", [False, True])
 def test_rows_that_died_with_their_worker_are_made_again(
-    scene: Scene, client: Client, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, client: Client, monkeypatch: pytest.MonkeyPatch, is_noticed: bool
 ) -> None:
+    """Also where the client knows of the loss before it takes the rows."""
     task_ended, killed = SweepDriver._task_ended, list[int]()
 
     def lose_the_first(driver: SweepDriver, future: Future) -> None:
@@ -451,6 +453,8 @@ def test_rows_that_died_with_their_worker_are_made_again(
             (holders,) = client.who_has([future]).values()
             killed.extend(client.run(os.getpid, workers=list(holders)).values())
             os.kill(killed[0], signal.SIGKILL)
+            while is_noticed and future.status == "finished":
+                time.sleep(0.01)
         task_ended(driver, future)
 
     monkeypatch.setattr(SweepDriver, "_task_ended", lose_the_first)
