@@ -233,7 +233,8 @@ def residual_scale(T_a_b: Float, pairs: Pairs) -> float:
     e = a.position_m[pairs.index_a] - b.position_m[pairs.index_b] @ turn.T
     e[:, :2] -= T_a_b[:2]
     S = a.covariance_m2[pairs.index_a] + turn @ b.covariance_m2[pairs.index_b] @ turn.T
-    S += DRIFT_FLOOR_M**2 * np.eye(3)  # maps may state zero
+    i = np.arange(3)
+    S[:, i, i] = np.maximum(S[:, i, i], DRIFT_FLOOR_M**2)  # maps may state zero
     e, S = e[:, :n_dimensions], S[:, :n_dimensions, :n_dimensions]
     squares = np.vecdot(e, np.linalg.solve(S, e[..., None])[..., 0])
     return math.sqrt(float(np.median(squares)) / chi_square_bound(0.5, n_dimensions))

@@ -491,6 +491,7 @@ class PairVerifier:
         """Say that the residuals contradict the covariances of the maps; empty if they do not.
 
         Maps with joint covariances are left out: errors that their landmarks share are stated.
+        The figure is a lower bound, since matching drops pairs whose heights differ too much.
         """
         maps = self._pairs.map_a, self._pairs.map_b
         if not alignment.inlier.any() or all(each.joint is not None for each in maps):
@@ -498,7 +499,7 @@ class PairVerifier:
         scale = residual_scale(alignment.T_a_b, self._pairs[alignment.inlier])
         if scale < _OVERCONFIDENT:
             return ""
-        return f"the residuals are {scale:.2g} times as large as the maps' covariances state"
+        return f"the residuals are at least {scale:.2g} times as large as the maps' covariances state"
 
     def _why_unsure(self, alignment: Alignment) -> str:
         """Return why the covariance of an alignment is too large; empty if it is not."""
