@@ -299,7 +299,7 @@ class PairVerifier:
         status, reason, told = Status.ACCEPTED, "", {}
         evidence = self.evidence
         if evidence is not None:
-            regions = self.regions(alignment, evidence)
+            regions = self.regions(alignment, evidence, evidence.region_m)
             log10_evidence = regions.log10_evidence(evidence.shares)
             told = {"log10_evidence": log10_evidence, "n_confirmed": regions.n_confirmed}
             rival = self._best_rival(alignment, evidence)
@@ -389,10 +389,10 @@ class PairVerifier:
                 )
         return ""
 
-    def regions(self, alignment: Alignment, evidence: PairEvidence) -> Regions:
-        """Return the regions that both robots must have seen under an alignment."""
+    def regions(self, alignment: Alignment, evidence: PairEvidence, side_m: float) -> Regions:
+        """Return the regions of a side that both robots must have seen under an alignment."""
         T_a_b, p_b = alignment.T_a_b, self._pairs.map_b.position_m[:, :2]
-        squares = RegionGrid.about(self._pairs.p_a[alignment.inlier], evidence.region_m)
+        squares = RegionGrid.about(self._pairs.p_a[alignment.inlier], side_m)
         others = (
             each.copies
             for each in evidence.motions
@@ -425,7 +425,8 @@ class PairVerifier:
         """Return log10 of the largest `least_ratio` that the regions pass; infinite without limit.
 
         Maps without repeated structure and without another motion need no evidence if the
-        supporters extend over two regions or more.
+        supporters extend over two regions or more. Less may be a copy that led to the motion as a
+        whole. It is then one region, which is no evidence.
         """
         ratio = regions.log10_evidence(evidence.shares)
         # the best of n wrong motions reaches the threshold n times as often (Boole)
@@ -434,8 +435,9 @@ class PairVerifier:
             return passed
         if ratio < 0 and regions.n_contradicted:
             return passed
-        if self._extent_m(alignment) < _TOUCHED * evidence.region_m:
-            return max(passed, regions.log10_ratio(evidence.shares))
+        if (extent_m := self._extent_m(alignment)) < _TOUCHED * evidence.region_m:
+            around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
+            return around.log10_evidence(evidence.shares)
         return math.inf
 
     def _doubt(

@@ -163,9 +163,20 @@ def test_a_room_that_is_all_there_is_may_be_another_s_like() -> None:
     assert refined.ok
     assert said.status is Status.AMBIGUOUS
     assert "little else than this place" in said.reason
-    small = Verifier(evidence=EvidenceParameters(place_m=1.0))
+    small = Verifier(evidence=EvidenceParameters(place_m=1.0, region_m=1.0))
     trusted, _ = verdict(mapped(room, 0, 4, seed=12), mapped(room, 0.5, 4, seed=13), small)
     assert trusted.status is Status.ACCEPTED
+
+
+@pytest.mark.parametrize(("start_b", "passed"), [(9.5, 0.0), (7.0, math.inf)])
+def test_what_agrees_within_two_regions_may_be_one_copy(start_b: float, passed: float) -> None:
+    """Two robots share the end of a wall, and nothing around it."""
+    small = Verifier(evidence=EvidenceParameters(place_m=1.0))
+    said, refined = verdict(A, mapped(COMMON, start_b, 19, seed=3, name="B"), small)
+    np.testing.assert_allclose(refined.T_a_b, between(1, start_b), atol=0.05)
+    assert said.log10_evidence > 1
+    assert said.log10_ratio_passed == passed
+    assert said.accepted == (passed > 0)
 
 
 def test_without_viewing_evidence_it_is_said_that_none_was_sought() -> None:
