@@ -501,7 +501,8 @@ class PairVerifier:
         scale = residual_scale(alignment.T_a_b, self._pairs[alignment.inlier])
         if scale < _OVERCONFIDENT:
             return ""
-        return f"the residuals are at least {scale:.2g} times as large as the maps' covariances state"
+        times = f"the residuals are at least {scale:.2g} times as large as"
+        return f"{times} the maps' covariances state"
 
     def _why_unsure(self, alignment: Alignment) -> str:
         """Return why the covariance of an alignment is too large; empty if it is not."""
