@@ -37,7 +37,7 @@ from mapfusion.files import (
 )
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se3 import tilt
-from mapfusion.parameters import require_finite, require_shape
+from mapfusion.geometry.numerics import require_finite, require_shape
 from mapfusion.robot_log import Observations
 from mapfusion.tables import described
 

@@ -40,15 +40,9 @@ from mapfusion.files import (
     schema,
     write_table,
 )
-from mapfusion.geometry.camera import EXACT, CalibrationError, calibration_from
+from mapfusion.camera import EXACT, CalibrationError, calibration_from
 from mapfusion.geometry.numerics import Float
-from mapfusion.parameters import (
-    LARGEST_POSITION_M,
-    require_finite,
-    require_no_twins,
-    require_points,
-    require_shape,
-)
+from mapfusion.geometry.numerics import LARGEST_POSITION_M, require_finite, require_no_twins, require_points, require_shape
 from mapfusion.tables import (
     APPEARANCE_FIELDS,
     DESCRIPTOR_LENGTH,

@@ -30,7 +30,7 @@ from mapfusion.files import (
 )
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import wrap
-from mapfusion.parameters import require_finite, require_shape
+from mapfusion.geometry.numerics import require_finite, require_shape
 from mapfusion.robot_log import RobotLog
 from mapfusion.tables import described
 

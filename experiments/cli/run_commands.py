@@ -202,7 +202,7 @@ def check(
     from experiments.evaluation.metrics import CheckedScenario, check_all
     from experiments.reports import export
     from experiments.reports.terminal import layout, run_screen
-    from experiments.scenario.seeds import parse_seeds
+    from experiments.scenario.suite import parse_seeds
     from experiments.scenario.settings import AnyScenario
 
     require_file("--output", output, DOCUMENT, scenarios)

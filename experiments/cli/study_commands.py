@@ -45,7 +45,7 @@ def refusal(
     from experiments.cli.options import require_folder
     from experiments.reports.study_files import draw_refusals, write_kinds
     from experiments.reports.terminal import layout, study_screen
-    from experiments.scenario.seeds import parse_seeds
+    from experiments.scenario.suite import parse_seeds
     from experiments.studies import refusal_rates, refusal_trial
     from experiments.studies.refusal_cases import worlds_of
     from experiments.studies.refusal_trial import PairsDrawn
@@ -130,7 +130,7 @@ def sweep(
     """
     from experiments.cli.options import require_folder
     from experiments.reports.terminal import layout, study_screen
-    from experiments.scenario.seeds import parse_seeds
+    from experiments.scenario.suite import parse_seeds
     from experiments.studies import sweep
 
     require_folder(output, scenarios)
@@ -347,7 +347,7 @@ def independence(
     from experiments.reports.study_files import write_independence
     from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.loading import load_scenario
-    from experiments.scenario.seeds import parse_seeds
+    from experiments.scenario.suite import parse_seeds
     from experiments.scenario.suite import one_scenario
     from experiments.studies import independence_trial
 

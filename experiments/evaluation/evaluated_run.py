@@ -47,7 +47,7 @@ from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from experiments.scenario.settings import AnyScenario, Recording
 from mapfusion.datasets.log_consistency import Finding, truth_finding
 from mapfusion.datasets.relative_motion import composed_spans, observed_spans, odometry_motions

@@ -21,7 +21,7 @@ from experiments.pipeline.stages.smooth import SmoothSettings, log_until, smooth
 from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
 from mapfusion.align.alignment import NOT_RUN, Pairs, Status
 from mapfusion.align.correspondences import match, why_not_unit_vectors

@@ -21,7 +21,7 @@ from mapfusion.datasets.stereo_import import (
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.datasets.text_files import read_odometry, read_tum
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import CalibrationError
+from mapfusion.camera import CalibrationError
 from mapfusion.vision.front_end import FrontEndParameters
 
 BY_IMAGES = "images"  # visual odometry, in place of an odometry file

@@ -227,3 +227,23 @@ def entries(folder: Path | None = None) -> list[dict[str, Any]]:
 
 def _number(value: Any) -> float | None:
     return value if isinstance(value, int | float) else None
+
+
+MAX_SEEDS = 1000  # days of computation; more is probably a typing error
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Parse `3`, `0..4` (both ends included) or `0,2,5`; raise InputError for other texts."""
+    try:
+        if ".." in text:
+            first, last = (int(part) for part in text.split(".."))
+            seeds = range(first, last + 1)[: MAX_SEEDS + 1]
+        else:
+            seeds = [int(part) for part in text.split(",")]
+    except ValueError:
+        seeds = []
+    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
+        raise InputError(f"--seeds {text}: expected a number, a range 0..4 or a list 0,2,5")
+    if len(seeds) > MAX_SEEDS:
+        raise InputError(f"--seeds {text}: more than {MAX_SEEDS} seeds")
+    return list(seeds)

@@ -23,7 +23,7 @@ from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, wri
 from experiments.pipeline.tasks import OnProgress, run_tasks, tasks_of
 from experiments.pipeline.workers import single_threaded, workers
 from experiments.plugins.discovery import callable_aligner, find_method, known_methods
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.scenario.suite import chosen_aligners, settings_of
 from experiments.studies.intervals import log_ratio, wilson

@@ -28,7 +28,7 @@ from experiments.pipeline.stages.smooth import SmoothSettings
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.workers import single_threaded
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.fastslam.mapping import run_log

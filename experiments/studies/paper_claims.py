@@ -34,7 +34,7 @@ from experiments.evaluation.loop_closures import WINDOW_FRAMES, LoopClosure, loo
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import repetition_spread_m
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from experiments.studies.benchmark import (
     BenchmarkDesign,
     crossing_shares,

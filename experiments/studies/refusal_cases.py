@@ -24,7 +24,7 @@ from experiments.pipeline.stages.robot_maps import RobotFolders, stored_maps
 from experiments.pipeline.stages.slam import evaluated_iterations
 from experiments.pipeline.store import Store
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import parse_seeds
+from experiments.scenario.suite import parse_seeds
 from experiments.scenario.settings import AlignerEntry, AnyScenario, Simulation
 from experiments.scenario.suite import scenarios_of
 from mapfusion.align.alignment import Alignment

@@ -18,7 +18,7 @@ from experiments.pipeline.stages.robot_maps import latest_at
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.tasks import OnProgress
 from experiments.pipeline.workers import workers
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from experiments.scenario.settings import Simulation
 from experiments.studies import refusal_cases
 from experiments.studies.refusal_cases import Case, MappedWorld

@@ -27,7 +27,7 @@ from experiments.evaluation.criteria import (
 from experiments.evaluation.fused_landmarks import mean_nees_band
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.path_errors import STATISTICS
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from experiments.studies import intervals
 from experiments.studies.method_comparison import (
     LAST,

@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
 from experiments.evaluation.criteria import MERGEABLE_PAIRS
-from experiments.scenario.seeds import parse_seeds
+from experiments.scenario.suite import parse_seeds
 from experiments.studies import refusal_cases
 from experiments.studies.refusal_cases import Case, MappedWorld, worlds_of
 from mapfusion.align.alignment import Pairs

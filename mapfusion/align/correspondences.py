@@ -19,7 +19,8 @@ from mapfusion.geometry.numerics import (
     trailing_zeros,
 )
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import Probability, Range, require_finite, require_in_range, require_shape
+from mapfusion.parameters import Probability, Range, require_in_range
+from mapfusion.geometry.numerics import require_finite, require_shape
 from mapfusion.robot_log import FILTERED_STRAY_M
 from mapfusion.tables import NO_LABEL
 

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from mapfusion.errors import InputError, OutOfRangeError
-from mapfusion.geometry.camera import MAX_IMAGE_SIDE_PX, StereoCamera
+from mapfusion.camera import MAX_IMAGE_SIDE_PX, StereoCamera
 from mapfusion.geometry.numerics import Float
 
 Distortion = Literal["none", "radial-tangential", "equidistant"]

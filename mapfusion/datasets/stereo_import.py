@@ -29,7 +29,7 @@ from mapfusion.datasets.text_files import NS, TimedPoses
 from mapfusion.errors import InputError, OutOfRangeError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import CalibrationError, StereoCamera, default_calibration_error
+from mapfusion.camera import CalibrationError, StereoCamera, default_calibration_error
 from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import (
     TRUTH_FILES,

@@ -39,7 +39,8 @@ from mapfusion.fastslam.resampling import effective_sample_size, normalised, sys
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import compose
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import Probability, Range, require_finite, require_in_range, require_shape
+from mapfusion.parameters import Probability, Range, require_in_range
+from mapfusion.geometry.numerics import require_finite, require_shape
 from mapfusion.robot_log import FILTERED_STRAY_M, Observations
 from mapfusion.tables import NO_LABEL
 

@@ -11,7 +11,7 @@ from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, FastSlamParameters, StepResult
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import require_shape
+from mapfusion.geometry.numerics import require_shape
 from mapfusion.robot_log import RobotLog
 from mapfusion.tables import NO_LABEL
 from mapfusion.viewing import viewing_of_log

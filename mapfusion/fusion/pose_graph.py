@@ -10,7 +10,7 @@ import numpy as np
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import IDENTITY, between, compose, inverse, rotation, wrap
-from mapfusion.parameters import require_finite, require_shape
+from mapfusion.geometry.numerics import require_finite, require_shape
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import IDENTITY, between, compose
-from mapfusion.parameters import require_shape
+from mapfusion.geometry.numerics import require_shape
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.smoother.elimination import pose_covariances, require_memory
 from mapfusion.smoother.noise_estimation import UNIT_SCALES, optimize_with_noise

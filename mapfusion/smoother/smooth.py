@@ -30,7 +30,8 @@ from mapfusion.geometry.joint_covariance import (
 from mapfusion.geometry.numerics import Float, chi_square_bound, one_blas_thread
 from mapfusion.geometry.se2 import between, rotation
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import Range, require_in_range, require_shape
+from mapfusion.parameters import Range, require_in_range
+from mapfusion.geometry.numerics import require_shape
 from mapfusion.robot_log import STRAY_M, RobotLog
 from mapfusion.smoother.elimination import require_memory, shared_errors
 from mapfusion.smoother.noise_estimation import UNIT_SCALES, NoiseScales, optimize_with_noise

@@ -21,7 +21,7 @@ from experiments.pipeline.stages.drive import Walls
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.se2 import compose
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, observable
 from mapfusion.vision.tracking import Tracker

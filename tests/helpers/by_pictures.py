@@ -13,7 +13,7 @@ from experiments.scenario.yaml_files import read_calibration
 from mapfusion.datasets.formats import read_recording
 from mapfusion.datasets.stereo_import import RecordingPart, StereoImport
 from mapfusion.fastslam.mapping import run_log
-from mapfusion.geometry.camera import EXACT
+from mapfusion.camera import EXACT
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import read_truth

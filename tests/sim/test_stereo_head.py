@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest, norm
 
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from sim.floorplan import FloorPlan
 from sim.stereo_head import (
     SAME_SURFACE,

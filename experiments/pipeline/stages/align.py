@@ -33,7 +33,7 @@ from experiments.pipeline.tables import (
     write_rows,
 )
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.correspondences import Correspondences, MatchParameters, match
 from mapfusion.align.refinement import Refinement

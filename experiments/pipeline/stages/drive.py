@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from experiments.pipeline.stage import Job, StageKind
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from mapfusion.errors import InputError
 from sim.driver import DriverSettings, drive, require_drivable
 from sim.floorplan import FloorPlan, Wall

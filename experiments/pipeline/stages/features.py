@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from mapfusion.files import (
     POSITION_FIELDS,
     column,
@@ -30,7 +30,7 @@ from mapfusion.files import (
     write_table,
     write_whole,
 )
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import with_rows
 from mapfusion.tables import DESCRIPTOR_LENGTH

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.log_consistency import Finding, Jump, check_log, gate_finding, without_jumps
 from mapfusion.datasets.odometry_noise import NoiseSource

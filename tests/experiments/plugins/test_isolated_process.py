@@ -20,7 +20,7 @@ from experiments.plugins.isolated_process import (
     end_children,
     process_for,
 )
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.geometry import se2
 from mapfusion.verification.registration import Registration, as_aligner

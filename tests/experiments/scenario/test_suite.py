@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.scenario.suite import MAX_SEEDS, parse_seeds
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from experiments.scenario.suite import SHIPPED as SUITE
@@ -185,3 +186,12 @@ def test_entries_hold_what_the_listing_shows() -> None:
     assert known["quick"]["overlap"] is None
     assert (known["quick"]["robots"], known["quick"]["iterations"]) == (2, 300)
     assert known["mrclam7"]["iterations"] is None
+
+
+def test_seeds() -> None:
+    assert parse_seeds("3") == [3]
+    assert parse_seeds("0..4") == [0, 1, 2, 3, 4]
+    assert parse_seeds("5,2,0") == [5, 2, 0]
+    assert len(parse_seeds("0..999")) == 1000
+    with pytest.raises(InputError, match="more than 1000"):
+        parse_seeds("0..1000")

@@ -14,7 +14,7 @@ from experiments.pipeline.store import Store
 from experiments.plugins import discovery
 from experiments.reports.figures.study_figures import draw_benchmark
 from experiments.reports.study_files import benchmark_markdown, cell_text
-from experiments.scenario.seeds import generator
+from mapfusion.geometry.numerics import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.studies import benchmark as benchmark
 from experiments.studies.benchmark import (

@@ -23,7 +23,7 @@ from mapfusion.align.rigid_motion import fit_rigid, least_squares_gain
 from mapfusion.fusion.fusers import AlignedPair, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
-from mapfusion.geometry.camera import EXACT, CalibrationError
+from mapfusion.camera import EXACT, CalibrationError
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import rotation

@@ -20,7 +20,7 @@ from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.datasets.text_files import TimedPoses
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.front_end import FrontEndParameters
 from mapfusion.vision.tracking import Features

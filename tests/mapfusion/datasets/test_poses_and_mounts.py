@@ -13,7 +13,7 @@ from mapfusion.datasets.levelling import (
 )
 from mapfusion.datasets.text_files import TimedPoses
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 
 TIMES_NS = np.array([0, 10, 20, 60]) * 100_000_000

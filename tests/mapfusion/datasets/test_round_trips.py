@@ -14,7 +14,7 @@ from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImpo
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2, se3
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.vision.front_end import (
     FrontEnd,
     FrontEndParameters,

@@ -9,7 +9,7 @@ from mapfusion.datasets.stereo_import import (
     scale_descriptor_window,
 )
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.vision.front_end import FrontEndParameters
 from mapfusion.vision.tracking import Tracks
 from mapfusion.vision.visual_odometry import RigidMotion

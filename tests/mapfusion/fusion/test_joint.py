@@ -16,7 +16,7 @@ from mapfusion.fusion.joint_estimate import JointMap, estimate_jointly
 from mapfusion.fusion.kalman import KalmanDrift
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
-from mapfusion.geometry.camera import CalibrationError
+from mapfusion.camera import CalibrationError
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.robust_loss import information_share
 from mapfusion.verification.registration import Registration

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.attitude_filter import (
     LOST_M,

@@ -1,4 +1,4 @@
-"""Tests of `mapfusion.geometry.camera`."""
+"""Tests of `mapfusion.camera`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2
-from mapfusion.geometry.camera import (
+from mapfusion.camera import (
     EXACT,
     CalibrationError,
     StereoCamera,
