@@ -8,10 +8,10 @@ from numbers import Integral, Real
 from types import NoneType
 from typing import Annotated, Any, get_args, get_type_hints
 
-import numpy as np
 from annotated_types import BaseMetadata, Ge, GroupedMetadata, Le
 
 from mapfusion.errors import OutOfRangeError
+
 
 @dataclass(frozen=True)
 class Unit(BaseMetadata):

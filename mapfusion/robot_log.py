@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import pyarrow as pa
 
+from mapfusion.camera import EXACT, CalibrationError, calibration_from
 from mapfusion.errors import InputError
 from mapfusion.files import (
     COVARIANCE_FIELDS,
@@ -40,9 +41,14 @@ from mapfusion.files import (
     schema,
     write_table,
 )
-from mapfusion.camera import EXACT, CalibrationError, calibration_from
-from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.numerics import LARGEST_POSITION_M, require_finite, require_no_twins, require_points, require_shape
+from mapfusion.geometry.numerics import (
+    LARGEST_POSITION_M,
+    Float,
+    require_finite,
+    require_no_twins,
+    require_points,
+    require_shape,
+)
 from mapfusion.tables import (
     APPEARANCE_FIELDS,
     DESCRIPTOR_LENGTH,

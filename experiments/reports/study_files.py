@@ -19,7 +19,7 @@ from experiments.reports.export import publish_json, to_markdown, write_tables, 
 from experiments.reports.figures import study_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
-from experiments.reports.terminal.statistics_screen import print_summary
+from experiments.reports.statistics_screen import print_summary
 from experiments.scenario.settings import AnyScenario
 from experiments.studies.benchmark import SIGMA_M, SIZE_M, SUMMARY, TRIALS, BenchmarkDesign
 from experiments.studies.independence_trial import (

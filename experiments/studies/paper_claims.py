@@ -34,7 +34,6 @@ from experiments.evaluation.loop_closures import WINDOW_FRAMES, LoopClosure, loo
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import repetition_spread_m
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields
-from mapfusion.geometry.numerics import generator
 from experiments.studies.benchmark import (
     BenchmarkDesign,
     crossing_shares,
@@ -45,6 +44,7 @@ from experiments.studies.intervals import RUN, Clusters, median_interval
 from experiments.studies.run_tables import Runs
 from mapfusion.errors import InputError
 from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, schema
+from mapfusion.geometry.numerics import generator
 
 SCENARIOS = ("paper_as_printed", "paper")
 ALIGNERS = ("ransac", "svd", "icp", "impicp")  # of the paper

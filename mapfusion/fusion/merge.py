@@ -18,8 +18,8 @@ from mapfusion.fusion.fusers import (
 )
 from mapfusion.fusion.pose_graph import AlignmentEdges
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters, team_graph
-from mapfusion.landmark_map import LandmarkMap
 from mapfusion.geometry.numerics import require_shape
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.joint_smoothing import AssociatedLog
 
 DEFAULTS = MergeParameters()

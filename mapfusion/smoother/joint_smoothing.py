@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_shape
 from mapfusion.geometry.se2 import IDENTITY, between, compose
-from mapfusion.geometry.numerics import require_shape
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.smoother.elimination import pose_covariances, require_memory
 from mapfusion.smoother.noise_estimation import UNIT_SCALES, optimize_with_noise

@@ -27,11 +27,10 @@ from mapfusion.geometry.joint_covariance import (
     StackedErrors,
     reduce_rank,
 )
-from mapfusion.geometry.numerics import Float, chi_square_bound, one_blas_thread
+from mapfusion.geometry.numerics import Float, chi_square_bound, one_blas_thread, require_shape
 from mapfusion.geometry.se2 import between, rotation
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Range, require_in_range
-from mapfusion.geometry.numerics import require_shape
 from mapfusion.robot_log import STRAY_M, RobotLog
 from mapfusion.smoother.elimination import require_memory, shared_errors
 from mapfusion.smoother.noise_estimation import UNIT_SCALES, NoiseScales, optimize_with_noise

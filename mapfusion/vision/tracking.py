@@ -10,9 +10,8 @@ from typing import Annotated
 import numpy as np
 
 from mapfusion.camera import StereoCamera
-from mapfusion.geometry.numerics import Float, kernel
+from mapfusion.geometry.numerics import Float, kernel, require_finite, require_shape
 from mapfusion.parameters import Probability, Range, require_in_range
-from mapfusion.geometry.numerics import require_finite, require_shape
 from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.patch_alignment import Templates, fit_patches
 from mapfusion.vision.visual_odometry import RigidMotion, estimate_rigid_motion

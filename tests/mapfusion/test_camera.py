@@ -10,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mapfusion.errors import InputError
-from mapfusion.geometry import se2
 from mapfusion.camera import (
     EXACT,
     CalibrationError,
@@ -19,6 +17,8 @@ from mapfusion.camera import (
     calibration_from,
     default_calibration_error,
 )
+from mapfusion.errors import InputError
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import read_map, write_map
 from mapfusion.robot_log import Observations, RobotLog, read_log, write_log
 from tests.mapfusion.align.map_pairs import landmarks

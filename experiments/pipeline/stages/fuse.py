@@ -16,10 +16,12 @@ import pyarrow as pa
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages import align
 from experiments.pipeline.stages.align import alignment_of, correspondences_of
-from experiments.pipeline.stages.robot_maps import RobotFolders, latest_at, maps_of
 from experiments.pipeline.stages.smooth import (
+    RobotFolders,
+    latest_at,
     log_to_smooth,
     log_until,
+    maps_of,
     read_smoothed_path,
     smoothed_owners,
 )

@@ -10,18 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own
+from scipy.stats import pearsonr
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import mapfusion.fusion.joint
 import mapfusion.smoother.smooth
 from mapfusion.fusion.fusers import MergeParameters
-from mapfusion.geometry.numerics import generator, require_no_twins
-from scipy.stats import pearsonr
 from mapfusion.geometry.numerics import (
     chi_square_bound,
     cholesky,
     cofactors,
+    generator,
     one_blas_thread,
+    require_no_twins,
     solve_lower,
     solve_upper,
 )
