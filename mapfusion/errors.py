@@ -128,7 +128,7 @@ def _first_of(words: Sequence[str], most: int) -> list[str]:
 _FORMER_MODULES = {
     "geometry.se2": "se2 planar",
     "geometry.se3": "se3",
-    "geometry.camera": "camera calibration_error",
+    "camera": "calibration_error geometry.camera",
     "geometry.joint_covariance": "joint_covariance",
     "geometry.numerics": "kernels one_thread chi_square symmetric align.bits",
     "parameters": "arguments",

@@ -379,7 +379,16 @@ class EvaluatedFusion:
         return consistencies(self.fusion.landmarks, self.fit)
 
     def row(self) -> dict[str, Any]:
-        """Return the row of the table `fusers`."""
+        """Return the row of the table `fusers`, with medians over the motions of the maps."""
+        first, *others = self.fusion.members
+        T_world_first, errors = self.given[first].robot.path.T_world_map, []
+        for k in others:
+            T_true = se2.between(T_world_first, self.given[k].robot.path.T_world_map)
+            T, covariance = self.fusion.T_first_map[k], self.fusion.motion_covariance[k]
+            error_m, error_rad = motion_errors(T, T_true)
+            nees = alignment_nees(T, covariance, T_true)
+            errors.append([error_m, abs(error_rad), *se2.motion_sigma(covariance), nees / 3])
+        medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
         landmarks, fit = self.fusion.landmarks, self.fit
         relative, in_frame = self.consistency
         return {
@@ -400,7 +409,7 @@ class EvaluatedFusion:
             "frame_coverage_95": in_frame.coverage_95,
             "duplicate_share": self.fusion.duplicate_share,
             "fallback": self.fallback,
-        } | self._motion_errors()
+        } | dict(zip(_MOTION_FIGURES, medians.tolist(), strict=True))
 
     def _over_better_map(self, of_filter: bool) -> float:
         """Return the error of the fused map over the error of the better of two robots' maps.
@@ -446,19 +455,6 @@ class EvaluatedFusion:
                 rms = np.sqrt(np.mean(three**2, axis=1))
                 ratios.append(rms[0] / min(rms[1:]) if min(rms[1:]) > 0 else np.nan)
         return float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else np.nan
-
-    def _motion_errors(self) -> dict[str, float]:
-        """Return median errors, standard deviations and NEES of the motions of the robots' maps."""
-        first, *others = self.fusion.members
-        T_world_first, errors = self.given[first].robot.path.T_world_map, []
-        for k in others:
-            T_true = se2.between(T_world_first, self.given[k].robot.path.T_world_map)
-            T, covariance = self.fusion.T_first_map[k], self.fusion.motion_covariance[k]
-            error_m, error_rad = motion_errors(T, T_true)
-            nees = alignment_nees(T, covariance, T_true)
-            errors.append([error_m, abs(error_rad), *se2.motion_sigma(covariance), nees / 3])
-        medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
-        return dict(zip(_MOTION_FIGURES, medians.tolist(), strict=True))
 
 
 def last_fused(rows: pd.DataFrame) -> pd.DataFrame:

@@ -342,6 +342,8 @@ def write_claims(folder: Path, values: pd.DataFrame, crossing: pd.DataFrame) -> 
 
 def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
     """Return the page "The paper beside this software" in Markdown."""
+    runs = values.groupby(["scenario", "renderer"], sort=False)["n_runs"].max().reset_index()
+    drawn = (f"`{row.scenario}`: {row.n_runs} by {row.renderer}" for row in runs.itertuples())
     parts = [
         "# The paper beside this software\n",
         "Written by `mapfusion study paper`; do not edit. `paper_as_printed` runs the methods of "
@@ -352,7 +354,7 @@ def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
         "it, refuted if all of it lies outside, and partly confirmed otherwise. The range is in "
         "`claims.csv` beside this page. T_a_b is the motion from the frame of map b to that of "
         f"map a; errors are those of T_a_b before the common least squares. "
-        f"{_drawn_by(values)}\n",
+        f"Runs and their renderers: {'; '.join(drawn)}.\n",
         "## Readings of the paper\n",
         *(f"- {line}" for line in READINGS),
         "",
@@ -366,13 +368,6 @@ def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
         *(f"{line}\n" for line in crossing_lines(crossing)),
     ]
     return "\n".join(parts)
-
-
-def _drawn_by(values: pd.DataFrame) -> str:
-    """Say who drew the pictures of how many runs."""
-    runs = values.groupby(["scenario", "renderer"], sort=False)["n_runs"].max().reset_index()
-    each = (f"`{row.scenario}`: {row.n_runs} by {row.renderer}" for row in runs.itertuples())
-    return f"Runs and their renderers: {'; '.join(each)}."
 
 
 def claims_table(values: pd.DataFrame) -> pd.DataFrame:
@@ -392,14 +387,13 @@ def claim_text(row: Mapping[str, Any]) -> str:
     """Write verdict, value and interval of a row of VALUES."""
     if math.isnan(row["value"]):
         return str(row["verdict"])
-    value, low, high = (_number_text(row[name]) for name in ("value", "value_low", "value_high"))
+    value, low, high = (
+        "no answer" if math.isinf(row[name]) else f"{row[name]:.3g}"
+        for name in ("value", "value_low", "value_high")
+    )
     unit = f" {row['unit']}" if row["unit"] else ""
     interval = f" ({low} to {high})" if not math.isnan(row["value_low"]) else " (one run)"
     return f"**{row['verdict']}**: {value}{unit}{interval}"
-
-
-def _number_text(value: float) -> str:
-    return "no answer" if math.isinf(value) else f"{value:.3g}"
 
 
 def crossing_lines(crossing: pd.DataFrame) -> list[str]:

@@ -43,8 +43,23 @@ def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path | None = None
         path = Path(wanted)
         if path.suffix in SUFFIXES or len(path.parts) > 1 or path.is_file():
             found.append(path)
-        else:
-            found += _named(str(wanted), folder)
+            continue
+        files, word = _files(folder), str(wanted)
+        if any(path.stem == word for path in files):
+            # reading all files is slow: read only those that contain the name
+            files = [path for path in files if path.stem == word or _mentions(path, word)]
+        known = {path: read_mapping(path) for path in files}
+        by_name = [path for path, data in known.items() if word in (data.get("name"), path.stem)]
+        by_tag = [path for path, data in known.items() if word in _tags(data)]
+        if not by_name and not by_tag:
+            tags = sorted({tag for data in known.values() for tag in _tags(data)})
+            raise InputError(
+                f"{word}: neither a file, nor a scenario of {folder or 'the suite'} "
+                f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
+                f"({', '.join(tags) or 'there is none'})"
+                f"{did_you_mean(word, [*(path.stem for path in known), *tags])}"
+            )
+        found += by_name or by_tag
     return list(dict.fromkeys(found))
 
 
@@ -126,25 +141,6 @@ def chosen_aligners(
                 raise InputError(f"--aligner {name}: {' '.join(str(error).split())}") from error
         chosen.append(known[name])
     return tuple(chosen)
-
-
-def _named(wanted: str, folder: Path | None) -> list[Path]:
-    files = _files(folder)
-    if any(path.stem == wanted for path in files):
-        # reading all files is slow: read only those that contain the name
-        files = [path for path in files if path.stem == wanted or _mentions(path, wanted)]
-    known = {path: read_mapping(path) for path in files}
-    by_name = [path for path, data in known.items() if wanted in (data.get("name"), path.stem)]
-    by_tag = [path for path, data in known.items() if wanted in _tags(data)]
-    if not by_name and not by_tag:
-        tags = sorted({tag for data in known.values() for tag in _tags(data)})
-        raise InputError(
-            f"{wanted}: neither a file, nor a scenario of {folder or 'the suite'} "
-            f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
-            f"({', '.join(tags) or 'there is none'})"
-            f"{did_you_mean(wanted, [*(path.stem for path in known), *tags])}"
-        )
-    return by_name or by_tag
 
 
 def _mentions(path: Path, word: str) -> bool:

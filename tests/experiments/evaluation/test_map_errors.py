@@ -386,7 +386,7 @@ def test_the_run_ends_and_says_what_stands_in(
 
 T_WORLD_A = np.array([1.0, 2.0, 0.3])
 T_WORLD_B = np.array([4.0, -1.0, 3.0])
-POINTS = np.random.default_rng(5).uniform(0, 6, (12, 3))
+GROUND = np.random.default_rng(5).uniform(0, 6, (12, 3))
 
 
 def judged(estimated: Alignment, refined: Alignment, index_b: list[int]) -> pd.DataFrame:
@@ -395,7 +395,7 @@ def judged(estimated: Alignment, refined: Alignment, index_b: list[int]) -> pd.D
     names = {"robot_a": "A", "robot_b": "B", "iteration": ITERATION}
     row = names | {"aligner": "ransac", "repetition": 0}
     estimates = pd.DataFrame([row | estimate_row(len(pairs), estimated, refined, ACCEPTED)])
-    a, b = robot("A", POINTS, T_WORLD_A), robot("B", POINTS, T_WORLD_B)
+    a, b = robot("A", GROUND, T_WORLD_A), robot("B", GROUND, T_WORLD_B)
     (met,) = join_map_pairs([a, b], estimates, offered("A", "B", pairs), NO_RIVALS)
     return error_rows(met, Verifier(), 0.1).set_index("aligner")
 
@@ -517,11 +517,11 @@ def test_alignment_nees_leaves_its_arguments_alone() -> None:
 
 
 def test_a_robot_whose_log_ended_keeps_its_last_map() -> None:
-    early, late = robot("A", POINTS[:3], T_WORLD_A), robot("A", POINTS[:5], T_WORLD_A)
+    early, late = robot("A", GROUND[:3], T_WORLD_A), robot("A", GROUND[:5], T_WORLD_A)
     both = EvaluatedRobot(
         "A",
         {5: early.maps[ITERATION], 9: late.maps[ITERATION]},
-        {5: POINTS[:3], 9: POINTS[:5]},
+        {5: GROUND[:3], 9: GROUND[:5]},
         early.path,
     )
     assert [len(both.at(k)[0]) for k in (1, 5, 8, 9, 100)] == [3, 3, 3, 5, 5]
@@ -553,12 +553,12 @@ def test_paths_and_their_errors() -> None:
 
 
 RADIUS_M = 0.1
-WORLD = np.random.default_rng(0).uniform(0, 20, (40, 3))  # no two within the radius
+MATCHED_M = np.random.default_rng(0).uniform(0, 20, (40, 3))  # no two within the radius
 
 
 def seeing(name: str, by_iteration: dict[int, list[int]], off_m: float = 0.0) -> EvaluatedRobot:
     """A robot that has these points of the world in its maps, each off by so much along x."""
-    points = {k: WORLD[rows] + [off_m, 0, 0] for k, rows in by_iteration.items()}
+    points = {k: MATCHED_M[rows] + [off_m, 0, 0] for k, rows in by_iteration.items()}
     maps = {k: landmark_map(own, name) for k, own in points.items()}
     return EvaluatedRobot(name, maps, points, PathTruth(np.zeros((1, 3)), np.zeros(3)))
 
