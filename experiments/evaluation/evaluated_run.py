@@ -46,6 +46,7 @@ from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, 
 from experiments.pipeline.workers import workers
 from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.settings import AnyScenario, Recording
+from mapfusion.align.aligners import Aligner
 from mapfusion.datasets.log_consistency import Finding, truth_finding
 from mapfusion.datasets.relative_motion import composed_spans, observed_spans, odometry_motions
 from mapfusion.errors import DamagedFileError, InputError
@@ -54,7 +55,6 @@ from mapfusion.fusion.fusers import make_fuser
 from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log, read_true_poses
-from mapfusion.verification.registration import Aligner
 
 TABLES_PART = "tables"  # part of a run outside its stages, in the table `timings`
 SMOOTHED_PREFIX = "smoothed_"  # of tables of alignments of smoothed maps

@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.plugins.isolated_process import IsolatedAligner, ProcessFailedError, process_for
-from mapfusion.align.aligners import ALIGNERS, PEERS, construct
+from mapfusion.align.aligners import ALIGNERS, PEERS, Aligner, as_aligner, construct
 from mapfusion.errors import did_you_mean, not_installed
-from mapfusion.verification.registration import Aligner, as_aligner
 
 ENTRY_POINTS = "mapfusion.aligners"  # group of the entry points that declare aligners
 _CODE_SUFFIXES = (".py", ".so", ".pyd")
