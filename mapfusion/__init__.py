@@ -28,7 +28,7 @@ _NAMES_OF = {
     "fusion.team_graph": ("EdgeStatus", "TeamParameters", "Unconfirmed"),
     "landmark_map": ("LandmarkMap", "read_map", "write_map"),
     "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
-    "smoother.joint_smoothing": ("AssociatedLog",),
+    "smoother.smooth": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),
     "verification.regions": ("EvidenceParameters",),
     "verification.registration": ("Registered", "Registration"),

@@ -33,7 +33,7 @@ from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log
 from mapfusion.robot_log import write_log as write_log
-from mapfusion.smoother.joint_smoothing import AssociatedLog as AssociatedLog
+from mapfusion.smoother.smooth import AssociatedLog as AssociatedLog
 from mapfusion.verification.false_alarms import Acceptance as Acceptance
 from mapfusion.verification.regions import EvidenceParameters as EvidenceParameters
 from mapfusion.verification.registration import Registered as Registered

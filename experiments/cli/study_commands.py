@@ -156,10 +156,13 @@ def statistics(
 ) -> None:
     """Summarise success, errors and consistency of runs: `mapfusion statistics results/quick-*`."""
     from experiments.cli.options import require_folder
+    from experiments.reports.statistics_screen import print_summary
     from experiments.reports.study_files import run_statistics
 
     require_folder(output, paths)
-    run_statistics(paths, output, as_json)
+    summary, skipped = run_statistics(paths, output, as_json)
+    if not as_json:
+        print_summary(summary, output, skipped)
 
 
 @app.command(rich_help_panel=options.LOOK)

@@ -19,7 +19,6 @@ from experiments.reports.export import publish_json, to_markdown, write_tables, 
 from experiments.reports.figures import study_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
-from experiments.reports.statistics_screen import print_summary
 from experiments.scenario.settings import AnyScenario
 from experiments.studies.benchmark import SIGMA_M, SIZE_M, SUMMARY, TRIALS, BenchmarkDesign
 from experiments.studies.independence_trial import (
@@ -47,8 +46,13 @@ from mapfusion.files import schema, write_json
 _FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_time")
 
 
-def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = False) -> None:
-    """Print the main tables, or all as JSON; write all and figures 4 to 6 into an output folder.
+def run_statistics(
+    paths: Sequence[Path], output: Path | None, as_json: bool = False
+) -> tuple[Summary, list[str]]:
+    """Write all tables and figures 4 to 6 into an output folder, and the tables as JSON if asked.
+
+    Returns:
+        The tables, and lines about figures that could not be drawn.
 
     Raises:
         InputError: a path has no runs, no run knows the truth, or a table is damaged.
@@ -67,8 +71,7 @@ def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = F
         publish_json(
             "statistics", contents | {"written": output, "tables": summary.tables}, shown=True
         )
-    else:
-        print_summary(summary, output, skipped)
+    return summary, skipped
 
 
 def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:

@@ -20,7 +20,7 @@ from mapfusion.fusion.pose_graph import AlignmentEdges
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters, team_graph
 from mapfusion.geometry.numerics import require_shape
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.smoother.joint_smoothing import AssociatedLog
+from mapfusion.smoother.smooth import AssociatedLog
 
 DEFAULTS = MergeParameters()
 

@@ -238,6 +238,29 @@ class SmootherParameters:
 
 
 @dataclass(frozen=True)
+class AssociatedLog:
+    """Log of a robot with data association and path.
+
+    Attributes:
+        log: T frames with N observations.
+        landmark: `source_observation` of the map's landmark for each observation, shape (N,);
+            negative for none.
+        path: approximate path, shape (T, 3), for example smoothed; its first pose is the frame of
+            the map.
+        parameters: parameters of the smoother.
+    """
+
+    log: RobotLog
+    landmark: np.ndarray
+    path: Float
+    parameters: SmootherParameters
+
+    def __post_init__(self) -> None:
+        require_shape("landmark", self.landmark, (len(self.log.observations),))
+        require_shape("path", self.path, (len(self.log), 3))
+
+
+@dataclass(frozen=True)
 class Smoothed:
     """Result of the smoother.
 

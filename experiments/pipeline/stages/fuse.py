@@ -54,8 +54,7 @@ from mapfusion.fusion.fusers import AlignedPair, FusedMap, MergeParameters, make
 from mapfusion.fusion.merge import ConnectedMaps, connect
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
-from mapfusion.smoother.joint_smoothing import AssociatedLog
-from mapfusion.smoother.smooth import SmootherParameters
+from mapfusion.smoother.smooth import AssociatedLog, SmootherParameters
 
 WRITES = ("landmarks.parquet", "parents.parquet", "motions.parquet", "map.parquet")
 _OF = {"iteration": INT, "component": INT}  # component 1 has the most robots
