@@ -8,20 +8,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.scenario.yaml_files import OWN, SHIPPED, read_mapping
+from experiments.scenario.yaml_files import OWN, SHIPPED, lines_of_keys, read_mapping
 from mapfusion.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from experiments.scenario.settings import AlignerEntry, Scenario
-
-from collections.abc import Iterator
-
-from experiments.scenario.yaml_files import lines_of_keys
-from mapfusion.files import write_whole
 
 _TAGS = re.compile(r"^tags: \[([^]\n]+)\]", re.MULTILINE)
 SUFFIXES = {".yaml", ".yml", ".json"}  # a JSON file is YAML too: a result's scenario.json
@@ -292,7 +287,8 @@ def copy_to_edit(name: str) -> tuple[Path, Path]:
     Raises:
         InputError: the name is unknown, or the file exists.
     """
-    from experiments.scenario.loading import schema_text  # a slow import
+    from experiments.scenario.loading import schema_text  # slow imports
+    from mapfusion.files import write_whole
 
     source = shipped_scenario(name)
     copy, schema = OWN / source.name, OWN / "schema.json"
