@@ -188,12 +188,7 @@ def _drive_once(
                 finished = [driver.finished for driver in drivers]
                 monitor.apply_holds(now)
                 for i, driver in enumerate(drivers):
-                    others = (
-                        _Other(now[j], j, j < i and not finished[j], i in other.waits_for)
-                        for j, other in enumerate(drivers)
-                        if j != i
-                    )
-                    driver.control(time_s, now[i], others)
+                    driver.control(time_s, now[i], _others(i, now, finished, drivers))
                 if (hold := monitor.hold_needed(now)) is not None:
                     return hold
                 walls.stand_near(now)
@@ -240,6 +235,16 @@ class _Other(NamedTuple):
         passes = self.goes_first and self.yields
         beside_m = OUTER_RADIUS_M + (WIDTH_M / 2 if passes else OUTER_RADIUS_M)
         return x < 2 * OUTER_RADIUS_M + STOPPING_GAP_M and abs(y) < beside_m
+
+
+def _others(
+    robot: int, now: list[Pose], finished: list[bool], drivers: list["_Driver"]
+) -> Iterator[_Other]:
+    """Yield all robots except one, from the view of that one."""
+    for i, driver in enumerate(drivers):
+        if i != robot:
+            goes_first = i < robot and not finished[i]
+            yield _Other(now[i], i, goes_first, robot in driver.waits_for)
 
 
 class _Driver:

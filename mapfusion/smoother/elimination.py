@@ -260,33 +260,8 @@ class Solution(NamedTuple):
 def solve(obs: OrderedObservations, equations: NormalEquations) -> Solution:
     """Solve the equations of these observations for the next step."""
     if _is_landmarks_first(obs):
-        reduced = eliminate_offsets(obs, equations.points)
-        poses = ReducedPoses(obs, equations, reduced)
-        gradient, factor = poses.gradient(), poses.factor()
-        path_step = poses.solve(factor, -gradient)
-        path_term = coupling_times_poses(obs, equations.coupling, path_step)
-        step = Estimate(path_step, *substitute_points(obs, equations.points, reduced, path_term))
-        squared_step, known = -float(np.vdot(gradient, path_step)), point_covariances(obs, reduced)
-        own = reduced.landmark_m2, known.offset_m2, known.track_m2
-        return Solution(step, squared_step, *own, factor, landmarks_first=True)
-    n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(obs.has_offset)
-    B, K, gradient = pose_point_blocks(obs, equations)
-    chain = chain_factor(equations)
-    right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
-    solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
-    whole = Envelope(np.zeros(len(K), dtype=np.int64))
-    factor = factor_in_envelope(whole.of(K - B.T @ solved[:, :-1]), whole)
-    points = -factor.solve_transposed(factor.solve(gradient - B.T @ solved[:, -1]))
-    path_step, offsets = np.zeros((n_poses, 3)), np.zeros((len(obs.has_offset), 3))
-    path_step[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
-    offsets[obs.has_offset] = points[:n_offsets].reshape(-1, 3)
-    step = Estimate(path_step, points[n_offsets:].reshape(-1, 3), offsets)
-    reduced = eliminate_offsets(obs, equations.points)
-    known = point_covariances(obs, reduced)
-    own = reduced.landmark_m2, known.offset_m2, known.track_m2
-    last = step.point_m.ravel()
-    squared_step = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
-    return Solution(step, squared_step, *own, factor, landmarks_first=False)
+        return _eliminate_landmarks_first(obs, equations)
+    return _eliminate_poses_first(obs, equations)
 
 
 def solve_points(
@@ -363,6 +338,39 @@ def pose_covariances(
         right, alone = pose_point_blocks(obs, equations)[0].T @ solved, right.T @ solved
     root = solution.factor.solve(right)
     return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+
+
+def _eliminate_landmarks_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
+    reduced = eliminate_offsets(obs, equations.points)
+    poses = ReducedPoses(obs, equations, reduced)
+    gradient, factor = poses.gradient(), poses.factor()
+    path_step = poses.solve(factor, -gradient)
+    path_term = coupling_times_poses(obs, equations.coupling, path_step)
+    step = Estimate(path_step, *substitute_points(obs, equations.points, reduced, path_term))
+    squared_step, known = -float(np.vdot(gradient, path_step)), point_covariances(obs, reduced)
+    own = reduced.landmark_m2, known.offset_m2, known.track_m2
+    return Solution(step, squared_step, *own, factor, landmarks_first=True)
+
+
+def _eliminate_poses_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
+    n_poses, n_offsets = len(equations.pose_block), 3 * np.count_nonzero(obs.has_offset)
+    B, K, gradient = pose_point_blocks(obs, equations)
+    chain = chain_factor(equations)
+    right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
+    solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
+    whole = Envelope(np.zeros(len(K), dtype=np.int64))
+    factor = factor_in_envelope(whole.of(K - B.T @ solved[:, :-1]), whole)
+    points = -factor.solve_transposed(factor.solve(gradient - B.T @ solved[:, -1]))
+    path_step, offsets = np.zeros((n_poses, 3)), np.zeros((len(obs.has_offset), 3))
+    path_step[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
+    offsets[obs.has_offset] = points[:n_offsets].reshape(-1, 3)
+    step = Estimate(path_step, points[n_offsets:].reshape(-1, 3), offsets)
+    reduced = eliminate_offsets(obs, equations.points)
+    known = point_covariances(obs, reduced)
+    own = reduced.landmark_m2, known.offset_m2, known.track_m2
+    last = step.point_m.ravel()
+    squared_step = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
+    return Solution(step, squared_step, *own, factor, landmarks_first=False)
 
 
 def pose_point_blocks(

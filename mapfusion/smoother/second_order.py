@@ -139,27 +139,30 @@ class _Drawing(NamedTuple):
         return cls(problem, state, at, weights, poses, to_robot, predicted_m)
 
     def errors(self, rng: np.random.Generator, n: int) -> tuple[Float, Float]:
-        """Return n draws of q: errors (n, T, 3) of the path and (n, L, 3) of the landmarks.
+        """Return n draws of q: errors (n, T, 3) of the path and (n, L, 3) of the landmarks."""
+        path = np.empty((n, *self.at.path.shape))
+        point_m = np.empty((n, *self.at.point_m.shape))
+        for k in range(n):
+            path[k], point_m[k] = self._second_order(self._draw(rng))
+        return path, point_m
 
-        A draw is an error d of the path and of the points, given the path. The points' errors for
-        a known path have no second-order effect and are left out.
+    def _draw(self, rng: np.random.Generator) -> Estimate:
+        """Draw an error d of the path and of the points, given the path.
+
+        The points' errors for a known path have no second-order effect and are left out.
         """
-        obs, equations, factor = self.state.obs, self.state.equations, self.state.solution.factor
-        reduced = self.poses.reduced
+        factor, reduced = self.state.solution.factor, self.poses.reduced
+        normal = rng.standard_normal(len(factor))
+        path_step = self.poses.by_frame(factor.solve_transposed(normal))
         still = reduced._replace(
             offset_gradient=np.zeros_like(reduced.offset_gradient),
             point_gradient=np.zeros_like(reduced.point_gradient),
         )
-        path = np.empty((n, *self.at.path.shape))
-        point_m = np.empty((n, *self.at.point_m.shape))
-        for k in range(n):
-            path_step = self.poses.by_frame(
-                factor.solve_transposed(rng.standard_normal(len(factor)))
-            )
-            path_term = coupling_times_poses(obs, equations.coupling, path_step)
-            points = substitute_points(obs, equations.points, still, path_term)
-            path[k], point_m[k] = self._second_order(Estimate(path_step, *points))
-        return path, point_m
+        equations = self.state.equations
+        path_term = coupling_times_poses(self.state.obs, equations.coupling, path_step)
+        return Estimate(
+            path_step, *substitute_points(self.state.obs, equations.points, still, path_term)
+        )
 
     def _second_order(self, error: Estimate) -> tuple[Float, Float]:
         """Return q of path and landmarks for an error d.

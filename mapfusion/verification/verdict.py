@@ -454,10 +454,7 @@ class PairVerifier:
         ratio = regions.log10_evidence(evidence.shares)
         if rival is not None and rival.log10_evidence > ratio - math.log10(settings.most_against):
             return f"{{told}}; so do {_named(rival)}"
-        smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
-        most = np.count_nonzero(alignment.inlier) > smaller / 2
-        if most and extent_m < settings.place_m:
-            # most of the smaller map agrees and lies within the size of a room
+        if self._is_one_place(alignment, extent_m):
             what = f"the maps show little else than this place of {extent_m:.2g} m"
             return f"{what}; what lies around it tells whether it is another's like"
         if math.log10(settings.least_ratio) <= log10_ratio_passed:
@@ -483,6 +480,12 @@ class PairVerifier:
     def _extent_m(self, alignment: Alignment) -> float:
         """Return the longer side of the bounding box of the supporters."""
         return float(np.ptp(self._pairs.p_b[alignment.inlier, :2], axis=0).max(initial=0.0))
+
+    def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
+        """Return True if most of the smaller map agrees and lies within the size of a room."""
+        smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
+        most = np.count_nonzero(alignment.inlier) > smaller / 2
+        return bool(most) and extent_m < self._settings.evidence.place_m
 
     def _overconfidence_note(self, alignment: Alignment) -> str:
         """Say that the residuals contradict the covariances of the maps; empty if they do not.
