@@ -12,7 +12,7 @@ import importlib
 from typing import Any
 
 _NAMES_OF = {
-    "align.aligners": ("make_aligner",),
+    "align.aligners": ("Aligner", "make_aligner"),
     "align.alignment": ("Alignment", "Status"),
     "align.correspondences": ("Correspondences", "MatchParameters", "match"),
     "align.refinement": ("Refinement",),
@@ -28,10 +28,10 @@ _NAMES_OF = {
     "fusion.team_graph": ("EdgeStatus", "TeamParameters", "Unconfirmed"),
     "landmark_map": ("LandmarkMap", "read_map", "write_map"),
     "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
-    "smoother.joint_smoothing": ("AssociatedLog",),
+    "smoother.smooth": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),
     "verification.regions": ("EvidenceParameters",),
-    "verification.registration": ("Aligner", "Registered", "Registration"),
+    "verification.registration": ("Registered", "Registration"),
     "verification.verdict": ("Verifier",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}

@@ -1,3 +1,4 @@
+from mapfusion.align.aligners import Aligner as Aligner
 from mapfusion.align.aligners import make_aligner as make_aligner
 from mapfusion.align.alignment import Alignment as Alignment
 from mapfusion.align.alignment import Status as Status
@@ -32,10 +33,9 @@ from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log
 from mapfusion.robot_log import write_log as write_log
-from mapfusion.smoother.joint_smoothing import AssociatedLog as AssociatedLog
+from mapfusion.smoother.smooth import AssociatedLog as AssociatedLog
 from mapfusion.verification.false_alarms import Acceptance as Acceptance
 from mapfusion.verification.regions import EvidenceParameters as EvidenceParameters
-from mapfusion.verification.registration import Aligner as Aligner
 from mapfusion.verification.registration import Registered as Registered
 from mapfusion.verification.registration import Registration as Registration
 from mapfusion.verification.verdict import Verifier as Verifier

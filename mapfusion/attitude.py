@@ -35,9 +35,8 @@ from mapfusion.files import (
     text_attributes,
     write_table,
 )
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se3 import tilt
-from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import Observations
 from mapfusion.tables import described
 

@@ -124,13 +124,17 @@ def _first_of(words: Sequence[str], most: int) -> list[str]:
     return [word for word, end in zip(words, ends, strict=True) if end - 1 <= most]
 
 
-# New modules, and the former modules that plug-ins may import; all names without `mapfusion.`.
+# New modules, and the former modules and functions that plug-ins may import; all names without
+# `mapfusion.`.
 _FORMER_MODULES = {
     "geometry.se2": "se2 planar",
     "geometry.se3": "se3",
-    "geometry.camera": "camera calibration_error",
+    "camera": "calibration_error geometry.camera",
     "geometry.joint_covariance": "joint_covariance",
-    "geometry.numerics": "kernels one_thread chi_square symmetric align.bits",
+    "geometry.numerics": (
+        "kernels one_thread chi_square symmetric align.bits parameters.require_finite "
+        "parameters.require_shape parameters.require_points parameters.require_no_twins"
+    ),
     "parameters": "arguments",
     "files": "storage sealed",
     "tables": "open_tables looks",

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from mapfusion.camera import EXACT, CalibrationError, calibration_from
 from mapfusion.errors import InputError, TellingWarning
 from mapfusion.files import (
     COVARIANCE_FIELDS,
@@ -36,10 +37,14 @@ from mapfusion.files import (
     text_attributes,
     write_together,
 )
-from mapfusion.geometry.camera import EXACT, CalibrationError, calibration_from
 from mapfusion.geometry.joint_covariance import JointCovariance
-from mapfusion.geometry.numerics import Float
-from mapfusion.parameters import require_finite, require_no_twins, require_points, require_shape
+from mapfusion.geometry.numerics import (
+    Float,
+    require_finite,
+    require_no_twins,
+    require_points,
+    require_shape,
+)
 from mapfusion.robot_log import with_rows
 from mapfusion.tables import (
     APPEARANCE_FIELDS,

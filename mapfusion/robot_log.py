@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import pyarrow as pa
 
+from mapfusion.camera import EXACT, CalibrationError, calibration_from
 from mapfusion.errors import InputError
 from mapfusion.files import (
     COVARIANCE_FIELDS,
@@ -40,10 +41,9 @@ from mapfusion.files import (
     schema,
     write_table,
 )
-from mapfusion.geometry.camera import EXACT, CalibrationError, calibration_from
-from mapfusion.geometry.numerics import Float
-from mapfusion.parameters import (
+from mapfusion.geometry.numerics import (
     LARGEST_POSITION_M,
+    Float,
     require_finite,
     require_no_twins,
     require_points,

@@ -28,9 +28,8 @@ from mapfusion.files import (
     schema,
     table_write,
 )
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se2 import wrap
-from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import RobotLog
 from mapfusion.tables import described
 

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mapfusion.errors import InputError
-from mapfusion.geometry.numerics import Float
-from mapfusion.parameters import require_finite, require_shape
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 
 SHARPEST_CORNER_RAD = np.radians(30)  # sharper corners have a very long mitred outer edge
 BURIED_M = 0.001  # an end this deep in another wall is hidden; larger than rounding errors

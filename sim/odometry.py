@@ -7,9 +7,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se2 import wrap
-from mapfusion.parameters import Range, require_finite, require_in_range, require_shape
+from mapfusion.parameters import Range, require_in_range
 from sim.p3at import WHEEL_RADIUS_M, P3at
 from sim.world import World
 

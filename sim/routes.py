@@ -18,8 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.errors import InputError
-from mapfusion.geometry.numerics import Float
-from mapfusion.parameters import require_finite, require_shape
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from sim.floorplan import FloorPlan, format_point, segment_distance_m
 from sim.p3at import OUTER_RADIUS_M, TIRE_FRICTION, WIDTH_M, Pose
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se3 import from_planar, pose
 from mapfusion.parameters import Range, require_in_range

@@ -25,9 +25,9 @@ from mapfusion.files import (
     text_attributes,
     write_table,
 )
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se3 import in_space
-from mapfusion.parameters import Range, require_finite, require_in_range, require_shape
+from mapfusion.parameters import Range, require_in_range
 
 _WHEEL_FIELDS = ["left_wheel_rad", "right_wheel_rad"]
 _TILT_FIELDS = ["roll_rad", "pitch_rad"]

@@ -76,7 +76,7 @@ def _log_command(format_name: str) -> Callable[..., None]:
 
     def command(folder: Folder, output: options.Output, overrides: options.ImportOverrides) -> None:
         from experiments.cli.options import require_folder
-        from experiments.reports.terminal.layout import print_paths
+        from experiments.reports.layout import print_paths
         from experiments.scenario.loading import made_settings
 
         require_folder(output, [folder])
@@ -105,8 +105,8 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
     ) -> None:
         from experiments.cli.options import require_folder
         from experiments.pipeline.stereo_import import Source, import_stereo, vision_of
-        from experiments.reports.terminal.layout import progress
-        from experiments.reports.terminal.run_screen import print_imported
+        from experiments.reports.layout import progress
+        from experiments.reports.run_screen import print_imported
         from experiments.scenario.loading import made_settings
 
         require_folder(output, [*folders, odometry, truth, scenario])

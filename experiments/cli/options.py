@@ -12,13 +12,6 @@ from typing import Annotated
 
 import typer
 
-from experiments.cli.completion import (
-    complete_aligner,
-    complete_format,
-    complete_scenario,
-    complete_scenario_or_tag,
-    complete_setting,
-)
 from experiments.reports.formatting import plain
 from mapfusion.errors import InputError
 
@@ -31,6 +24,56 @@ RUN, LOOK, STEPS = "Run", "Look and compare", "Your own maps, logs and recording
 ALL_CORES = (
     len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 )
+
+# Completion of arguments in the shell. Each function returns the known values that begin with what
+# was typed. Where none does, the shell completes names of files.
+
+# Formats of `experiments.reports.result_export`, whose import takes too long for a key press.
+_EXPORTS = ("tum", "kitti", "g2o", "ply", "rerun")
+
+
+def complete_scenario(incomplete: str) -> list[str]:
+    """Complete the name of a scenario of the suite."""
+    from experiments.scenario.suite import scenario_names
+
+    return _beginning(scenario_names(), incomplete)
+
+
+def complete_scenario_or_tag(incomplete: str) -> list[str]:
+    """Complete the name of a scenario or a tag of the suite."""
+    from experiments.scenario.suite import tags_as_written
+
+    return complete_scenario(incomplete) + _beginning(tags_as_written(), incomplete)
+
+
+def complete_format(context: typer.Context, incomplete: str) -> list[str]:
+    """Complete a format of `record`, or of `export`."""
+    if context.info_name == "record":
+        from mapfusion.datasets.formats import EXPORTERS
+
+        return _beginning(["log", *EXPORTERS], incomplete)
+    return _beginning(_EXPORTS, incomplete)
+
+
+def complete_setting(incomplete: str) -> list[str]:
+    """Complete the dotted key of a setting, with the equals sign."""
+    from experiments.scenario.loading import setting_keys
+
+    return _beginning((f"{key}=" for key in setting_keys()), incomplete)
+
+
+def complete_aligner(incomplete: str) -> list[str]:
+    """Complete the name of an aligner."""
+    from experiments.plugins.discovery import known_methods
+    from experiments.scenario.settings import DEFAULT_ALIGNERS
+
+    known = [*known_methods(), *(entry.name for entry in DEFAULT_ALIGNERS)]
+    return _beginning(dict.fromkeys(known), incomplete)
+
+
+def _beginning(known: Iterable[str], incomplete: str) -> list[str]:
+    return [each for each in known if each.startswith(incomplete)]
+
 
 # Options with a mutable default have it here, not in the signature of a command.
 ScenarioNames = Annotated[

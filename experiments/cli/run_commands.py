@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from experiments.cli import options
-from experiments.cli.completion import complete_scenario
+from experiments.cli.options import complete_scenario
 from mapfusion.errors import InputError
 
 app = typer.Typer()
@@ -53,7 +53,7 @@ def run(
         raise InputError(f"--output {output}: {several}")
     if dry_run:
         from experiments.evaluation.run_plan import plan_run
-        from experiments.reports.terminal.run_screen import print_plan
+        from experiments.reports.run_screen import print_plan
 
         for loaded in checked:
             print_plan(plan_run(loaded, results, jobs, fresh), results, jobs)
@@ -63,8 +63,8 @@ def run(
     from experiments.evaluation.evaluated_run import finding_lines, has_usable_map
     from experiments.evaluation.result import add_times, run_scenario
     from experiments.pipeline.workers import workers
+    from experiments.reports import layout, run_screen
     from experiments.reports.figures.drawing import Drawing, remove_figures
-    from experiments.reports.terminal import layout, run_screen
 
     unusable = False
     start = {"start": {"run": time.process_time()}}  # shared by all scenarios
@@ -114,9 +114,9 @@ def report(
     """Show a result in one HTML file that works offline: `mapfusion report results/quick-0`."""
     from experiments.cli.options import REPORT, require_file
     from experiments.evaluation.result import require_result
+    from experiments.reports import layout
     from experiments.reports.figures.drawing import draw_all
     from experiments.reports.report.document import write_report
-    from experiments.reports.terminal import layout
 
     require_file("--output", output, REPORT)
     if figures:
@@ -147,8 +147,8 @@ def export(
     `mapfusion docs export` describes files, frames and keys.
     """
     from experiments.cli.options import require_folder
+    from experiments.reports.layout import print_lines
     from experiments.reports.result_export import export_result
-    from experiments.reports.terminal.layout import print_lines
 
     require_folder(output, [result])
     print_lines(map(str, export_result(result, kind, output)))
@@ -171,7 +171,7 @@ def docs(
     ] = None,
 ) -> None:
     """Show a page of the manual: `mapfusion docs formats`."""
-    from experiments.reports.terminal import layout
+    from experiments.reports import layout
 
     if page is None:
         layout.print_pages()
@@ -200,10 +200,9 @@ def check(
     """
     from experiments.cli.options import DOCUMENT, JUNIT, require_file
     from experiments.evaluation.metrics import CheckedScenario, check_all
-    from experiments.reports import export
-    from experiments.reports.terminal import layout, run_screen
-    from experiments.scenario.seeds import parse_seeds
+    from experiments.reports import export, layout, run_screen
     from experiments.scenario.settings import AnyScenario
+    from experiments.scenario.suite import parse_seeds
 
     require_file("--output", output, DOCUMENT, scenarios)
     require_file("--junit", junit, JUNIT, scenarios)
@@ -257,7 +256,7 @@ def list_scenarios(
     from experiments.scenario.suite import entries
 
     if copy is not None:
-        from experiments.scenario.editable_copy import copy_to_edit
+        from experiments.scenario.suite import copy_to_edit
 
         for path in copy_to_edit(copy):
             typer.echo(path)
@@ -267,7 +266,7 @@ def list_scenarios(
 
         typer.echo(schema_text(), nl=False)
         return
-    from experiments.reports.terminal import layout
+    from experiments.reports import layout
 
     if aligners:
         layout.print_methods()

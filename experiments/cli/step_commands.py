@@ -30,7 +30,7 @@ def record(
     from experiments.evaluation import single_steps as single
     from experiments.evaluation.metrics import load_checked
     from experiments.evaluation.single_steps import write_drives
-    from experiments.reports.terminal.layout import print_paths, progress
+    from experiments.reports.layout import print_paths, progress
     from experiments.scenario.suite import one_scenario
 
     require_folder(output, [scenario])
@@ -72,8 +72,7 @@ def slam(
     """
     from experiments.cli.options import require_map_file
     from experiments.evaluation import single_steps as single
-    from experiments.reports import export
-    from experiments.reports.terminal import layout
+    from experiments.reports import export, layout
     from experiments.scenario.suite import settings_of
 
     require_map_file(output, [log, scenario])
@@ -124,8 +123,8 @@ def align(
     from experiments.cli.options import DOCUMENT, require_file
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
-    from experiments.reports.terminal.layout import print_lines
-    from experiments.reports.terminal.run_screen import print_estimates, print_verdict
+    from experiments.reports.layout import print_lines
+    from experiments.reports.run_screen import print_estimates, print_verdict
     from experiments.scenario.suite import settings_of, with_aligners
     from mapfusion.align.alignment import Status
 
@@ -168,8 +167,8 @@ def merge(
     from experiments.cli.options import require_map_file
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
-    from experiments.reports.terminal.layout import print_lines
-    from experiments.reports.terminal.run_screen import print_fused, print_unmerged
+    from experiments.reports.layout import print_lines
+    from experiments.reports.run_screen import print_fused, print_unmerged
     from experiments.scenario.suite import settings_of, with_aligners
 
     require_map_file(output, [*maps, scenario], n_maps=max(len(maps) // 2, 1))

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from experiments.cli import options
-from experiments.cli.completion import complete_setting
+from experiments.cli.options import complete_setting
 from mapfusion.errors import InputError
 
 app = typer.Typer()
@@ -43,12 +43,11 @@ def refusal(
     `mapfusion study refusal full --seeds 0..2 -o refusal`.
     """
     from experiments.cli.options import require_folder
+    from experiments.reports import layout, study_screen
     from experiments.reports.study_files import draw_refusals, write_kinds
-    from experiments.reports.terminal import layout, study_screen
-    from experiments.scenario.seeds import parse_seeds
+    from experiments.scenario.suite import parse_seeds
     from experiments.studies import refusal_rates, refusal_trial
-    from experiments.studies.refusal_cases import worlds_of
-    from experiments.studies.refusal_trial import PairsDrawn
+    from experiments.studies.refusal_trial import PairsDrawn, worlds_of
 
     require_folder(output, worlds)
     mapped, drawn = worlds_of(worlds, parse_seeds(seeds), results), PairsDrawn(pairs, every)
@@ -81,8 +80,8 @@ def verdicts(
     results/sweeps/calibration -o guarantee`.
     """
     from experiments.cli.options import require_folder
+    from experiments.reports import layout, study_screen
     from experiments.reports.study_files import write_guarantee
-    from experiments.reports.terminal import layout, study_screen
     from experiments.studies.run_tables import find_runs
     from experiments.studies.verdict_guarantee import guarantee
 
@@ -129,8 +128,8 @@ def sweep(
     seeds or values it adds to the same tables. Exit code 1 if a run failed.
     """
     from experiments.cli.options import require_folder
-    from experiments.reports.terminal import layout, study_screen
-    from experiments.scenario.seeds import parse_seeds
+    from experiments.reports import layout, study_screen
+    from experiments.scenario.suite import parse_seeds
     from experiments.studies import sweep
 
     require_folder(output, scenarios)
@@ -157,10 +156,13 @@ def statistics(
 ) -> None:
     """Summarise success, errors and consistency of runs: `mapfusion statistics results/quick-*`."""
     from experiments.cli.options import require_folder
+    from experiments.reports.statistics_screen import print_summary
     from experiments.reports.study_files import run_statistics
 
     require_folder(output, paths)
-    run_statistics(paths, output, as_json)
+    summary, skipped = run_statistics(paths, output, as_json)
+    if not as_json:
+        print_summary(summary, output, skipped)
 
 
 @app.command(rich_help_panel=options.LOOK)
@@ -200,7 +202,7 @@ def compare(
     """
     from experiments.cli.options import require_folder
     from experiments.reports.export import write_tables
-    from experiments.reports.terminal.statistics_screen import print_comparison
+    from experiments.reports.statistics_screen import print_comparison
     from experiments.studies import comparison
     from experiments.studies.sweep import parse_axes
 
@@ -251,8 +253,8 @@ def benchmark(
     """
     from experiments.cli.options import require_folder
     from experiments.pipeline.store import Store
+    from experiments.reports import layout, study_screen
     from experiments.reports.study_files import write_benchmark
-    from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.suite import settings_of
     from experiments.studies import benchmark
 
@@ -296,8 +298,8 @@ def paper(
     """
     from experiments.cli.options import require_folder
     from experiments.pipeline.store import Store
+    from experiments.reports import layout, study_screen
     from experiments.reports.study_files import write_claims
-    from experiments.reports.terminal import layout, study_screen
     from experiments.studies import paper_claims
     from experiments.studies.benchmark import run_benchmark
     from experiments.studies.run_tables import find_runs
@@ -344,11 +346,10 @@ def independence(
     """
     from experiments.cli.options import require_folder
     from experiments.pipeline.store import Store
+    from experiments.reports import layout, study_screen
     from experiments.reports.study_files import write_independence
-    from experiments.reports.terminal import layout, study_screen
     from experiments.scenario.loading import load_scenario
-    from experiments.scenario.seeds import parse_seeds
-    from experiments.scenario.suite import one_scenario
+    from experiments.scenario.suite import one_scenario, parse_seeds
     from experiments.studies import independence_trial
 
     require_folder(output, [scenario])
@@ -377,8 +378,7 @@ def calibrate(
     """Calibrate and correct odometry of logs: `mapfusion study calibrate raw/robot* -o logs`."""
     from experiments.cli.options import require_folder
     from experiments.evaluation.single_steps import calibrate_logs
-    from experiments.reports import export
-    from experiments.reports.terminal import layout, study_screen
+    from experiments.reports import export, layout, study_screen
     from experiments.scenario.suite import settings_of
 
     require_folder(output, [*logs, scenario], may_hold=True)

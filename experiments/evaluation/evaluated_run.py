@@ -13,14 +13,12 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import tables
-from experiments.evaluation.alignment_errors import (
-    ALIGNED,
-    EVALUATION_STAGE,
-    EvaluationSettings,
-)
 from experiments.evaluation.fused_landmarks import FusedTeam, MergeSettings
 from experiments.evaluation.map_errors import (
+    ALIGNED,
+    EVALUATION_STAGE,
     EvaluatedFusion,
+    EvaluationSettings,
     GivenMap,
     SmoothedRobot,
     load_smoothed,
@@ -41,23 +39,22 @@ from experiments.pipeline.stages.pipeline import (
     build_pipeline,
     require_memory,
 )
-from experiments.pipeline.stages.robot_maps import RobotFolders, latest_at, stored_maps
 from experiments.pipeline.stages.slam import noise_factor, read_findings
+from experiments.pipeline.stages.smooth import RobotFolders, latest_at, stored_maps
 from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AnyScenario, Recording
+from mapfusion.align.aligners import Aligner
 from mapfusion.datasets.log_consistency import Finding, truth_finding
 from mapfusion.datasets.relative_motion import composed_spans, observed_spans, odometry_motions
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fusion.fusers import make_fuser
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog, read_log, read_true_poses
-from mapfusion.verification.registration import Aligner
 
 TABLES_PART = "tables"  # part of a run outside its stages, in the table `timings`
 SMOOTHED_PREFIX = "smoothed_"  # of tables of alignments of smoothed maps

@@ -1,4 +1,6 @@
-"""Errors of smoothed and fused maps: the tables `smoother`, `fusers` and `fuser_coverage`.
+"""Errors of alignments (table `errors`), and of smoothed and fused maps.
+
+The tables of maps are `smoother`, `fusers` and `fuser_coverage`.
 
 The true point of a fused landmark is the mean of the true points of its parents. `map_consistency`
 defines gross landmarks, which are left out, and consistency.
@@ -18,8 +20,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.alignment_errors import alignment_nees
-from experiments.evaluation.fused_landmarks import FusedTeam
+from experiments.evaluation import tables
+from experiments.evaluation.criteria import COMMON_LANDMARKS, ORACLE
+from experiments.evaluation.fused_landmarks import FusedTeam, MergeSettings, fusion_rows
 from experiments.evaluation.map_consistency import (
     Consistency,
     FittedMap,
@@ -29,19 +32,35 @@ from experiments.evaluation.map_consistency import (
 )
 from experiments.evaluation.truth import (
     EvaluatedRobot,
+    MapPair,
+    common_landmarks,
     degrees_of_freedom,
+    join_map_pairs,
     landmark_truth,
+    load_robot,
+    load_robot_smoothed,
     motion_errors,
+    squared_mahalanobis,
     truth_or_unknown,
 )
-from experiments.pipeline.stages.robot_maps import RobotFolders
+from experiments.pipeline.stage import Job, StageKind
+from experiments.pipeline.stages.align import (
+    alignment_of,
+    estimate_row,
+    evidence_of,
+)
 from experiments.pipeline.stages.slam import final_path
 from experiments.pipeline.stages.smooth import (
+    RobotFolders,
+    folders_of_both,
     read_endings,
     read_smoothed,
     read_smoothed_path,
     smoothed_owners,
 )
+from experiments.pipeline.tables import MOTION
+from mapfusion.align.alignment import Pairs
+from mapfusion.align.refinement import Oracle
 from mapfusion.files import POSE_FIELDS, named_columns
 from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import FusedMap, Fusion
@@ -49,6 +68,116 @@ from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
+from mapfusion.verification.verdict import Verifier
+
+
+def alignment_nees(T_estimate: Float, covariance: Float, T_true: Float) -> Float:
+    """Return the NEES (...) of alignments; chi-square with 3 degrees of freedom if consistent.
+
+    Args:
+        T_estimate: estimated motions, shape (..., 3).
+        covariance: covariances of the estimates, shape (..., 3, 3). NaN gives NaN.
+        T_true: true motion, shape (3,).
+    """
+    error = T_estimate - T_true
+    error[..., 2] = se2.wrap(error[..., 2])
+    known = np.isfinite(covariance).all(axis=(-2, -1)) & np.isfinite(error).all(axis=-1)
+    nees = np.full(known.shape, np.nan)
+    nees[known] = squared_mahalanobis(error[known], covariance[known])
+    return nees
+
+
+def error_rows(map_pair: MapPair, verifier: Verifier, radius_m: float) -> pd.DataFrame:
+    """Return the rows of the table `errors` of one pair of maps; the first is the oracle's.
+
+    The oracle is the aligner that is given the true correspondences.
+    """
+    is_true, pairs = map_pair.is_true(radius_m), Pairs(*map_pair.maps, map_pair.offered)
+    oracle = Oracle(verifier.refinement).align(pairs, is_true)
+    evidence = evidence_of(map_pair.rivals, map_pair.maps, verifier.evidence)
+    row = map_pair.keys | {"aligner": ORACLE, "repetition": 0}
+    row |= estimate_row(len(pairs), oracle, oracle, verifier.on(pairs, evidence).verify(oracle))
+    rows = [row, *map_pair.estimates]
+    alignments = [alignment_of(each, len(pairs)) for each in rows]
+    T_true = se2.between(map_pair.a.path.T_world_map, map_pair.b.path.T_world_map)
+    T_refined = np.array([alignment.T_a_b for alignment in alignments])
+    inlier = np.array([alignment.inlier for alignment in alignments])
+    covariance = np.array([alignment.covariance for alignment in alignments])
+    T_estimated = np.array([[each[name] for name in MOTION] for each in rows])
+    error_m, error_rad = motion_errors(T_estimated, T_true)
+    refined_m, refined_rad = motion_errors(T_refined, T_true)
+    oracle_m, oracle_rad = motion_errors(T_refined, oracle.T_a_b)
+    n_inliers, n_hits = inlier.sum(axis=1), (inlier & is_true).sum(axis=1)
+    errors = {
+        "translation_error_m": error_m,
+        "rotation_error_rad": error_rad,
+        "refined_translation_error_m": refined_m,
+        "refined_rotation_error_rad": refined_rad,
+        "oracle_distance_m": oracle_m,
+        "oracle_distance_rad": np.abs(oracle_rad),
+        "n_true": is_true.sum(),
+        "n_common": common_landmarks(*map_pair.points_world_m, radius_m),
+        "n_inliers": n_inliers,
+        "precision": n_hits / np.where(n_inliers, n_inliers, np.nan),
+        "recall": n_hits / (is_true.sum() or np.nan),
+        "alignment_nees": alignment_nees(T_refined, covariance, T_true),
+    }
+    # one DataFrame of all columns: adding columns one by one is slow in pandas
+    return pd.DataFrame({name: [each[name] for each in rows] for name in row} | errors)
+
+
+def first_shared_iteration(robots: Sequence[EvaluatedRobot], radius_m: float) -> int | None:
+    """Return the first evaluated iteration at which any two maps have common ground.
+
+    Args:
+        robots: robots of a team.
+        radius_m: distance of true points below which two landmarks are the same.
+
+    Returns:
+        The iteration; None if no two maps ever have common ground.
+    """
+    for k in sorted({k for robot in robots for k in robot.maps}):
+        points = [robot.at(k)[1] for robot in robots]
+        for a, b in itertools.combinations(points, 2):
+            if common_landmarks(a, b, radius_m) >= COMMON_LANDMARKS:
+                return k
+    return None
+
+
+# Tables of the stage `align`, in the order of the arguments of `join_map_pairs`.
+ALIGNED = ("estimates", "correspondences", "rivals")
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """Settings of the evaluation of alignments."""
+
+    verifier: Verifier
+    merge: MergeSettings
+    true_pair_radius_m: float
+
+
+def run_evaluation(settings: EvaluationSettings, job: Job) -> None:
+    """Write the pair's `errors.parquet`, `smoothed_errors.parquet` and `fusion.parquet`."""
+    folders, radius_m, map_pairs = folders_of_both(job), settings.true_pair_radius_m, []
+    for name, load, align in (
+        ("smoothed_errors", load_robot_smoothed, job.inputs["align_smoothed"]),
+        ("errors", load_robot, job.inputs["align"]),
+    ):
+        aligned = [tables.read(align / f"{table}.parquet", table) for table in ALIGNED]
+        map_pairs = join_map_pairs([load(each) for each in folders], *aligned)
+        errors = pd.concat([error_rows(pair, settings.verifier, radius_m) for pair in map_pairs])
+        tables.write(job.output / f"{name}.parquet", name, errors)
+    fusion = fusion_rows(map_pairs, settings.merge, radius_m)
+    tables.write(job.output / "fusion.parquet", "fusion", fusion)
+
+
+EVALUATION_STAGE = StageKind(
+    "judge",
+    "compare with the truth",
+    run_evaluation,
+    ("errors.parquet", "smoothed_errors.parquet", "fusion.parquet"),
+)
 
 
 @dataclass(frozen=True)
@@ -250,7 +379,16 @@ class EvaluatedFusion:
         return consistencies(self.fusion.landmarks, self.fit)
 
     def row(self) -> dict[str, Any]:
-        """Return the row of the table `fusers`."""
+        """Return the row of the table `fusers`, with medians over the motions of the maps."""
+        first, *others = self.fusion.members
+        T_world_first, errors = self.given[first].robot.path.T_world_map, []
+        for k in others:
+            T_true = se2.between(T_world_first, self.given[k].robot.path.T_world_map)
+            T, covariance = self.fusion.T_first_map[k], self.fusion.motion_covariance[k]
+            error_m, error_rad = motion_errors(T, T_true)
+            nees = alignment_nees(T, covariance, T_true)
+            errors.append([error_m, abs(error_rad), *se2.motion_sigma(covariance), nees / 3])
+        medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
         landmarks, fit = self.fusion.landmarks, self.fit
         relative, in_frame = self.consistency
         return {
@@ -271,7 +409,7 @@ class EvaluatedFusion:
             "frame_coverage_95": in_frame.coverage_95,
             "duplicate_share": self.fusion.duplicate_share,
             "fallback": self.fallback,
-        } | self._motion_errors()
+        } | dict(zip(_MOTION_FIGURES, medians.tolist(), strict=True))
 
     def _over_better_map(self, of_filter: bool) -> float:
         """Return the error of the fused map over the error of the better of two robots' maps.
@@ -317,19 +455,6 @@ class EvaluatedFusion:
                 rms = np.sqrt(np.mean(three**2, axis=1))
                 ratios.append(rms[0] / min(rms[1:]) if min(rms[1:]) > 0 else np.nan)
         return float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else np.nan
-
-    def _motion_errors(self) -> dict[str, float]:
-        """Return median errors, standard deviations and NEES of the motions of the robots' maps."""
-        first, *others = self.fusion.members
-        T_world_first, errors = self.given[first].robot.path.T_world_map, []
-        for k in others:
-            T_true = se2.between(T_world_first, self.given[k].robot.path.T_world_map)
-            T, covariance = self.fusion.T_first_map[k], self.fusion.motion_covariance[k]
-            error_m, error_rad = motion_errors(T, T_true)
-            nees = alignment_nees(T, covariance, T_true)
-            errors.append([error_m, abs(error_rad), *se2.motion_sigma(covariance), nees / 3])
-        medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
-        return dict(zip(_MOTION_FIGURES, medians.tolist(), strict=True))
 
 
 def last_fused(rows: pd.DataFrame) -> pd.DataFrame:

@@ -18,7 +18,6 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import fused_landmarks, tables
-from experiments.evaluation.alignment_errors import ALIGNED
 from experiments.evaluation.evaluated_run import TABLES_PART, EvaluatedRun, finding_rows
 from experiments.evaluation.fused_landmarks import (
     FusedTeam,
@@ -28,6 +27,7 @@ from experiments.evaluation.fused_landmarks import (
 )
 from experiments.evaluation.loop_closures import sighting_rows
 from experiments.evaluation.map_errors import (
+    ALIGNED,
     EvaluatedFusion,
     SmoothedRobot,
     coverage_rows,
@@ -44,8 +44,7 @@ from experiments.evaluation.truth import EvaluatedRobot
 from experiments.pipeline.stage import library_versions
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
-from experiments.pipeline.stages.robot_maps import stored_maps
-from experiments.pipeline.stages.smooth import map_files, read_smoothed_path
+from experiments.pipeline.stages.smooth import map_files, read_smoothed_path, stored_maps
 from experiments.pipeline.store import (
     Store,
     file_entries,

@@ -91,7 +91,14 @@ def plan_run(scenario: AnyScenario, results: Path, jobs: int, fresh: bool = Fals
             the machine has too little memory.
     """
     run = EvaluatedRun.of(scenario, Store.of(results))
-    _require_drive(run)
+    for robot in run.pipeline.simulated[:1]:  # all robots have the same drive
+        driven = robot.features.before["drive"]
+        assert isinstance(driven, Stage)
+        assert isinstance(driven.settings, DriveSettings)
+        try:
+            require_drive(driven.settings)
+        except InputError as error:
+            raise InputError(f"scenario {run.scenario.name}: {error}") from error
     require_memory(run.pipeline, jobs)
     rates, n_earlier = _rates_of_earlier_runs(results)
     rates, amounts = dict(_TYPICAL_S) | rates, _amounts(run)
@@ -112,18 +119,6 @@ def plan_run(scenario: AnyScenario, results: Path, jobs: int, fresh: bool = Fals
     n_frames = {robot.name: robot.n_frames for robot in run.pipeline.robots}
     memory = process_bytes(run.pipeline)
     return RunPlan(scenario, n_frames, stages, total_s + _OUTSIDE_S, elapsed_s, memory, n_earlier)
-
-
-def _require_drive(run: EvaluatedRun) -> None:
-    """Raise InputError if the stage `drive` would refuse its settings before the robots drive."""
-    for robot in run.pipeline.simulated[:1]:  # all robots have the same drive
-        driven = robot.features.before["drive"]
-        assert isinstance(driven, Stage)
-        assert isinstance(driven.settings, DriveSettings)
-        try:
-            require_drive(driven.settings)
-        except InputError as error:
-            raise InputError(f"scenario {run.scenario.name}: {error}") from error
 
 
 def _kind(stage: Stage, scenario: AnyScenario) -> str:

@@ -21,7 +21,6 @@ from experiments.pipeline.stages.smooth import SmoothSettings, log_until, smooth
 from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import generator
 from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
 from mapfusion.align.alignment import NOT_RUN, Pairs, Status
 from mapfusion.align.correspondences import match, why_not_unit_vectors
@@ -36,7 +35,7 @@ from mapfusion.files import Write, write_together
 from mapfusion.fusion.fusers import AlignedPair, FusedMap, Fusion, make_fuser, name_order
 from mapfusion.fusion.merge import merge as merge_maps
 from mapfusion.fusion.team_graph import EdgeStatus
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.robot_log import (
     TRUTH_FILES,

@@ -11,14 +11,15 @@ import pandas as pd
 import scipy
 
 from experiments.pipeline.stages.align import alignment_of, correspondences_of
-from experiments.pipeline.stages.robot_maps import (
+from experiments.pipeline.stages.smooth import (
     ROBOTS_KEPT,
     RobotFolders,
     latest_at,
+    read_smoothed_path,
     smoothed_maps,
+    smoothed_owners,
     stored_maps,
 )
-from experiments.pipeline.stages.smooth import read_smoothed_path, smoothed_owners
 from experiments.pipeline.tables import records
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid

@@ -10,6 +10,7 @@ from experiments.scenario.loading import made_settings
 from experiments.scenario.settings import SimulatedScenario
 from experiments.scenario.suite import settings_of
 from experiments.scenario.yaml_files import read_calibration
+from mapfusion.camera import CalibrationError
 from mapfusion.datasets.formats import AttitudeSource, read_recording
 from mapfusion.datasets.stereo_import import (
     Imported,
@@ -21,7 +22,6 @@ from mapfusion.datasets.stereo_import import (
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.datasets.text_files import read_odometry, read_tum
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import CalibrationError
 from mapfusion.vision.front_end import FrontEndParameters
 
 BY_IMAGES = "images"  # visual odometry, in place of an odometry file

@@ -16,13 +16,11 @@ from importlib import import_module
 from importlib.machinery import ModuleSpec
 from operator import attrgetter
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from experiments.plugins.isolated_process import IsolatedAligner, ProcessFailedError, process_for
-from mapfusion.align.aligners import ALIGNERS, PEERS, construct
+from mapfusion.align.aligners import ALIGNERS, PEERS, Aligner, as_aligner, construct
 from mapfusion.errors import did_you_mean, not_installed
-from mapfusion.verification.registration import Aligner, as_aligner
 
 ENTRY_POINTS = "mapfusion.aligners"  # group of the entry points that declare aligners
 _CODE_SUFFIXES = (".py", ".so", ".pyd")
@@ -185,28 +183,20 @@ def make_method(name: str, /, **parameters: Any) -> Any:
         module, _, names = method.target.partition(":")
         return construct(name, attrgetter(names)(import_module(module)), parameters)
     file, names = own_file.groups()
-    made = _module_of_file(Path(file))
+    # Import the file under a name of its own.
+    own_name = f"mapfusion_own_{Path(file).stem}"
+    spec = importlib.util.spec_from_file_location(own_name, file)
+    assert spec is not None
+    assert spec.loader is not None
+    made = importlib.util.module_from_spec(spec)
+    sys.modules[own_name] = made  # dataclasses look their module up
+    spec.loader.exec_module(made)
     if not hasattr(made, names):
-        own = [key for key, value in vars(made).items() if _is_class_of(made, value)]
+        classes = {key: each for key, each in vars(made).items() if isinstance(each, type)}
+        own = [key for key, each in classes.items() if each.__module__ == own_name]
         there = ", ".join(own) or "none"
         raise ValueError(f"{file}: has no class {names}; there: {there}{did_you_mean(names, own)}")
     return construct(names, getattr(made, names), parameters)
-
-
-def _is_class_of(module: ModuleType, value: Any) -> bool:
-    return isinstance(value, type) and value.__module__ == module.__name__
-
-
-def _module_of_file(file: Path) -> ModuleType:
-    """Import a Python file under a name of its own."""
-    name = f"mapfusion_own_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
 
 
 def callable_aligner(method: str, parameters: dict[str, Any], time_limit_s: float) -> Aligner:

@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from mapfusion.align.aligners import Aligner, MethodAligner
 from mapfusion.align.alignment import (
     Alignment,
     Fit,
@@ -44,7 +45,6 @@ from mapfusion.align.alignment import (
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.errors import one_line
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.verification.registration import Aligner, MethodAligner
 
 _STATUSES = (Status.ACCEPTED, Status.REFUSED, Status.DEGENERATE)
 _MAX_ASYMMETRY = 1e-9  # relative to the largest entry: rounding of a symmetric product

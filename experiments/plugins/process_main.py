@@ -21,8 +21,8 @@ from experiments.plugins.isolated_process import (
     checked_aligner,
     checked_alignment,
 )
+from mapfusion.align.aligners import Aligner
 from mapfusion.errors import moved_module_note, one_line
-from mapfusion.verification.registration import Aligner
 
 # The process ends itself this long after the time limit, if a plug-in holds the interpreter's lock
 # and the process that would end it has been killed.

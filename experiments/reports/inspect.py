@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from experiments.evaluation import tables
 from experiments.evaluation.tables import require_as_written
-from experiments.reports.terminal.layout import Column, print_lines, print_table
+from experiments.reports.layout import Column, print_lines, print_table
 from mapfusion import attitude, landmark_map, robot_log
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, read_parquet, read_table, text_attributes

@@ -19,7 +19,6 @@ from experiments.reports.export import publish_json, to_markdown, write_tables, 
 from experiments.reports.figures import study_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
-from experiments.reports.terminal.statistics_screen import print_summary
 from experiments.scenario.settings import AnyScenario
 from experiments.studies.benchmark import SIGMA_M, SIZE_M, SUMMARY, TRIALS, BenchmarkDesign
 from experiments.studies.independence_trial import (
@@ -47,8 +46,13 @@ from mapfusion.files import schema, write_json
 _FIGURES = ("fig04_translation_error", "fig05_rotation_error", "fig06_aligner_time")
 
 
-def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = False) -> None:
-    """Print the main tables, or all as JSON; write all and figures 4 to 6 into an output folder.
+def run_statistics(
+    paths: Sequence[Path], output: Path | None, as_json: bool = False
+) -> tuple[Summary, list[str]]:
+    """Write all tables and figures 4 to 6 into an output folder, and the tables as JSON if asked.
+
+    Returns:
+        The tables, and lines about figures that could not be drawn.
 
     Raises:
         InputError: a path has no runs, no run knows the truth, or a table is damaged.
@@ -67,8 +71,7 @@ def run_statistics(paths: Sequence[Path], output: Path | None, as_json: bool = F
         publish_json(
             "statistics", contents | {"written": output, "tables": summary.tables}, shown=True
         )
-    else:
-        print_summary(summary, output, skipped)
+    return summary, skipped
 
 
 def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
@@ -342,6 +345,8 @@ def write_claims(folder: Path, values: pd.DataFrame, crossing: pd.DataFrame) -> 
 
 def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
     """Return the page "The paper beside this software" in Markdown."""
+    runs = values.groupby(["scenario", "renderer"], sort=False)["n_runs"].max().reset_index()
+    drawn = (f"`{row.scenario}`: {row.n_runs} by {row.renderer}" for row in runs.itertuples())
     parts = [
         "# The paper beside this software\n",
         "Written by `mapfusion study paper`; do not edit. `paper_as_printed` runs the methods of "
@@ -352,7 +357,7 @@ def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
         "it, refuted if all of it lies outside, and partly confirmed otherwise. The range is in "
         "`claims.csv` beside this page. T_a_b is the motion from the frame of map b to that of "
         f"map a; errors are those of T_a_b before the common least squares. "
-        f"{_drawn_by(values)}\n",
+        f"Runs and their renderers: {'; '.join(drawn)}.\n",
         "## Readings of the paper\n",
         *(f"- {line}" for line in READINGS),
         "",
@@ -366,13 +371,6 @@ def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
         *(f"{line}\n" for line in crossing_lines(crossing)),
     ]
     return "\n".join(parts)
-
-
-def _drawn_by(values: pd.DataFrame) -> str:
-    """Say who drew the pictures of how many runs."""
-    runs = values.groupby(["scenario", "renderer"], sort=False)["n_runs"].max().reset_index()
-    each = (f"`{row.scenario}`: {row.n_runs} by {row.renderer}" for row in runs.itertuples())
-    return f"Runs and their renderers: {'; '.join(each)}."
 
 
 def claims_table(values: pd.DataFrame) -> pd.DataFrame:
@@ -392,14 +390,13 @@ def claim_text(row: Mapping[str, Any]) -> str:
     """Write verdict, value and interval of a row of VALUES."""
     if math.isnan(row["value"]):
         return str(row["verdict"])
-    value, low, high = (_number_text(row[name]) for name in ("value", "value_low", "value_high"))
+    value, low, high = (
+        "no answer" if math.isinf(row[name]) else f"{row[name]:.3g}"
+        for name in ("value", "value_low", "value_high")
+    )
     unit = f" {row['unit']}" if row["unit"] else ""
     interval = f" ({low} to {high})" if not math.isnan(row["value_low"]) else " (one run)"
     return f"**{row['verdict']}**: {value}{unit}{interval}"
-
-
-def _number_text(value: float) -> str:
-    return "no answer" if math.isinf(value) else f"{value:.3g}"
 
 
 def crossing_lines(crossing: pd.DataFrame) -> list[str]:

@@ -6,7 +6,7 @@ import json
 import re
 import reprlib
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -292,7 +292,19 @@ def _validated(where: str, kind: type[S], data: dict[str, Any], place: Place = _
                 refused.append(problem)
         problems = refused + problems
     if isinstance(kind, type) and issubclass(kind, Scenario):
-        problems += _contradictions(kind, data, {problem.location[:1] for problem in problems})
+        # contradictions between sections that are valid by themselves
+        wrong, sections = {problem.location[:1] for problem in problems}, dict[str, Any]()
+        for name in sections_of(kind.RULES) & kind.model_fields.keys():
+            field = kind.model_fields[name]
+            if (name,) in wrong or (field.is_required() and name not in data):
+                continue
+            own: Any = field.annotation
+            sections[name] = (
+                _known(own).validate_python(data[name])
+                if name in data
+                else field.get_default(call_default_factory=True)
+            )
+        problems += map(_problem_of_line, broken_rules(kind.RULES, sections))
     lines = []
     for location, text in dict.fromkeys(problems):
         named = f"{'.'.join(map(str, location))}: " if location else ""
@@ -321,24 +333,6 @@ def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:
             yield Problem(location, f"{text} (it is {reprlib.repr(each['input'])})")
         else:
             yield Problem(location, text)
-
-
-def _contradictions(
-    kind: type[Scenario], data: dict[str, Any], wrong: Collection[Location]
-) -> Iterator[Problem]:
-    """Yield contradictions between sections that are valid by themselves."""
-    sections = {}
-    for name in sections_of(kind.RULES) & kind.model_fields.keys():
-        field = kind.model_fields[name]
-        if (name,) in wrong or (field.is_required() and name not in data):
-            continue
-        own: Any = field.annotation
-        sections[name] = (
-            _known(own).validate_python(data[name])
-            if name in data
-            else field.get_default(call_default_factory=True)
-        )
-    yield from map(_problem_of_line, broken_rules(kind.RULES, sections))
 
 
 def _problem_of_line(line: str) -> Problem:

@@ -33,9 +33,9 @@ from experiments.scenario.world_settings import (
 )
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.refinement import Refinement
+from mapfusion.camera import StereoCamera
 from mapfusion.errors import OutOfRangeError, did_you_mean
 from mapfusion.fusion.fusers import USUAL, MergeParameters
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.parameters import Range
 from mapfusion.robot_log import TRUTH_TABLES
 from mapfusion.tables import table_path

@@ -1,17 +1,18 @@
 """Scenario suite: shipped scenarios and those in ./scenarios, found by path, name or tag.
 
-A scenario in ./scenarios replaces the shipped scenario of the same name.
+A scenario in ./scenarios replaces the shipped scenario of the same name. A copy of a shipped
+scenario names its schema and lists common settings as comments.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.scenario.yaml_files import OWN, SHIPPED, read_mapping
+from experiments.scenario.yaml_files import OWN, SHIPPED, lines_of_keys, read_mapping
 from mapfusion.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
@@ -37,8 +38,23 @@ def scenarios_of(names_or_tags: Sequence[str | Path], folder: Path | None = None
         path = Path(wanted)
         if path.suffix in SUFFIXES or len(path.parts) > 1 or path.is_file():
             found.append(path)
-        else:
-            found += _named(str(wanted), folder)
+            continue
+        files, word = _files(folder), str(wanted)
+        if any(path.stem == word for path in files):
+            # reading all files is slow: read only those that contain the name
+            files = [path for path in files if path.stem == word or _mentions(path, word)]
+        known = {path: read_mapping(path) for path in files}
+        by_name = [path for path, data in known.items() if word in (data.get("name"), path.stem)]
+        by_tag = [path for path, data in known.items() if word in _tags(data)]
+        if not by_name and not by_tag:
+            tags = sorted({tag for data in known.values() for tag in _tags(data)})
+            raise InputError(
+                f"{word}: neither a file, nor a scenario of {folder or 'the suite'} "
+                f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
+                f"({', '.join(tags) or 'there is none'})"
+                f"{did_you_mean(word, [*(path.stem for path in known), *tags])}"
+            )
+        found += by_name or by_tag
     return list(dict.fromkeys(found))
 
 
@@ -120,25 +136,6 @@ def chosen_aligners(
                 raise InputError(f"--aligner {name}: {' '.join(str(error).split())}") from error
         chosen.append(known[name])
     return tuple(chosen)
-
-
-def _named(wanted: str, folder: Path | None) -> list[Path]:
-    files = _files(folder)
-    if any(path.stem == wanted for path in files):
-        # reading all files is slow: read only those that contain the name
-        files = [path for path in files if path.stem == wanted or _mentions(path, wanted)]
-    known = {path: read_mapping(path) for path in files}
-    by_name = [path for path, data in known.items() if wanted in (data.get("name"), path.stem)]
-    by_tag = [path for path, data in known.items() if wanted in _tags(data)]
-    if not by_name and not by_tag:
-        tags = sorted({tag for data in known.values() for tag in _tags(data)})
-        raise InputError(
-            f"{wanted}: neither a file, nor a scenario of {folder or 'the suite'} "
-            f"({', '.join(path.stem for path in known) or 'there is none'}), nor a tag "
-            f"({', '.join(tags) or 'there is none'})"
-            f"{did_you_mean(wanted, [*(path.stem for path in known), *tags])}"
-        )
-    return by_name or by_tag
 
 
 def _mentions(path: Path, word: str) -> bool:
@@ -227,3 +224,146 @@ def entries(folder: Path | None = None) -> list[dict[str, Any]]:
 
 def _number(value: Any) -> float | None:
     return value if isinstance(value, int | float) else None
+
+
+MAX_SEEDS = 1000  # days of computation; more is probably a typing error
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Parse `3`, `0..4` (both ends included) or `0,2,5`; raise InputError for other texts."""
+    try:
+        if ".." in text:
+            first, last = (int(part) for part in text.split(".."))
+            seeds = range(first, last + 1)[: MAX_SEEDS + 1]
+        else:
+            seeds = [int(part) for part in text.split(",")]
+    except ValueError:
+        seeds = []
+    if not seeds or min(seeds) < 0 or len(set(seeds)) < len(seeds):
+        raise InputError(f"--seeds {text}: expected a number, a range 0..4 or a list 0,2,5")
+    if len(seeds) > MAX_SEEDS:
+        raise InputError(f"--seeds {text}: more than {MAX_SEEDS} seeds")
+    return list(seeds)
+
+
+# Settings that users change first.
+COMMON_SETTINGS = (
+    "generate.robots",
+    "generate.overlap",
+    "drive.frames",
+    "drive.frame_interval_s",
+    "render.renderer",
+    "camera.baseline_m",
+    "odometry.translation_m_per_sqrt_m",
+    "odometry.yaw_rad_per_sqrt_rad",
+    "radiometry.sigma_gray",
+    "slam.filter.n_particles",
+    "slam.filter.proposal",
+    "slam.min_count",
+    "align.repetitions",
+    "merge.aligner",
+    "merge.fuser",
+    "evaluate.every",
+)
+_ABOUT = (
+    "# Common settings with their present values. To change one, remove the # before it and before",
+    "# its section. All settings with their ranges: schema.json, which editors read, or",
+    "# `mapfusion scenarios --schema`.",
+)
+_WIDTH = 100  # characters of a line; longer descriptions are left out
+_LEAST_ABOUT = 3  # characters; a shorter description is a symbol of a formula
+_BLOCK = re.compile(r"^( *)[\w]+: *(#.*)?$")  # a key whose value is on the lines below it
+
+Key = tuple[str, ...]
+_Tree = dict[str, Any]  # sections, and lines of settings
+
+
+def copy_to_edit(name: str) -> tuple[Path, Path]:
+    """Copy a shipped scenario to ./scenarios with the schema that its first line names.
+
+    Returns:
+        The paths of the copy and of the schema.
+
+    Raises:
+        InputError: the name is unknown, or the file exists.
+    """
+    from experiments.scenario.loading import schema_text  # slow imports
+    from mapfusion.files import write_whole
+
+    source = shipped_scenario(name)
+    copy, schema = OWN / source.name, OWN / "schema.json"
+    if copy.exists():
+        raise InputError(f"{copy}: exists; edit it, or rename it to get the shipped one again")
+    for path, text in ((schema, schema_text()), (copy, with_common_settings(source))):
+        write_whole(path, lambda file, text=text: file.write_text(text, encoding="utf-8"))
+    return copy, schema
+
+
+def with_common_settings(path: Path) -> str:
+    """Return the text of a scenario file, with common settings that it lacks as comments.
+
+    A setting of a section of the file is below the section's key, the others are at the end.
+    """
+    text = path.read_text(encoding="utf-8")
+    lines, written = text.splitlines(), lines_of_keys(path)
+    hints: dict[int, tuple[str, _Tree]] = {}  # indentation and hints below a line; 0: the end
+    for key, value, about in _common_values(path):
+        if key in written:
+            continue
+        depth = max(n for n in range(len(key)) if n == 0 or key[:n] in written)
+        place = written[key[:depth]] if depth else 0
+        block = _BLOCK.match(lines[place - 1]) if place else None
+        if place and block is None:
+            continue  # a section in brackets has no lines
+        indent = f"{block[1]}  " if block else ""
+        *sections, last = key[depth:]
+        node = hints.setdefault(place, (indent, {}))[1]
+        for section in sections:
+            node = node.setdefault(section, {})
+        node[last] = (value, about)
+    for place in sorted(filter(None, hints), reverse=True):
+        indent, tree = hints[place]
+        lines[place:place] = _commented(tree, indent)
+    if 0 in hints:
+        lines += ["", *_ABOUT, *_commented(hints[0][1], "")]
+    return "\n".join(lines) + "\n"
+
+
+def _commented(tree: _Tree, indent: str, depth: int = 0) -> Iterator[str]:
+    """Yield the lines of sections and settings as comments at an indentation."""
+    for name, below in tree.items():
+        start = f"{indent}# {'  ' * depth}{name}:"
+        if isinstance(below, dict):
+            yield start
+            yield from _commented(below, indent, depth + 1)
+        else:
+            value, about = below
+            line = f"{start} {json.dumps(value)}"
+            with_about = f"{line}  # {about}"
+            yield with_about if len(about) >= _LEAST_ABOUT and len(with_about) <= _WIDTH else line
+
+
+def _common_values(path: Path) -> Iterator[tuple[Key, Any, str]]:
+    """Yield key, present value and description of the common settings that a scenario has."""
+    from experiments.scenario.loading import load_scenario, schema_text
+    from experiments.scenario.settings import Recording
+
+    scenario, schema = load_scenario(path), json.loads(schema_text())
+    present = scenario.resolved()
+    kind = "Simulation"
+    if isinstance(scenario, Recording):
+        kind = "Recording"
+    elif scenario.generated is not None:
+        kind = "GeneratedScenario"
+    for dotted in COMMON_SETTINGS:
+        key = tuple(dotted.split("."))
+        field: dict[str, Any] | None = {"$ref": f"#/$defs/{kind}"}
+        value: Any = present
+        for part in key:
+            if field and "$ref" in field:
+                field = schema["$defs"][field["$ref"].rpartition("/")[2]]
+            field = field.get("properties", {}).get(part) if field else None
+            value = value.get(part) if isinstance(value, dict) else None
+        if field is not None:
+            about = field.get("description", "").partition(". ")[0].partition(";")[0]
+            yield key, field.get("default") if value is None else value, about.rstrip(".")

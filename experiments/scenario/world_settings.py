@@ -7,11 +7,10 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from experiments.scenario.seeds import generator
 from mapfusion.datasets.odometry_noise import NoiseSource
 from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fusion.fusers import COMPARED, target_of
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.parameters import Range
 from mapfusion.robot_log import STRAY_M
 from sim.driver import DriverSettings

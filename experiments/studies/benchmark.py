@@ -23,7 +23,6 @@ from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, wri
 from experiments.pipeline.tasks import OnProgress, run_tasks, tasks_of
 from experiments.pipeline.workers import single_threaded, workers
 from experiments.plugins.discovery import callable_aligner, find_method, known_methods
-from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.scenario.suite import chosen_aligners, settings_of
 from experiments.studies.intervals import log_ratio, wilson
@@ -32,7 +31,7 @@ from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.files import schema
 from mapfusion.geometry import se2
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.registration import Registration
 

@@ -88,11 +88,6 @@ def _nees_per_dof(fusion: pd.DataFrame) -> pd.DataFrame:
     return per_dof.groupby(["run_id", *ROBOT_PAIR], sort=False)["nees"].mean().reset_index()
 
 
-def _fused_last(fusers: pd.DataFrame) -> pd.DataFrame:
-    """Return each fuser's last map, with the fuser as aligner."""
-    return last_fused(fusers).drop(columns="iteration").rename(columns={"fuser": "aligner"})
-
-
 def _team_alignments(pairs: pd.DataFrame) -> pd.DataFrame:
     """Add found (right and used), false (wrong and used) and off_m (error in the team's map)."""
     used, right = is_used_by_team(pairs), right_refined(pairs)
@@ -109,7 +104,14 @@ READ: dict[str, tuple[Sequence[str] | None, Sequence[str], Callable[..., pd.Data
     "robots": (["robot", "path_error_m", "odometry_error_m"], (), partial(path_rms, by=_ROBOT)),
     "map_fits": (["map", "rmse_m"], (), pd.DataFrame),
     "smoother": (["robot", *_SMOOTHER], (), pd.DataFrame),
-    "fusers": (["fuser", "iteration", *_FUSERS], (), _fused_last),
+    "fusers": (
+        ["fuser", "iteration", *_FUSERS],
+        (),
+        # each fuser's last map, with the fuser as aligner
+        lambda rows: (
+            last_fused(rows).drop(columns="iteration").rename(columns={"fuser": "aligner"})
+        ),
+    ),
     "team": (["component", "source", "rmse"], (), pd.DataFrame),
     "team_pairs": (None, (), _team_alignments),
     "fusion": ([*ROBOT_PAIR, "true_pair", _NEES, "degrees_of_freedom"], (), _nees_per_dof),

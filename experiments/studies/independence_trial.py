@@ -15,9 +15,13 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.evaluation.alignment_errors import first_shared_iteration
 from experiments.evaluation.evaluated_run import EvaluatedRun
-from experiments.evaluation.map_errors import EvaluatedFusion, GivenMap, SmoothedRobot
+from experiments.evaluation.map_errors import (
+    EvaluatedFusion,
+    GivenMap,
+    SmoothedRobot,
+    first_shared_iteration,
+)
 from experiments.evaluation.path_errors import STATISTICS, PlacedPath, team_ate_m
 from experiments.evaluation.tables import UNKNOWN
 from experiments.pipeline.stage import Stage

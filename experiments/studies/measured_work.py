@@ -22,19 +22,17 @@ from experiments.pipeline.stage import Job
 from experiments.pipeline.stages import fuse, smooth
 from experiments.pipeline.stages.align import AlignerSettings
 from experiments.pipeline.stages.fuse import FuseSettings
-from experiments.pipeline.stages.robot_maps import folders_of_both, latest_at, maps_of
 from experiments.pipeline.stages.slam import SlamSettings
-from experiments.pipeline.stages.smooth import SmoothSettings
+from experiments.pipeline.stages.smooth import SmoothSettings, folders_of_both, latest_at, maps_of
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows
 from experiments.pipeline.workers import single_threaded
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import generator
 from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import POSE_FIELDS, float_fields, named_columns, schema
 from mapfusion.fusion.fusers import FusedMap
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance, write_log
 from mapfusion.verification.registration import Registration

@@ -17,8 +17,12 @@ from experiments.evaluation.criteria import (
     right_refined,
 )
 from experiments.studies.intervals import wilson
-from experiments.studies.refusal_cases import APART, COMMON, FEW, POSTER_RADII_M
 from mapfusion.geometry.numerics import Float
+
+# Kinds of cases; `refusal_trial` describes them.
+APART, COMMON = "apart", "common"
+FEW, REPEATED = "few", "repeated"
+POSTER_RADII_M = (0.5, 1.0, 2.0)  # of a poster, a mural, and half a wall
 
 
 class Rate(NamedTuple):

@@ -27,7 +27,6 @@ from experiments.evaluation.criteria import (
 from experiments.evaluation.fused_landmarks import mean_nees_band
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.path_errors import STATISTICS
-from experiments.scenario.seeds import generator
 from experiments.studies import intervals
 from experiments.studies.method_comparison import (
     LAST,
@@ -37,6 +36,7 @@ from experiments.studies.method_comparison import (
 )
 from experiments.studies.run_tables import Runs
 from mapfusion.align.alignment import Status
+from mapfusion.geometry.numerics import generator
 
 BAND = (0.1, 0.9)
 _SIGNED = tuple(name for name in ERROR_COLUMNS if name.endswith("_rad"))

@@ -22,9 +22,9 @@ from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
 from experiments.evaluation.criteria import MERGEABLE_PAIRS
-from experiments.scenario.seeds import parse_seeds
-from experiments.studies import refusal_cases
-from experiments.studies.refusal_cases import Case, MappedWorld, worlds_of
+from experiments.scenario.suite import parse_seeds
+from experiments.studies import refusal_trial
+from experiments.studies.refusal_trial import Case, MappedWorld, worlds_of
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Oracle
 from mapfusion.files import write_whole
@@ -60,7 +60,7 @@ def cases_of(world: MappedWorld, every: int) -> Iterator[tuple[int, Case]]:
     matching, radius_m = world.scenario.align.match, world.scenario.evaluate.true_pair_radius_m
     pairs = itertools.combinations(world.robots(), 2)
     for (a, b), k in itertools.product(pairs, world.iterations[every - 1 :: every]):
-        yield k, refusal_cases.common(a, b, k, matching, radius_m)
+        yield k, refusal_trial.common(a, b, k, matching, radius_m)
 
 
 # Regions observed again under right and under wrong motions

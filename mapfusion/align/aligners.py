@@ -1,18 +1,39 @@
-"""Built-in aligners by name."""
+"""Interface of aligners, and the built-in methods by name.
 
+A method estimates a motion from correspondences. `MethodAligner` makes an aligner of it, which adds
+refusal, covariance and time.
+"""
+
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
-from typing import Any
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, NamedTuple, Protocol
 
-from mapfusion.align.alignment import Method
+import numpy as np
+
+from mapfusion.align.alignment import (
+    MIN_PAIRS,
+    Alignment,
+    Fit,
+    Method,
+    Needs,
+    Pairs,
+    Status,
+    Undetermined,
+    undetermined,
+    why_too_few,
+)
 from mapfusion.align.clique import Clique
-from mapfusion.align.correspondences import HeightGate
+from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.covariance import alignment_covariance, estimate_drift_m
 from mapfusion.align.gnc import Gnc
 from mapfusion.align.icp import Icp, ImpIcp
 from mapfusion.align.peers import KissMatcher, OpenCv
 from mapfusion.align.ransac import Ransac, RansacMahalanobis
+from mapfusion.align.rigid_motion import least_squares_gain, residual_covariances, residuals
 from mapfusion.align.svd import Svd
 from mapfusion.errors import did_you_mean
+from mapfusion.landmark_map import LandmarkMap
 
 ALIGNERS: dict[str, type[Method]] = {
     "ransac": Ransac,
@@ -60,3 +81,151 @@ def construct(name: str, constructor: Callable[..., Any], parameters: Mapping[st
         return constructor(**parameters)
     except TypeError as error:
         raise ValueError(f"parameters: {name}: {error}") from error
+
+
+class Aligner(Protocol):
+    """Interface of a class that returns a complete `Alignment`."""
+
+    @property
+    def randomised(self) -> bool:
+        """True if the result depends on the random generator."""
+        ...
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b."""
+        ...
+
+
+@dataclass(frozen=True)
+class MethodAligner:
+    """Aligner from a method: selects its input and adds refusal, covariance and time."""
+
+    method: Method
+
+    @property
+    def randomised(self) -> bool:
+        """True if the result depends on the random generator."""
+        return self.method.randomised
+
+    def align(
+        self,
+        map_a: LandmarkMap,
+        map_b: LandmarkMap,
+        correspondences: Correspondences,
+        rng: np.random.Generator,
+    ) -> Alignment:
+        """Estimate T_a_b.
+
+        Raises:
+            ValueError: an index of the correspondences lies outside its map.
+        """
+        return self.align_pairs(Pairs(map_a, map_b, correspondences), rng)
+
+    def align_pairs(self, pairs: Pairs, rng: np.random.Generator) -> Alignment:
+        """Estimate T_a_b from pairs, for which the method may hold cached data."""
+        started_s = time.perf_counter()
+        height = getattr(self.method, "height", None)
+        needs = getattr(self.method, "needs", None) or Needs()
+        gate = height if isinstance(height, HeightGate) else None
+        selection = _MethodInput.select(pairs, gate, needs)
+        if selection.shortage:
+            return undetermined(selection.shortage, len(pairs), started_s)
+        found = self.method.find(selection.pairs, rng)
+        if isinstance(found, Undetermined):
+            return undetermined(found.reason, len(pairs), started_s)
+        # equal fits give equal alignments
+        fitted = None if found.fitted is None else found.fitted.correspondences
+        indices = (None, None) if fitted is None else (fitted.index_a, fitted.index_b)
+        arrays = (found.T_a_b, found.inlier, found.weight, found.gain, *indices)
+        key = (
+            *(None if array is None else np.asarray(array).tobytes() for array in arrays),
+            found.gate_m,
+            found.refusal,
+        )
+        alignment = selection.alignments.get(key)
+        if alignment is None:
+            alignment = alignment_of_fit(found, pairs, selection.rows, started_s)
+            selection.alignments[key] = alignment
+        return replace(alignment, elapsed_s=time.perf_counter() - started_s)
+
+
+class _MethodInput(NamedTuple):
+    """Pairs that a method gets of all pairs of two maps.
+
+    Attributes:
+        rows: (n,) rows of these pairs among all pairs.
+        pairs: these pairs.
+        shortage: reason why the pairs are not enough for the method; empty if they are.
+        alignments: alignments of earlier fits to these pairs, by the content of the fit.
+    """
+
+    rows: np.ndarray
+    pairs: Pairs
+    shortage: str
+    alignments: dict[tuple, Alignment]
+
+    @classmethod
+    def select(cls, pairs: Pairs, height: HeightGate | None, needs: Needs) -> "_MethodInput":
+        """Return the input for a height gate and needs; equal calls share one object."""
+        inputs: dict[tuple, _MethodInput] = pairs.cache.setdefault(cls, {})
+        if (height, needs) not in inputs:
+            rows = np.arange(len(pairs)) if height is None else pairs.of_one_height(height)
+            given = pairs if len(rows) == len(pairs) else pairs[rows]
+            shortage = pairs.correspondences.shortage
+            reason = why_too_few(pairs.map_a, pairs.map_b, len(pairs), needs.pairs, shortage)
+            if not reason and len(given) < needs.pairs:
+                n, least = len(given), needs.pairs
+                reason = f"the heights of {n} correspondences agree, at least {least} are needed"
+            inputs[height, needs] = cls(rows, given, reason or needs.why_without_extent(given), {})
+        return inputs[height, needs]
+
+
+def alignment_of_fit(
+    found: Fit | Undetermined, pairs: Pairs, rows: np.ndarray, started_s: float
+) -> Alignment:
+    """Return the alignment of a fit, with drift and covariance estimated from the residuals.
+
+    Args:
+        found: result of the method.
+        pairs: all N pairs.
+        rows: (n,) rows of the pairs that the method got.
+        started_s: `time.perf_counter()` at the start.
+    """
+    if isinstance(found, Undetermined):
+        return undetermined(found.reason, len(pairs), started_s)
+    inlier = np.zeros(len(pairs), dtype=bool)
+    inlier[rows[found.inlier]] = True
+    fitted = pairs[inlier] if found.fitted is None else found.fitted
+    refusal, n_inliers = found.refusal, int(np.count_nonzero(inlier))
+    if n_inliers < MIN_PAIRS and not refusal:
+        refusal = f"{n_inliers} correspondences agree, at least {MIN_PAIRS} are needed"
+    covariance, drift, lower_bound = np.full((3, 3), np.nan), np.nan, True
+    if len(fitted) >= 2:
+        gain = found.gain
+        if gain is None:
+            gain = least_squares_gain(found.T_a_b, fitted.p_b, found.weight)
+        own = residual_covariances(found.T_a_b, fitted.covariance_a, fitted.covariance_b)
+        e = residuals(found.T_a_b, fitted.p_a, fitted.p_b)
+        drift = estimate_drift_m(e, own, found.gate_m)
+        covariance, lower_bound = alignment_covariance(found.T_a_b, fitted, gain, drift)
+    return Alignment(
+        found.T_a_b,
+        covariance,
+        inlier,
+        time.perf_counter() - started_s,
+        Status.REFUSED if refusal else Status.ACCEPTED,
+        refusal,
+        drift,
+        lower_bound,
+    )
+
+
+def as_aligner(method: Method | Aligner) -> Aligner:
+    """Return an aligner for a method: the method itself if it has `align`."""
+    return method if hasattr(method, "align") else MethodAligner(method)  # type: ignore[return-value]

@@ -16,10 +16,12 @@ from mapfusion.geometry.numerics import (
     chi_square_bound,
     kernel,
     packed,
+    require_finite,
+    require_shape,
     trailing_zeros,
 )
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import Probability, Range, require_finite, require_in_range, require_shape
+from mapfusion.parameters import Probability, Range, require_in_range
 from mapfusion.robot_log import FILTERED_STRAY_M
 from mapfusion.tables import NO_LABEL
 

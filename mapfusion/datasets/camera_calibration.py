@@ -18,8 +18,8 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from mapfusion.camera import MAX_IMAGE_SIDE_PX, StereoCamera
 from mapfusion.errors import InputError, OutOfRangeError
-from mapfusion.geometry.camera import MAX_IMAGE_SIDE_PX, StereoCamera
 from mapfusion.geometry.numerics import Float
 
 Distortion = Literal["none", "radial-tangential", "equidistant"]

@@ -13,15 +13,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mapfusion.camera import StereoCamera
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
 from mapfusion.datasets.text_files import NS, ODOMETRY_FILE, tum_text
 from mapfusion.files import write_whole
 from mapfusion.geometry import se2, se3
-from mapfusion.geometry.camera import StereoCamera
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_shape
 from mapfusion.geometry.se2 import rotation
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import require_shape
 
 OnFrame = Callable[[int, int], None]  # called with the numbers of written and of all frames
 

@@ -6,11 +6,11 @@ from typing import Annotated
 import numpy as np
 
 from mapfusion.attitude import Attitude, transform_observations
+from mapfusion.camera import StereoCamera
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
 from mapfusion.datasets.formats import AttitudeSource
 from mapfusion.datasets.imu import SHARED_RAD, ImuData
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se3 import inverse, pose, roll_pitch
 from mapfusion.parameters import Range, require_in_range

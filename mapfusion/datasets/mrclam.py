@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mapfusion.camera import CalibrationError
 from mapfusion.datasets.text_files import parse_numbers, read_rows, require_columns
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import CalibrationError
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, compose, rotation, wrap
 from mapfusion.robot_log import (

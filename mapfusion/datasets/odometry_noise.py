@@ -114,7 +114,11 @@ def estimate_odometry_noise(
             continue
         off, S, C = off[is_accurate], S[is_accurate], C[is_accurate]
         if not factors:  # the shortest spans are the most
-            exceeds = _exceeds_stated(off, S + C)
+            # sign test: more squared distances than by chance exceed the median
+            median = chi_square_bound(0.5, len(_MEASURED))
+            n_larger = int(np.count_nonzero(_squared_distances(off, S + C) > median))
+            by_chance = scipy.special.bdtrc(n_larger - 1, len(off), 0.5)
+            exceeds = n_larger > 0 and float(by_chance) < _FALSE_ALARM
             stated = np.median(sigma[observed.end[is_accurate]][:, _MEASURED], axis=0)
         _, _, C_walks = _differences(log.odometry, walks, observed)
         given = off, S, C_walks[is_accurate]
@@ -160,13 +164,6 @@ def _diagonal(covariance: Float) -> Float:
 
 def _squared_distances(off: Float, covariance: Float) -> Float:
     return np.sum(off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0], axis=1)
-
-
-def _exceeds_stated(off: Float, covariance: Float) -> bool:
-    """Return True if more squared distances than by chance exceed the median (sign test)."""
-    median = chi_square_bound(0.5, len(_MEASURED))
-    n_larger = int(np.count_nonzero(_squared_distances(off, covariance) > median))
-    return n_larger > 0 and float(scipy.special.bdtrc(n_larger - 1, len(off), 0.5)) < _FALSE_ALARM
 
 
 def _factor(off: Float, S: Float, C: Float, probability: float) -> float:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.attitude import Attitude, write_attitude
+from mapfusion.camera import CalibrationError, StereoCamera, default_calibration_error
 from mapfusion.datasets.camera_calibration import Rectification
 from mapfusion.datasets.formats import AttitudeSource
 from mapfusion.datasets.levelling import (
@@ -29,7 +30,6 @@ from mapfusion.datasets.text_files import NS, TimedPoses
 from mapfusion.errors import InputError, OutOfRangeError
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import CalibrationError, StereoCamera, default_calibration_error
 from mapfusion.geometry.numerics import Float
 from mapfusion.robot_log import (
     TRUTH_FILES,

@@ -14,8 +14,7 @@ import numpy as np
 
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
-from mapfusion.geometry.numerics import Float
-from mapfusion.parameters import require_finite, require_shape
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 
 NS = 1_000_000_000  # nanoseconds in a second
 _LATEST_NS = 2**62  # the year 2116, from 1970; the sum of two times fits 64 bits

@@ -36,10 +36,10 @@ from mapfusion.fastslam.motion import MotionNoise, sample_motion
 from mapfusion.fastslam.particles import ParticleMaps, PathHistory
 from mapfusion.fastslam.proposal import Proposal, informed_disturbance, with_odometry_noise
 from mapfusion.fastslam.resampling import effective_sample_size, normalised, systematic_ancestors
-from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.numerics import Float, chi_square_bound, require_finite, require_shape
 from mapfusion.geometry.se2 import compose
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import Probability, Range, require_finite, require_in_range, require_shape
+from mapfusion.parameters import Probability, Range, require_in_range
 from mapfusion.robot_log import FILTERED_STRAY_M, Observations
 from mapfusion.tables import NO_LABEL
 

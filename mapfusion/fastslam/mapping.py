@@ -9,9 +9,8 @@ from mapfusion.attitude import Attitude, attitude_height_errors
 from mapfusion.errors import InputError
 from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, FastSlamParameters, StepResult
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_shape
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import require_shape
 from mapfusion.robot_log import RobotLog
 from mapfusion.tables import NO_LABEL
 from mapfusion.viewing import viewing_of_log

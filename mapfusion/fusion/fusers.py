@@ -22,7 +22,7 @@ from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Probability, Range, require_in_range
-from mapfusion.smoother.joint_smoothing import AssociatedLog
+from mapfusion.smoother.smooth import AssociatedLog
 
 
 @dataclass(frozen=True)

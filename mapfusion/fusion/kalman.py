@@ -159,15 +159,9 @@ class KalmanAsPrinted:
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the maps of a component; `fallback` reports covariances that are not positive."""
         fused = fuse_sequentially(component, parameters, kalman_update_as_printed, use_drift=False)
-        return replace(fused, fallback=_indefinite_covariances(fused))
-
-
-def _indefinite_covariances(fused: FusedMap) -> str:
-    """Return how many fused covariances are not positive definite; empty if all are."""
-    dimensions = 2 if fused.landmarks.planar else 3
-    several = np.count_nonzero(fused.parents != ABSENT, axis=1) > 1
-    covariance = fused.landmarks.covariance_m2[several, :dimensions, :dimensions]
-    n_wrong = int(np.count_nonzero(np.linalg.eigvalsh(covariance)[:, 0] <= 0))
-    if not n_wrong:
-        return ""
-    return f"{n_wrong} of {len(covariance)} fused covariances are not positive definite"
+        dimensions = 2 if fused.landmarks.planar else 3
+        several = np.count_nonzero(fused.parents != ABSENT, axis=1) > 1
+        covariance = fused.landmarks.covariance_m2[several, :dimensions, :dimensions]
+        n_wrong = int(np.count_nonzero(np.linalg.eigvalsh(covariance)[:, 0] <= 0))
+        wrong = f"{n_wrong} of {len(covariance)} fused covariances are not positive definite"
+        return replace(fused, fallback=wrong if n_wrong else "")

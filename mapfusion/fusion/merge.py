@@ -18,9 +18,9 @@ from mapfusion.fusion.fusers import (
 )
 from mapfusion.fusion.pose_graph import AlignmentEdges
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters, team_graph
+from mapfusion.geometry.numerics import require_shape
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import require_shape
-from mapfusion.smoother.joint_smoothing import AssociatedLog
+from mapfusion.smoother.smooth import AssociatedLog
 
 DEFAULTS = MergeParameters()
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se2 import IDENTITY, between, compose, inverse, rotation, wrap
-from mapfusion.parameters import require_finite, require_shape
 
 
 @dataclass(frozen=True)

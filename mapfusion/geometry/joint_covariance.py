@@ -13,8 +13,7 @@ from typing import Protocol
 import numpy as np
 import scipy
 
-from mapfusion.geometry.numerics import Float
-from mapfusion.parameters import require_finite, require_shape
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 
 # Number of shared variables that are kept. A log has three per frame, but their variances fall
 # fast; the remainder is added to the landmarks' own covariances.

@@ -1,4 +1,4 @@
-"""Numerical building blocks: compiled kernels, 3 x 3 matrices, bit sets, chi-square bounds.
+"""Numerical building blocks: kernels, 3 x 3 matrices, bit sets, bounds, generators, checks.
 
 BLAS threads: NumPy and SciPy each have a BLAS with its own threads, and the threads of one BLAS
 spin while the other computes. Alternating calls with small blocks, as in an envelope factorisation,
@@ -9,6 +9,7 @@ and its rounding depends on the processor.
 """
 
 import math
+import zlib
 from collections.abc import Callable
 from functools import cache, cached_property, partial
 from typing import Any, cast
@@ -373,3 +374,71 @@ def mirror(graph: np.ndarray) -> None:
             transpose(square)
             for k in range(min(WORD, n - c * WORD)):
                 graph[c * WORD + k, r] |= square[k]
+
+
+# Above these limits, rounding errors of squared distances and determinants are too large.
+LARGEST_POSITION_M = 1e7
+LARGEST_SIGMA_M = 1e5
+
+
+def require_finite(name: str, values: np.ndarray) -> None:
+    """Raise ValueError when `values` holds NaN or infinity."""
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"{name}: contains NaN or infinity")
+
+
+def require_shape(name: str, values: np.ndarray, shape: tuple[int | None, ...]) -> None:
+    """Raise ValueError when `values` has another shape; None matches any length."""
+    fits = values.ndim == len(shape) and all(
+        want is None or have == want for have, want in zip(values.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = tuple("N" if n is None else n for n in shape)
+        raise ValueError(f"{name}: shape is {values.shape}, expected {wanted}".replace("'", ""))
+
+
+def require_points(position_m: np.ndarray, covariance_m2: np.ndarray, planar: bool) -> None:
+    """Raise ValueError for points (N, 3) that cannot be used; the message names the row.
+
+    Coordinates and covariances (N, 3, 3) are limited in size, and covariances must be positive
+    definite. The z coordinate of planar data is not checked.
+    """
+    size = 2 if planar else 3
+    used = covariance_m2[:, :size, :size]
+    far = (np.abs(position_m) > LARGEST_POSITION_M).any(1)
+    _refuse("position_m", far, f"above {LARGEST_POSITION_M:g} m")
+    vague = (np.abs(used) > LARGEST_SIGMA_M**2).any((1, 2))
+    _refuse("covariance_m2", vague, f"above {LARGEST_SIGMA_M:g} m squared")
+    try:
+        np.linalg.cholesky(used)
+    except np.linalg.LinAlgError:
+        # the smallest eigenvalue that differs from zero in 64 bits
+        low, high = np.linalg.eigvalsh(used)[:, [0, -1]].T
+        _refuse("covariance_m2", low <= np.finfo(float).eps * high, "not positive definite")
+
+
+def require_no_twins(name: str, *columns: np.ndarray) -> None:
+    """Raise ValueError when two of N rows are equal in all columns (N,) or (N, k)."""
+    rows = np.column_stack(columns)
+    # a column without repetitions is enough, and far faster than sorting rows by all columns
+    if any(len(np.unique(column)) == len(rows) for column in rows.T[::-1]):
+        return
+    order = np.lexsort(rows.T)
+    same = (rows[order[1:]] == rows[order[:-1]]).all(1)
+    if same.any():
+        pair = sorted(order[np.flatnonzero(same)[0] :][:2].tolist())
+        raise ValueError(f"{name}: row {pair[1]} repeats row {pair[0]}, remove one of them")
+
+
+def _refuse(name: str, wrong: np.ndarray | np.bool, what: str) -> None:
+    if np.any(wrong):
+        raise ValueError(f"{name}: {what} in row {np.flatnonzero(wrong)[0]}")
+
+
+def generator(seed: int, *purpose: str | int) -> np.random.Generator:
+    """Return the generator for a purpose, for example ("odometry", "R1").
+
+    Its numbers do not depend on other generators.
+    """
+    key = tuple(zlib.crc32(str(part).encode()) for part in purpose)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))

@@ -12,38 +12,13 @@ import numpy as np
 
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import IDENTITY, between, compose
-from mapfusion.parameters import require_shape
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
 from mapfusion.smoother.elimination import pose_covariances, require_memory
 from mapfusion.smoother.noise_estimation import UNIT_SCALES, optimize_with_noise
 from mapfusion.smoother.normal_equations import Estimate, initial_landmarks
 from mapfusion.smoother.optimizer import Problem, optimize
 from mapfusion.smoother.problem import order_observations
-from mapfusion.smoother.smooth import Smoothed, SmootherParameters
-
-
-@dataclass(frozen=True)
-class AssociatedLog:
-    """Log of a robot with data association and path.
-
-    Attributes:
-        log: T frames with N observations.
-        landmark: `source_observation` of the map's landmark for each observation, shape (N,);
-            negative for none.
-        path: approximate path, shape (T, 3), for example smoothed; its first pose is the frame of
-            the map.
-        parameters: parameters of the smoother.
-    """
-
-    log: RobotLog
-    landmark: np.ndarray
-    path: Float
-    parameters: SmootherParameters
-
-    def __post_init__(self) -> None:
-        require_shape("landmark", self.landmark, (len(self.log.observations),))
-        require_shape("path", self.path, (len(self.log), 3))
-
+from mapfusion.smoother.smooth import AssociatedLog, Smoothed
 
 _UNKNOWN = np.zeros((1, 3))  # information of the motion between two logs
 

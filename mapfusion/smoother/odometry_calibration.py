@@ -25,9 +25,8 @@ import numpy as np
 
 from mapfusion.errors import InputError
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se2 import IDENTITY, compose, wrap
-from mapfusion.parameters import require_finite, require_shape
 from mapfusion.robot_log import RobotLog, first_frames
 from mapfusion.smoother.noise_estimation import (
     NOISE_PARAMETERS,

@@ -5,8 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, inverses
-from mapfusion.parameters import require_shape
+from mapfusion.geometry.numerics import Float, inverses, require_shape
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.smoother.cholesky import Envelope, envelope_order, first_entries
 

@@ -27,10 +27,10 @@ from mapfusion.geometry.joint_covariance import (
     StackedErrors,
     reduce_rank,
 )
-from mapfusion.geometry.numerics import Float, chi_square_bound, one_blas_thread
+from mapfusion.geometry.numerics import Float, chi_square_bound, one_blas_thread, require_shape
 from mapfusion.geometry.se2 import between, rotation
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.parameters import Range, require_in_range, require_shape
+from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import STRAY_M, RobotLog
 from mapfusion.smoother.elimination import require_memory, shared_errors
 from mapfusion.smoother.noise_estimation import UNIT_SCALES, NoiseScales, optimize_with_noise
@@ -235,6 +235,29 @@ class SmootherParameters:
         information = bounded_information(sigma)
         information[own] = odometry_information(log.odometry, self.motion)[own]
         return information
+
+
+@dataclass(frozen=True)
+class AssociatedLog:
+    """Log of a robot with data association and path.
+
+    Attributes:
+        log: T frames with N observations.
+        landmark: `source_observation` of the map's landmark for each observation, shape (N,);
+            negative for none.
+        path: approximate path, shape (T, 3), for example smoothed; its first pose is the frame of
+            the map.
+        parameters: parameters of the smoother.
+    """
+
+    log: RobotLog
+    landmark: np.ndarray
+    path: Float
+    parameters: SmootherParameters
+
+    def __post_init__(self) -> None:
+        require_shape("landmark", self.landmark, (len(self.log.observations),))
+        require_shape("path", self.path, (len(self.log), 3))
 
 
 @dataclass(frozen=True)

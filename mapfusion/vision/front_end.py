@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import Observations

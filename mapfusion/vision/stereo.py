@@ -21,15 +21,15 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.geometry.camera import StereoCamera
-from mapfusion.geometry.numerics import Float, chi_square_bound, kernel
-from mapfusion.parameters import (
-    Range,
-    require_at_least,
+from mapfusion.camera import StereoCamera
+from mapfusion.geometry.numerics import (
+    Float,
+    chi_square_bound,
+    kernel,
     require_finite,
-    require_in_range,
     require_shape,
 )
+from mapfusion.parameters import Range, require_at_least, require_in_range
 from mapfusion.vision.disparity_tests import FURTHER_TERMS, fails_silhouette_test, window_statistics
 from mapfusion.vision.subpixel import MOST_HALF_PX, fit_planes
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.vision.disparity_tests import window_statistics
 from mapfusion.vision.harris import HarrisParameters, detect

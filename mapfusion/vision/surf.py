@@ -17,14 +17,8 @@ from typing import Annotated, Literal
 import cv2
 import numpy as np
 
-from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.parameters import (
-    Range,
-    require_at_least,
-    require_finite,
-    require_in_range,
-    require_shape,
-)
+from mapfusion.geometry.numerics import Float, kernel, require_finite, require_shape
+from mapfusion.parameters import Range, require_at_least, require_in_range
 
 CELLS = 4
 SAMPLES_PER_CELL = 5

@@ -9,15 +9,9 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.geometry.camera import StereoCamera
-from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.parameters import (
-    Probability,
-    Range,
-    require_finite,
-    require_in_range,
-    require_shape,
-)
+from mapfusion.camera import StereoCamera
+from mapfusion.geometry.numerics import Float, kernel, require_finite, require_shape
+from mapfusion.parameters import Probability, Range, require_in_range
 from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.patch_alignment import Templates, fit_patches
 from mapfusion.vision.visual_odometry import RigidMotion, estimate_rigid_motion

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapfusion.attitude import Attitude
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import (
     Float,
     chi_square_bound,

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import StereoCamera
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, require_shape
 from mapfusion.geometry.se2 import compose, transform_points
-from mapfusion.parameters import require_shape
 from sim.p3at import P3at
 from sim.renderer import BulletRenderer, Renderer
 from sim.rendering.ray_caster import RayCaster

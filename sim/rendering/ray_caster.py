@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se3 import planar
 from sim.p3at import URDF

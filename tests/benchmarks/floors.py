@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
 from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.surf import LENGTH

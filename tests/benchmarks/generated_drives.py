@@ -26,7 +26,7 @@ from experiments.pipeline.stages import drive
 from experiments.pipeline.stages.pipeline import build_pipeline
 from experiments.pipeline.workers import single_threaded
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.seeds import parse_seeds
+from experiments.scenario.suite import parse_seeds
 from mapfusion.errors import InputError
 from sim.routes import resolve_deadlock
 from tests.benchmarks.generated_runs import REPOSITORY, generated_scenarios

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from experiments.evaluation.result import run_scenario
 from experiments.scenario.loading import load_scenario
-from experiments.scenario.seeds import parse_seeds
-from experiments.scenario.suite import one_scenario
+from experiments.scenario.suite import one_scenario, parse_seeds
 from experiments.studies.paper_claims import SCENARIOS
 
 

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.scenario.seeds import parse_seeds
+from experiments.scenario.suite import parse_seeds
 
 _SCENARIOS = Path(__file__).parents[2] / "scenarios"
 # The focal length is that of the default camera at half its resolution.

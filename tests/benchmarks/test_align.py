@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.align.aligners import ALIGNERS, make_aligner
+from mapfusion.align.aligners import ALIGNERS, as_aligner, make_aligner
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.correspondences import Correspondences, match
 from mapfusion.align.ransac import Ransac
@@ -17,7 +17,6 @@ from mapfusion.align.refinement import Refinement
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.verification.registration import as_aligner
 
 SIZE_M = np.array([20.0, 20.0, 2.5])
 NOISE_M = 0.05

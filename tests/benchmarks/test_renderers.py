@@ -20,8 +20,8 @@ from scipy.ndimage import map_coordinates
 from experiments.pipeline.stages.drive import Walls
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
+from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import compose
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters, observable
 from mapfusion.vision.tracking import Tracker

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from sim.driver import DriverSettings, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.rendering.frame_source import FrameSource

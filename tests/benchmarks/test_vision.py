@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.vision.front_end import FrontEnd
 from mapfusion.vision.harris import HarrisParameters, detect
 from mapfusion.vision.stereo import StereoParameters, match

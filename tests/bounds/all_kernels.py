@@ -10,7 +10,7 @@ import numpy as np
 from mapfusion.align.aligners import ALIGNERS, make_aligner
 from mapfusion.align.clique import full_set, larger_clique
 from mapfusion.align.correspondences import match
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.se3 import in_space
 from mapfusion.smoother.smooth import condensed_points
 from mapfusion.verification.registration import Registration

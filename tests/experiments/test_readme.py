@@ -10,7 +10,7 @@ import typer
 from typer.main import get_command
 
 from experiments.cli.main import app
-from experiments.reports.terminal.run_screen import closing_lines
+from experiments.reports.run_screen import closing_lines
 from mapfusion.landmark_map import read_map
 from tests.helpers.tiny_scenario import command
 

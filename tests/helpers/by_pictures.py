@@ -10,10 +10,10 @@ from experiments.evaluation.single_steps import write_drives
 from experiments.pipeline.store import Store
 from experiments.scenario.settings import Simulation
 from experiments.scenario.yaml_files import read_calibration
+from mapfusion.camera import EXACT
 from mapfusion.datasets.formats import read_recording
 from mapfusion.datasets.stereo_import import RecordingPart, StereoImport
 from mapfusion.fastslam.mapping import run_log
-from mapfusion.geometry.camera import EXACT
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import read_truth

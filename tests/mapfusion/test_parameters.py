@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapfusion.errors import MOST_CHARACTERS, InputError, OutOfRangeError, did_you_mean, one_line
-from mapfusion.parameters import Range, require_in_range, require_no_twins
+from mapfusion.parameters import Range, require_in_range
 
 Side = Annotated[float, Range(1, 5, "m")]
 
@@ -77,16 +77,3 @@ def test_names_that_look_alike_are_offered() -> None:
     assert did_you_mean("ipc", ["svd", "icp"]) == "; did you mean icp?"
     assert did_you_mean("magic", ["svd", "ransac"]) == ""
     assert did_you_mean("nope", ["svd", "opencv"]) == ""
-
-
-@pytest.mark.parametrize("named", [[0, 1, 2, 3], [0, 0, 1, 1], [0, 0, 0, 0]])
-def test_rows_are_twins_only_where_all_columns_are_the_same(named: list[int]) -> None:
-    name, points = np.array(named), np.array([[1.0, 2.0], [1.0, 3.0], [4.0, 2.0], [4.0, 3.0]])
-    require_no_twins("points", name, points)
-    twice = np.array([0, 1, 2, 3, 1])
-    with pytest.raises(ValueError, match="points: row 4 repeats row 1"):
-        require_no_twins("points", name[twice], points[twice])
-
-
-def test_rows_that_are_not_numbers_are_no_twins() -> None:
-    require_no_twins("points", np.full(3, np.nan), np.full((3, 2), np.nan))

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.se2 import transform_points
 from sim.floorplan import Face, FloorPlan
 from sim.stereo_head import RadiometricNoise

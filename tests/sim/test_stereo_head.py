@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest, norm
 
+from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import StereoCamera
 from sim.floorplan import FloorPlan
 from sim.stereo_head import (
     SAME_SURFACE,

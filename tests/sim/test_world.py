@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
 from sim.stereo_head import RadiometricNoise, render_stereo
 from sim.world import World, silence, write_faces
@@ -15,7 +15,7 @@ EVERYTHING = """
 import sys
 from pathlib import Path
 import numpy as np
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from sim.driver import DriverSettings, drive
 from sim.floorplan import FloorPlan, Wall
 from sim.rendering.frame_source import FrameSource

@@ -14,7 +14,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.pipeline.stage import Job, StageKind
-from experiments.pipeline.stages.robot_maps import (
+from experiments.pipeline.stages.smooth import (
     ROBOTS_KEPT,
     RobotFolders,
     folders_of_both,
@@ -33,10 +33,10 @@ from experiments.pipeline.tables import (
     write_rows,
 )
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.seeds import generator
 from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.correspondences import Correspondences, MatchParameters, match
 from mapfusion.align.refinement import Refinement
+from mapfusion.geometry.numerics import generator
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.likelihood import TwinShares

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from experiments.pipeline.stage import Job, StageKind
-from experiments.scenario.seeds import generator
 from mapfusion.errors import InputError
+from mapfusion.geometry.numerics import generator
 from sim.driver import DriverSettings, drive, require_drivable
 from sim.floorplan import FloorPlan, Wall
 from sim.routes import Route

@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
-from experiments.scenario.seeds import generator
+from mapfusion.camera import StereoCamera
 from mapfusion.files import (
     POSITION_FIELDS,
     column,
@@ -30,8 +30,7 @@ from mapfusion.files import (
     write_table,
     write_whole,
 )
-from mapfusion.geometry.camera import StereoCamera
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.robot_log import with_rows
 from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters

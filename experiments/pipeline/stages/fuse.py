@@ -16,10 +16,12 @@ import pyarrow as pa
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages import align
 from experiments.pipeline.stages.align import alignment_of, correspondences_of
-from experiments.pipeline.stages.robot_maps import RobotFolders, latest_at, maps_of
 from experiments.pipeline.stages.smooth import (
+    RobotFolders,
+    latest_at,
     log_to_smooth,
     log_until,
+    maps_of,
     read_smoothed_path,
     smoothed_owners,
 )
@@ -52,8 +54,7 @@ from mapfusion.fusion.fusers import AlignedPair, FusedMap, MergeParameters, make
 from mapfusion.fusion.merge import ConnectedMaps, connect
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
-from mapfusion.smoother.joint_smoothing import AssociatedLog
-from mapfusion.smoother.smooth import SmootherParameters
+from mapfusion.smoother.smooth import AssociatedLog, SmootherParameters
 
 WRITES = ("landmarks.parquet", "parents.parquet", "motions.parquet", "map.parquet")
 _OF = {"iteration": INT, "component": INT}  # component 1 has the most robots

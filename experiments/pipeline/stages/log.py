@@ -10,11 +10,10 @@ from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.pipeline.stages.features import read_features
 from experiments.pipeline.store import link_or_copy
 from experiments.pipeline.tables import TRACKS, write_rows
-from experiments.scenario.seeds import generator
 from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.attitude import write_attitude
-from mapfusion.geometry.camera import StereoCamera
-from mapfusion.geometry.numerics import Float
+from mapfusion.camera import StereoCamera
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.robot_log import (
     write_frames,
     write_observations,

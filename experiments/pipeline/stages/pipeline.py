@@ -131,9 +131,19 @@ def build_pipeline(scenario: AnyScenario) -> Pipeline:
     """
     recorded = isinstance(scenario, Recording)
     robots = tuple(_recorded(scenario) if recorded else _simulated(scenario))
-    pairs = tuple(_pair(scenario, *both) for both in itertools.combinations(robots, 2))
+    pairs, every = list[PairStages](), scenario.evaluate.every
+    for both in itertools.combinations(robots, 2):
+        a, b = sorted(both, key=lambda robot: name_order(robot.name))
+        n_frames = max(a.n_frames, b.n_frames)
+        evaluated = tuple(slam.evaluated_iterations(n_frames, every))
+        fused = tuple(smooth.fused_iterations(n_frames, every, scenario.fuse.every))
+        filtered = {"smoothed": False, "iterations": evaluated}
+        # the variation between repetitions is told by the filter's maps
+        smoothed = {"smoothed": True, "iterations": fused, "repetitions": 1}
+        alignments = (_alignment(scenario, a, b, own) for own in (filtered, smoothed))
+        pairs.append(PairStages(a, b, *alignments))
     fusers = _fusers(scenario, robots, pairs) if pairs else {}
-    return Pipeline(scenario, robots, pairs, fusers)
+    return Pipeline(scenario, robots, tuple(pairs), fusers)
 
 
 def _stage(kind: StageKind, *sections: Section, own: dict[str, Any], **more: Any) -> Stage:
@@ -252,20 +262,6 @@ def smoother_parameters(scenario: Scenario) -> SmootherParameters:
     """Return the smoother's parameters, with the filter's noise model."""
     slam = scenario.slam
     return SmootherParameters(slam.filter.motion, scenario.smooth.stray_m, slam.min_count)
-
-
-def _pair(scenario: Scenario, *robots: RobotStages) -> PairStages:
-    """Return the stages of two robots, which are ordered by name."""
-    a, b = sorted(robots, key=lambda robot: name_order(robot.name))
-    n_frames, every = max(a.n_frames, b.n_frames), scenario.evaluate.every
-    evaluated = tuple(slam.evaluated_iterations(n_frames, every))
-    fused = tuple(smooth.fused_iterations(n_frames, every, scenario.fuse.every))
-    filtered = {"smoothed": False, "iterations": evaluated}
-    # the variation between repetitions is told by the filter's maps
-    smoothed = {"smoothed": True, "iterations": fused, "repetitions": 1}
-    return PairStages(
-        a, b, _alignment(scenario, a, b, filtered), _alignment(scenario, a, b, smoothed)
-    )
 
 
 def _alignment(
@@ -408,7 +404,22 @@ def needs(pipeline: Pipeline) -> Iterator[Need]:
         pixels = camera.width_px * camera.height_px
         why = f"images of {camera.width_px} x {camera.height_px} pixels"
         yield Need(_PIXEL_BYTES * pixels, "camera.width_px", why)
-        yield _of_textures(scenario)
+        # textures of all walls (two sides each), floor and ceiling
+        world = scenario.world
+        corners = [point for wall in world.walls for point in wall.points]
+        wide, deep = (max(axis) - min(axis) for axis in zip(*corners, strict=True))
+        lengths = [
+            ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
+            for wall in world.walls
+            for (x0, y0), (x1, y1) in zip(wall.points, wall.points[1:], strict=False)
+        ]
+        upright, level = STYLES["wall"].texels_per_m ** 2, STYLES["floor"].texels_per_m ** 2
+        faces = [2 * length * world.wall_height_m * upright for length in lengths]
+        plans = [2 * wide * deep * level]
+        painted = max(max(faces), *plans) / 2
+        n_bytes = _TEXEL_BYTES * (sum(faces) + sum(plans)) + _PAINTED_BYTES * painted
+        why = f"walls of {sum(lengths):.0f} m around {wide:.0f} m x {deep:.0f} m, painted,"
+        yield Need(n_bytes, "world.walls", why)
 
 
 def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
@@ -441,25 +452,6 @@ def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
     n_rows = n_frames / scenario.evaluate.every * n_landmarks / 2
     often = f"maps each {scenario.evaluate.every} of {n_frames} frames"
     yield Need(n_rows * _EVALUATED_BYTES, "evaluate.every", often)
-
-
-def _of_textures(scenario: Simulation) -> Need:
-    """Return the memory of the textures of all walls (two sides each), floor and ceiling."""
-    world = scenario.world
-    corners = [point for wall in world.walls for point in wall.points]
-    wide, deep = (max(axis) - min(axis) for axis in zip(*corners, strict=True))
-    lengths = [
-        ((x1 - x0) ** 2 + (y1 - y0) ** 2) ** 0.5
-        for wall in world.walls
-        for (x0, y0), (x1, y1) in zip(wall.points, wall.points[1:], strict=False)
-    ]
-    upright, level = STYLES["wall"].texels_per_m ** 2, STYLES["floor"].texels_per_m ** 2
-    faces = [2 * length * world.wall_height_m * upright for length in lengths]
-    plans = [2 * wide * deep * level]
-    painted = max(max(faces), *plans) / 2
-    n_bytes = _TEXEL_BYTES * (sum(faces) + sum(plans)) + _PAINTED_BYTES * painted
-    why = f"walls of {sum(lengths):.0f} m around {wide:.0f} m x {deep:.0f} m, painted,"
-    return Need(n_bytes, "world.walls", why)
 
 
 def memory_bytes() -> float:

@@ -11,7 +11,6 @@ import pyarrow as pa
 
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows
-from experiments.scenario.seeds import generator
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.log_consistency import Finding, Jump, check_log, gate_finding, without_jumps
 from mapfusion.datasets.odometry_noise import NoiseSource
@@ -33,7 +32,7 @@ from mapfusion.files import (
     schema,
     write_table,
 )
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.robot_log import RobotLog, read_log, read_odometry_covariance
 
 _ONLINE, _FINAL = ([f"{path}_{name}" for name in POSE_FIELDS] for path in ("online", "final"))

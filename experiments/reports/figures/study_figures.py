@@ -16,8 +16,9 @@ from experiments.reports.figures.result_tables import NothingToDraw
 from experiments.reports.figures.style import BLACK, GRAY
 from experiments.studies.independence_trial import STRATEGIES
 from experiments.studies.paper_claims import crossings
-from experiments.studies.refusal_cases import FEW, POSTER_RADII_M
 from experiments.studies.refusal_rates import (
+    FEW,
+    POSTER_RADII_M,
     VERDICTS,
     Rate,
     mergeable,

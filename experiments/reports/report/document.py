@@ -51,8 +51,8 @@ from experiments.reports.report.charts import (
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
+from experiments.reports.run_screen import images_by, team_lines
 from experiments.reports.study_files import claims_table
-from experiments.reports.terminal.run_screen import images_by, team_lines
 from experiments.scenario.settings import Bound
 from experiments.studies.comparison import (
     BETTER,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mapfusion.attitude import read_attitude
-from mapfusion.geometry.camera import CalibrationError
+from mapfusion.camera import CalibrationError
 from mapfusion.robot_log import read_log
 from tests.helpers.tiny_scenario import assert_refused, command
 from tests.mapfusion.datasets.written_layouts import POSES, drive, tum_lines, write_kitti

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import typer
 
-from experiments.cli.completion import (
+from experiments.cli.main import app
+from experiments.cli.options import (
     complete_aligner,
     complete_format,
     complete_scenario_or_tag,
     complete_setting,
 )
-from experiments.cli.main import app
 from experiments.plugins.discovery import known_methods
 from experiments.reports import result_export
 from experiments.scenario.settings import DEFAULT_ALIGNERS

@@ -8,7 +8,7 @@ import numpy as np
 from experiments.evaluation import tables
 from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import run_scenario
-from experiments.pipeline.stages.robot_maps import stored_maps
+from experiments.pipeline.stages.smooth import stored_maps
 from experiments.pipeline.store import Store
 from experiments.scenario.settings import Simulation
 from mapfusion.landmark_map import read_map

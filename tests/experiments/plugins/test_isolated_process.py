@@ -20,10 +20,11 @@ from experiments.plugins.isolated_process import (
     end_children,
     process_for,
 )
-from experiments.scenario.seeds import generator
+from mapfusion.align.aligners import as_aligner
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.geometry import se2
-from mapfusion.verification.registration import Registration, as_aligner
+from mapfusion.geometry.numerics import generator
+from mapfusion.verification.registration import Registration
 from tests.helpers.answered_here import answered_here
 from tests.helpers.made_up_maps import landmark_map, paired
 from tests.helpers.made_up_plugin import install, look_again

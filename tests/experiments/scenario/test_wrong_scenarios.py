@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from experiments.scenario.loading import default_settings, load_scenario
-from experiments.scenario.seeds import parse_seeds
+from experiments.scenario.suite import parse_seeds
 from experiments.scenario.yaml_files import apply_overrides, parse_value, read_mapping
 from mapfusion.errors import InputError, InputErrors
 from tests.helpers.tiny_scenario import TINY

@@ -14,7 +14,6 @@ from experiments.pipeline.store import Store
 from experiments.plugins import discovery
 from experiments.reports.figures.study_figures import draw_benchmark
 from experiments.reports.study_files import benchmark_markdown, cell_text
-from experiments.scenario.seeds import generator
 from experiments.scenario.settings import AlignerEntry
 from experiments.studies import benchmark as benchmark
 from experiments.studies.benchmark import (
@@ -35,6 +34,7 @@ from mapfusion.align.rigid_motion import residual_covariances
 from mapfusion.errors import InputError
 from mapfusion.files import read_table
 from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import generator
 from tests.helpers.tiny_scenario import command
 
 SMALL = BenchmarkDesign(

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.reports.figures.drawing import save_figure
 from experiments.reports.figures.study_figures import draw_refusal_kinds, draw_refusal_roc
-from experiments.reports.terminal.study_screen import print_kinds
+from experiments.reports.study_screen import print_kinds
 from experiments.studies.refusal_rates import (
     Rate,
     by_kind,

@@ -17,7 +17,6 @@ from experiments.reports.figures.study_figures import draw_refusal
 from experiments.reports.study_files import KINDS
 from experiments.scenario.settings import Simulation
 from experiments.scenario.world_settings import Render
-from experiments.studies import refusal_cases
 from experiments.studies import refusal_trial as results
 from experiments.studies.refusal_rates import Rate, share_up_to, summary
 from experiments.studies.refusal_trial import STATED, accepted_motions, calibrate, points_on_walls
@@ -44,21 +43,21 @@ def described(name: str, points: np.ndarray, T_world_map: list[float], seed: int
 
 
 @pytest.fixture
-def same_world() -> refusal_cases.Case:
+def same_world() -> results.Case:
     points = np.random.default_rng(0).uniform(0, 8, (60, 3)) * [1, 1, 0.3]
     a = described("A", points, [1.0, 2.0, 0.3], 1)
     b = described("B", points, [-1.0, 0.5, 2.0], 1)
-    return refusal_cases.common(a, b, ITERATION, MATCHING, 0.1)
+    return results.common(a, b, ITERATION, MATCHING, 0.1)
 
 
-def test_maps_of_one_world(same_world: refusal_cases.Case) -> None:
+def test_maps_of_one_world(same_world: results.Case) -> None:
     assert (same_world.ground, same_world.n_common, same_world.is_true.sum()) == ("common", 60, 60)
     expected = se2.between(np.array([1.0, 2.0, 0.3]), np.array([-1.0, 0.5, 2.0]))
     assert same_world.T_true == pytest.approx(expected)
 
 
-def test_few_leaves_twenty_neighbours(same_world: refusal_cases.Case) -> None:
-    fewer = refusal_cases.few(same_world, np.random.default_rng(1))
+def test_few_leaves_twenty_neighbours(same_world: results.Case) -> None:
+    fewer = results.few(same_world, np.random.default_rng(1))
     assert fewer is not None
     assert (fewer.ground, fewer.is_true.sum(), len(fewer.pairs)) == ("few", 20, 20)
     kept = same_world.map_a.position_m[fewer.pairs.index_a]
@@ -67,13 +66,13 @@ def test_few_leaves_twenty_neighbours(same_world: refusal_cases.Case) -> None:
     reach = np.linalg.norm(kept[:, None] - kept[None], axis=2).max(axis=1)
     inside = np.linalg.norm(everyone[None] - kept[:, None], axis=2) <= reach[:, None] + 1e-9
     assert inside.sum(axis=1).min() == 20
-    assert refusal_cases.few(fewer, np.random.default_rng(1)) is None
+    assert results.few(fewer, np.random.default_rng(1)) is None
 
 
-def test_a_poster_hangs_elsewhere_and_looks_the_same(same_world: refusal_cases.Case) -> None:
+def test_a_poster_hangs_elsewhere_and_looks_the_same(same_world: results.Case) -> None:
     other = described("C", np.random.default_rng(5).uniform(0, 8, (40, 3)), [0, 0, 0], 7)
     landmarks = other.maps[ITERATION]
-    case = refusal_cases.repeated(same_world, landmarks, 4.0, MATCHING, np.random.default_rng(2))
+    case = results.repeated(same_world, landmarks, 4.0, MATCHING, np.random.default_rng(2))
     assert case is not None
     assert (case.ground, case.poster_radius_m, case.n_common) == ("repeated", 4.0, 0)
     hung = case.map_b[np.arange(len(landmarks), len(case.map_b))]

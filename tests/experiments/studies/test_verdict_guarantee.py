@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import binom
 
 from experiments.pipeline.tables import read_rows
-from experiments.scenario.seeds import parse_seeds
+from experiments.scenario.suite import parse_seeds
 from experiments.studies.run_tables import find_runs
 from experiments.studies.verdict_guarantee import (
     CANDIDATES,

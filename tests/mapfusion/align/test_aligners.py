@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.align.aligners import ALIGNERS, make_aligner
+from mapfusion.align.aligners import ALIGNERS, as_aligner, make_aligner
 from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.refinement import Oracle, Refinement
 from mapfusion.align.svd import Svd
 from mapfusion.geometry import se2
-from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import (
     MapPair,
     error,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from mapfusion.align.aligners import make_aligner
+from mapfusion.align.aligners import as_aligner, make_aligner
 from mapfusion.align.alignment import Fit, Pairs, Status
 from mapfusion.align.clique import Clique, CliqueSearch
 from mapfusion.align.consensus import consistency_graphs, packed_rows
@@ -22,7 +22,6 @@ from mapfusion.align.ransac import RansacMahalanobis, least_truncated_squares
 from mapfusion.align.refinement import Oracle
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
-from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import (
     blurred,
     error,

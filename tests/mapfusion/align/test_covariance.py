@@ -20,10 +20,10 @@ from mapfusion.align.covariance import (
 from mapfusion.align.mahalanobis_gate import DRIFT_FLOOR_M
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import fit_rigid, least_squares_gain
+from mapfusion.camera import EXACT, CalibrationError
 from mapfusion.fusion.fusers import AlignedPair, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
-from mapfusion.geometry.camera import EXACT, CalibrationError
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import rotation

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
+from mapfusion.align.aligners import as_aligner
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.gnc import Gnc, anneal
 from mapfusion.align.mahalanobis_gate import mean_variances
 from mapfusion.align.rigid_motion import fit_weighted
 from mapfusion.geometry import se2
-from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import blurred, error, given_pairs
 
 BOUND = Gnc().bound

@@ -2,13 +2,12 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from mapfusion.align.aligners import make_aligner
+from mapfusion.align.aligners import as_aligner, make_aligner
 from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.icp import ClosestPoints, Icp, ImpIcp
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
-from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 
 

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from mapfusion.align.aligners import make_aligner
+from mapfusion.align.aligners import as_aligner, make_aligner
 from mapfusion.align.alignment import Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
-from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks, swapped
 
 pytest.importorskip("kiss_matcher")

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
+from mapfusion.align.aligners import as_aligner
 from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.ransac import Ransac, draw_pair, list_supporters, most_supported
 from mapfusion.align.refinement import Oracle, Refinement
 from mapfusion.geometry import se2
-from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks
 from tests.mapfusion.align.slow_twins import draw
 

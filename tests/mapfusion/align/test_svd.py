@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
+from mapfusion.align.aligners import as_aligner
 from mapfusion.align.alignment import Status
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.align.rigid_motion import motion_covariance
 from mapfusion.align.svd import Svd, solve
 from mapfusion.geometry import se2
-from mapfusion.verification.registration import as_aligner
 from tests.mapfusion.align.map_pairs import error, given_pairs, landmarks, moved
 
 RNG = np.random.default_rng(0)  # SVD draws nothing

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mapfusion.attitude import read_attitude
+from mapfusion.camera import StereoCamera
 from mapfusion.datasets.formats import read_recording
 from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.levelling import (
@@ -20,7 +21,6 @@ from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.datasets.text_files import TimedPoses
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.front_end import FrontEndParameters
 from mapfusion.vision.tracking import Features

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from mapfusion.camera import StereoCamera
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
 from mapfusion.datasets.levelling import (
     MountSettings,
@@ -13,7 +14,6 @@ from mapfusion.datasets.levelling import (
 )
 from mapfusion.datasets.text_files import TimedPoses
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations
 
 TIMES_NS = np.array([0, 10, 20, 60]) * 100_000_000

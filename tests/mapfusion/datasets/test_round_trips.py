@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapfusion.camera import StereoCamera
 from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import EXPORTERS, export_drive, read_recording, settings_class
 from mapfusion.datasets.levelling import MountSettings
@@ -14,7 +15,6 @@ from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImpo
 from mapfusion.datasets.stereo_recording import StereoRecording
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2, se3
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.vision.front_end import (
     FrontEnd,
     FrontEndParameters,

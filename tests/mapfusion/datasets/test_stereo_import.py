@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from mapfusion.camera import StereoCamera
 from mapfusion.datasets.stereo_import import (
     front_end_for_camera,
     reprojection_errors_px,
     scale_descriptor_window,
 )
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.vision.front_end import FrontEndParameters
 from mapfusion.vision.tracking import Tracks
 from mapfusion.vision.visual_odometry import RigidMotion

@@ -7,8 +7,8 @@ import numpy as np
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
 from tests.mapfusion.vision.rendered_scene import render, wall
 
 CAMERA = StereoCamera(width_px=240, height_px=180, focal_px=216.0, mount_x_m=0.0)

@@ -12,8 +12,7 @@ from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
-from mapfusion.smoother.joint_smoothing import AssociatedLog
-from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map
+from mapfusion.smoother.smooth import AssociatedLog, SmootherParameters, smooth, smoothed_map
 from tests.mapfusion.smoother.white_noise_logs import (
     Known,
     dead_reckoned,

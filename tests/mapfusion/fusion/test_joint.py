@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
+from mapfusion.camera import CalibrationError
 from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import AlignedPair, FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
@@ -16,7 +17,6 @@ from mapfusion.fusion.joint_estimate import JointMap, estimate_jointly
 from mapfusion.fusion.kalman import KalmanDrift
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
-from mapfusion.geometry.camera import CalibrationError
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.robust_loss import information_share
 from mapfusion.verification.registration import Registration

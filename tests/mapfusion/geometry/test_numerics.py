@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  brings a BLAS of its own
+from scipy.stats import pearsonr
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import mapfusion.fusion.joint
@@ -19,7 +20,9 @@ from mapfusion.geometry.numerics import (
     chi_square_bound,
     cholesky,
     cofactors,
+    generator,
     one_blas_thread,
+    require_no_twins,
     solve_lower,
     solve_upper,
 )
@@ -135,3 +138,45 @@ def test_compilation_is_announced_once_and_not_for_kernels_on_the_disk(tmp_path)
             check=True,
         )
         assert run.stdout == announced
+
+
+def draw(seed: int, *purpose: str | int) -> list[float]:
+    return generator(seed, *purpose).standard_normal(4).tolist()
+
+
+def test_a_generator_depends_on_its_seed_and_purpose_alone() -> None:
+    first = draw(1, "odometry", "R1")
+    draw(1, "odometry", "R2")
+    np.random.default_rng(1).random(100)
+    assert draw(1, "odometry", "R1") == first
+    others = [draw(2, "odometry", "R1"), draw(1, "odometry", "R2"), draw(1, "R1", "odometry")]
+    others += [draw(1, "odometry"), draw(1, "odometry", "R1", 0), draw(1, "slam", "R1")]
+    assert first not in others
+    assert len({tuple(other) for other in others}) == len(others)
+
+
+def test_generators_do_not_correlate() -> None:
+    """Frames of one robot, neighbours among the purposes: |r| stays below 4 / sqrt(n)."""
+    n = 20_000
+    streams = [generator(0, "radiometry", "R1", k).standard_normal(n) for k in range(6)]
+    for i, first in enumerate(streams):
+        for second in streams[i + 1 :]:
+            assert abs(pearsonr(first, second).statistic) < 4 / np.sqrt(n)
+
+
+def test_purposes_are_hashed_the_same_in_every_process() -> None:
+    """Python's own hash of text differs from process to process; these numbers may not."""
+    assert generator(7, "slam", "R1").integers(0, 10**6, 3).tolist() == [315144, 477990, 873372]
+
+
+@pytest.mark.parametrize("named", [[0, 1, 2, 3], [0, 0, 1, 1], [0, 0, 0, 0]])
+def test_rows_are_twins_only_where_all_columns_are_the_same(named: list[int]) -> None:
+    name, points = np.array(named), np.array([[1.0, 2.0], [1.0, 3.0], [4.0, 2.0], [4.0, 3.0]])
+    require_no_twins("points", name, points)
+    twice = np.array([0, 1, 2, 3, 1])
+    with pytest.raises(ValueError, match="points: row 4 repeats row 1"):
+        require_no_twins("points", name[twice], points[twice])
+
+
+def test_rows_that_are_not_numbers_are_no_twins() -> None:
+    require_no_twins("points", np.full(3, np.nan), np.full((3, 2), np.nan))

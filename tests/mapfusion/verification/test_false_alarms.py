@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from mapfusion.align.aligners import make_aligner
+from mapfusion.align.aligners import as_aligner, make_aligner
 from mapfusion.align.alignment import Alignment, Pairs, Status, degenerate
 from mapfusion.align.correspondences import Correspondences, match
 from mapfusion.align.ransac import Ransac
@@ -29,7 +29,7 @@ from mapfusion.verification.false_alarms import (
     minimal_motion,
     named_false_alarms,
 )
-from mapfusion.verification.registration import Registration, as_aligner
+from mapfusion.verification.registration import Registration
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks, motion, moved, swapped
 
 GATES_M = np.array([0.05, 0.1, 0.2, 0.4])

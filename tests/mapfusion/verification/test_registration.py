@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from mapfusion.align.aligners import ALIGNERS, make_aligner
+from mapfusion.align.aligners import ALIGNERS, as_aligner, make_aligner
 from mapfusion.align.alignment import (
     Alignment,
     Fit,
@@ -33,7 +33,6 @@ from mapfusion.verification.registration import (
     Registered,
     Registration,
     VerifiedRefinement,
-    as_aligner,
 )
 from mapfusion.verification.verdict import Verifier
 from tests.mapfusion.align.map_pairs import given_pairs, landmarks

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 
 
 def texture(

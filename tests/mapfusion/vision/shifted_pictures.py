@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 
 CAMERA = StereoCamera(width_px=320, height_px=240, focal_px=300.0)
 

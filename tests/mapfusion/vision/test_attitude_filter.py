@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.robot_log import Observations
 from mapfusion.vision.attitude_filter import (
     LOST_M,

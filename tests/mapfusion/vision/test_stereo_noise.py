@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.vision.harris import HarrisParameters
 from mapfusion.vision.stereo import MatchStatus, StereoParameters, match
 from mapfusion.vision.stereo_noise import (

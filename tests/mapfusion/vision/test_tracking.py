@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.se2 import transform_points
 from mapfusion.vision.front_end import FrontEnd
 from mapfusion.vision.tracking import (

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mapfusion.attitude import Attitude
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry import se3
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import between, transform_points
 from mapfusion.vision.visual_odometry import (

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from mapfusion.geometry.se2 import compose
 from sim.p3at import URDF
 from sim.rendering.ray_caster import find_visible, render_filtered

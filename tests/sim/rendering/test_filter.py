@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from sim.rendering.scene import make_scene
 from tests.sim.rendering.scenes import TEXELS_PER_M, along_m, look, one_wall, pinhole, slanted
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from sim.rendering.floor_and_ceiling import BACKGROUND, draw_plane, footprints, row_depth_m
 from sim.rendering.scene import make_scene
 from sim.rendering.walls import Pinhole

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se2 import transform_points
 from mapfusion.geometry.se3 import in_space
 from sim.floorplan import FloorPlan, Wall

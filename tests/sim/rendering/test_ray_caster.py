@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mapfusion.camera import StereoCamera
 from mapfusion.errors import InputError
-from mapfusion.geometry.camera import StereoCamera
 from mapfusion.geometry.se3 import in_space
 from sim.floorplan import FloorPlan, Wall
 from sim.rendering.frame_source import FrameSource

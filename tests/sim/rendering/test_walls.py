@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.geometry.camera import StereoCamera
+from mapfusion.camera import StereoCamera
 from sim.floorplan import FloorPlan, Wall
 from sim.rendering.scene import Walls, make_scene
 from sim.rendering.walls import NO_WALL, Pinhole, find_visible_walls

@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # listings without data frames skip this slow import
     import pandas as pd
 
 Column = tuple[str, str]  # heading and format
-MANUAL = Path(__file__).parents[2] / "docs"  # folder of the manual's pages
+MANUAL = Path(__file__).parents[1] / "docs"  # folder of the manual's pages
 _LEAST_TEXT = 8  # characters of a column of text: folded names stay legible
 NO_ESTIMATE = "given: share with an estimate; without one the error is infinite"
 _GAP = 2  # characters between columns

@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation import tables
+from experiments.reports import layout
 from experiments.reports.formatting import plain
-from experiments.reports.terminal import layout
-from experiments.reports.terminal.layout import print_lines, print_table
-from experiments.reports.terminal.run_screen import (
+from experiments.reports.layout import print_lines, print_table
+from experiments.reports.run_screen import (
     edge_lines,
     not_run_lines,
     print_result,

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.reports.terminal.statistics_screen import print_comparison, print_summary
+from experiments.reports.statistics_screen import print_comparison, print_summary
 from experiments.studies.comparison import VersionComparison
 from experiments.studies.statistics import Summary
 

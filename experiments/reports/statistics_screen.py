@@ -16,9 +16,9 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_RAD,
     setting_columns,
 )
+from experiments.reports import layout
 from experiments.reports.formatting import interval, number
-from experiments.reports.terminal import layout
-from experiments.reports.terminal.layout import columns
+from experiments.reports.layout import columns
 from experiments.studies import comparison
 from experiments.studies.intervals import FEW_RUNS, MAPS_OF_ONE_RUN, RUN
 from experiments.studies.statistics import ALL_SCENARIOS, Summary

@@ -18,8 +18,7 @@ from experiments.evaluation.criteria import (
 )
 from experiments.evaluation.single_steps import filter_settings
 from experiments.reports.formatting import interval, two_digits
-from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
-from experiments.reports.terminal.layout import (
+from experiments.reports.layout import (
     NO_ESTIMATE,
     Column,
     columns,
@@ -28,6 +27,7 @@ from experiments.reports.terminal.layout import (
     print_skipped,
     print_table,
 )
+from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
 from experiments.studies.independence_trial import STRATEGIES
 from experiments.studies.refusal_rates import VERDICTS, Rate, pooled, worst
 from experiments.studies.sweep import Survey, SweepProgress

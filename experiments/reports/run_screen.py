@@ -35,7 +35,7 @@ from experiments.evaluation.tables import SHOWN, read_provenance
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
 from experiments.reports.formatting import listed, metres, percent, radians, two_digits
-from experiments.reports.terminal.layout import (
+from experiments.reports.layout import (
     NO_ESTIMATE,
     columns,
     print_frame,

@@ -1,4 +1,4 @@
-"""Tests of `mapfusion.geometry.camera`."""
+"""Tests of `mapfusion.camera`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mapfusion.errors import InputError
-from mapfusion.geometry import se2
-from mapfusion.geometry.camera import (
+from mapfusion.camera import (
     EXACT,
     CalibrationError,
     StereoCamera,
     calibration_from,
     default_calibration_error,
 )
+from mapfusion.errors import InputError
+from mapfusion.geometry import se2
 from mapfusion.landmark_map import read_map, write_map
 from mapfusion.robot_log import Observations, RobotLog, read_log, write_log
 from tests.mapfusion.align.map_pairs import landmarks

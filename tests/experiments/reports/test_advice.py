@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from experiments.evaluation import tables
-from experiments.reports.terminal.run_screen import closing_lines, method_advice
+from experiments.reports.run_screen import closing_lines, method_advice
 from experiments.studies.method_comparison import Recommendation
 from tests.experiments.reports.report.test_verdict import GOOD, ONE_RUN, POOR
 

@@ -1,1 +1,0 @@
-"""Terminal screens of the commands."""
