@@ -187,11 +187,11 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     """
     from experiments.evaluation.single_steps import numbered_path
     from mapfusion.landmark_map import MAP_ENDINGS
-    from mapfusion.tables import is_csv
+    from mapfusion.tables import is_alone
 
     require_file("--output", path, MAP_ENDINGS, inputs)
     companion = next((each for each in _COMPANIONS if path.stem.lower().endswith(each)), None)
-    if companion and not is_csv(path):
+    if companion and not is_alone(path):
         owner = f"{path.stem[: -len(companion)]}.parquet"
         reason = f"a file NAME{companion}.parquet belongs to the map NAME.parquet ({owner})"
         raise InputError(f"--output {path}: {reason}; choose another name")
@@ -262,7 +262,7 @@ def _is_same(path: Path, other: Path) -> bool:
 def _beside(path: Path) -> tuple[Path, ...]:
     """Return the files that belong to a map's file."""
     from mapfusion.landmark_map import joint_path
-    from mapfusion.tables import is_csv
+    from mapfusion.tables import is_alone
     from mapfusion.viewing import viewing_paths
 
-    return () if is_csv(path) else (joint_path(path), *viewing_paths(path))
+    return () if is_alone(path) else (joint_path(path), *viewing_paths(path))
