@@ -19,7 +19,6 @@ from experiments.evaluation.result import require_result
 from experiments.pipeline.stages.align import alignment_of
 from experiments.reports.export import write_text
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
-from experiments.reports.figures.style import FUSED_COLOUR
 from experiments.scenario.world_settings import NAME_PATTERN
 from mapfusion.datasets.kitti import kitti_text
 from mapfusion.datasets.text_files import tum_text
@@ -30,6 +29,7 @@ from mapfusion.files import POSE_FIELDS, write_whole
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import coloured_ply, joint_path, read_map
+from mapfusion.plotting import FUSED_COLOUR
 from mapfusion.viewing import viewing_paths
 
 # Smallest standard deviation of an odometry edge. A solver needs a positive one, but the motion

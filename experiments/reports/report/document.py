@@ -36,7 +36,7 @@ from experiments.reports.figures.result_tables import (
     parse_json_object,
     read_png,
 )
-from experiments.reports.figures.style import ROBOT_COLOURS, aligner_styles
+from experiments.reports.figures.style import aligner_styles
 from experiments.reports.report.charts import (
     NEUTRAL,
     chart_style,
@@ -67,6 +67,7 @@ from experiments.studies.paper_claims import SCENARIOS, compare_with_paper
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
 from mapfusion.errors import InputError, install_command
+from mapfusion.plotting import ROBOT_COLOURS
 
 _SOURCE_DIGITS = 16
 
