@@ -182,6 +182,14 @@ class MapAlignment:
         return self.registration.refinement
 
     @property
+    def refusal(self) -> str:
+        """Why the motion is not accepted, and what to do about it."""
+        reason = self.reason.removesuffix(f"; {self.hint}")
+        remedy = self.hint or _REMEDIES[self.status]
+        why = f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}"
+        return f"{_sentence(why)} {_sentence(remedy)}"
+
+    @property
     def advice(self) -> str:
         """Which motion to use, how sure it is, or why there is none and what to do."""
         return advice([self])
@@ -261,26 +269,26 @@ def _html(text: str, table: "pd.DataFrame") -> str:
     return f"<p>{html.escape(text)}</p>{table.to_html(max_rows=6, float_format='%.3f')}"
 
 
+def best_alignment(found: Sequence[MapAlignment]) -> MapAlignment:
+    """Return the accepted alignment that chance explains least; else the nearest to acceptance."""
+    return min(found, key=lambda each: (_RANKS.index(each.status), _log10_chance(each)))
+
+
+def _log10_chance(found: MapAlignment) -> float:
+    log10 = found.registered.verdict.log10_false_alarms
+    return math.inf if math.isnan(log10) else log10
+
+
 def advice(found: Sequence[MapAlignment]) -> str:
     """Say in a few sentences which motion to use, how sure it is, or why not and what to do.
 
     Args:
         found: alignments of the same two maps by different methods, at least one.
     """
-
-    def chance(each: MapAlignment) -> float:
-        log10 = each.registered.verdict.log10_false_alarms
-        return math.inf if math.isnan(log10) else log10
-
-    best = min(found, key=lambda each: (_RANKS.index(each.status), chance(each)))
-    several = len(found) > 1
+    best, several = best_alignment(found), len(found) > 1
     if not best.accepted:
-        hint = best.hint
-        reason = best.reason.removesuffix(f"; {hint}")
-        remedy = hint or _REMEDIES[best.status]
         tried = f"None of {len(found)} methods has an accepted motion. " if several else ""
-        why = f"{best.aligner}: {str(best.status).replace('_', ' ')}: {reason}"
-        return f"{tried}Use no T_a_b. {why}. {_sentence(remedy)}"
+        return f"Use no T_a_b. {tried}{best.refusal}"
     p_b = best.map_b.position_m[:, :2]
     accepted = [each for each in found if each.accepted]
     others = [e for e in accepted if rms_distance_m(best.T_a_b, e.T_a_b, p_b) >= DISTINCT_M]
@@ -293,15 +301,12 @@ def advice(found: Sequence[MapAlignment]) -> str:
     refined = best.registered.refined
     text = f"Use T_a_b = {motion_text(best.T_a_b)} of {best.aligner}"
     text += f", {sigma_text(refined.covariance, refined.lower_bound)}. It is accepted"
+    text += f": {np.count_nonzero(best.inlier)} of {len(best.inlier)} correspondences support it, "
+    text += f"chance gives as much once in {_times(-_log10_chance(best))} pairs of maps"
     if several:
-        same = "; all methods agree" if len(accepted) == len(found) else ""
-        text += (
-            same or f"; {len(accepted)} of {len(found)} methods agree, the others have no answer"
-        )
-    text += (
-        f": {np.count_nonzero(best.inlier)} of {len(best.inlier)} correspondences support it, "
-        f"and chance gives as much once in {_times(-chance(best))} pairs of maps."
-    )
+        agree = "all" if len(accepted) == len(found) else f"{len(accepted)} of"
+        text += f", and {agree} {len(found)} methods agree"
+    text += "."
     return f"{text} {_sentence(best.reason)}" if best.reason else text
 
 
@@ -314,7 +319,7 @@ def _times(log10: float) -> str:
 
 
 def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith(('.', '?')) else '.'}"
+    return text if text.endswith((".", "?")) else f"{text}."
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -405,9 +410,8 @@ class MergedMaps:
             (a, b), first = min(
                 self.alignments.items(), key=lambda each: _RANKS.index(each[1].status)
             )
-            why = self.reasons()[a, b] if first.accepted else first.advice
-            which = f"{self.maps[a].name} and {self.maps[b].name}"
-            return f"No two maps were merged; nothing can be used. {which}: {_sentence(why)}"
+            why = _sentence(self.reasons()[a, b]) if first.accepted else first.refusal
+            return f"No two maps were merged. {self.maps[a].name} and {self.maps[b].name}: {why}"
         fused, names = self.fused, [self.maps[k].name for k in self.fused.members]
         several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
         largest = max(fused.motion_covariance[fused.members], key=lambda S: S[0, 0] + S[1, 1])
@@ -418,7 +422,7 @@ class MergedMaps:
         )
         if self.note:
             text += f" {_sentence(self.note)}"
-        left = [_sentence(f"{name} is left out: {reason}") for name, reason in fused.left_out]
+        left = [f"{name} is left out: {_sentence(reason)}" for name, reason in fused.left_out]
         return " ".join([text, *left])
 
     def write(self, path: str | os.PathLike[str]) -> list[Path]:
@@ -492,8 +496,8 @@ def numbered_path(path: Path, k: int) -> Path:
     return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
 
 
-def _loaded(given: "MapLike", name: str) -> LandmarkMap:
-    """Return a map given as such, by path or as a table.
+def load_map(given: "MapLike", name: str = "map") -> LandmarkMap:
+    """Return a map given as such, by path or as a table, which is then named `name`.
 
     Raises:
         InputError: a file or a table is not as documented, or descriptors are no unit vectors.
@@ -545,7 +549,7 @@ def align_maps(
         InputError: a map cannot be read.
         ValueError: the aligner is unknown.
     """
-    a, b = _loaded(map_a, "a"), _loaded(map_b, "b")
+    a, b = load_map(map_a, "a"), load_map(map_b, "b")
     registration = _registration(aligner)
     pairs = matching if isinstance(matching, Correspondences) else match(a, b, matching)
     ready = registration.on(a, b, pairs, evidence)
@@ -582,7 +586,7 @@ def merge_maps(
     """
     if len(maps) < 2:
         raise InputError("merge: give two maps or more")
-    loaded = tuple(_loaded(each, f"map {k}") for k, each in enumerate(maps, start=1))
+    loaded = tuple(load_map(each, f"map {k}") for k, each in enumerate(maps, start=1))
     places = [os.fspath(each) if isinstance(each, str | os.PathLike) else "" for each in maps]
     order = sorted(range(len(maps)), key=lambda k: (name_order(loaded[k].name), places[k]))
     alignments, pairs = dict[tuple[int, int], MapAlignment](), list[AlignedPair]()

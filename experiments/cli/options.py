@@ -110,9 +110,21 @@ DryRun = Annotated[
 Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
 Results = Annotated[Path, typer.Option(help="Folder that results go to.", show_default="results")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]
+MapFile = Annotated[
+    Path,
+    typer.Option("--output", "-o", help="Map to write: .parquet (keeps all), .csv, .ply or .g2o."),
+]
 OutputFolder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")]
 DocumentFile = Annotated[
     Path | None, typer.Option("--output", "-o", help="File for what --json prints.")
+]
+ReportFile = Annotated[
+    Path | None,
+    typer.Option("--report", help="HTML file with the maps, correspondences and other motions."),
+]
+PlotFile = Annotated[
+    Path | None,
+    typer.Option("--plot", help="Picture of the same: .png, .svg or .pdf."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead.")]
 
@@ -135,8 +147,9 @@ def announce_compilation(as_json: bool = False) -> None:
 
 
 DOCUMENT, JUNIT, REPORT = (".json",), (".xml",), (".html", ".htm")
+PICTURE = (".png", ".svg", ".pdf")
 # Suffixes of files that commands write; a folder with such a name is a mistake.
-_OF_FILES = {*DOCUMENT, *JUNIT, *REPORT, ".yaml", ".ply", ".g2o", ".tum", ".bag"}
+_OF_FILES = {*DOCUMENT, *JUNIT, *REPORT, *PICTURE, ".yaml", ".ply", ".g2o", ".tum", ".bag"}
 _OF_RESULTS = {".ply", ".g2o", ".tum", ".rrd"}
 # Tables of a robot log, as Parquet or CSV.
 _OF_LOGS = {"frames", "observations", "truth_poses", "truth_points"}
@@ -185,8 +198,8 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     The files of joint covariance and viewing evidence that belong to a Parquet map must not be
     files of an input either.
     """
-    from experiments.evaluation.single_steps import numbered_path
     from mapfusion.landmark_map import MAP_ENDINGS
+    from mapfusion.map_merging import numbered_path
     from mapfusion.tables import is_alone
 
     require_file("--output", path, MAP_ENDINGS, inputs)
@@ -206,6 +219,17 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
                         f"--output {path}: its file {written.name} would replace the input {each}; "
                         "name another file"
                     )
+
+
+def require_pictures(
+    report: Path | None, plot: Path | None, others: Sequence[Path | str | None]
+) -> None:
+    """Raise InputError unless a page and a picture can be written, and are no other file.
+
+    `others` are the inputs, and the other output, which need not exist yet.
+    """
+    require_file("--report", report, REPORT, others)
+    require_file("--plot", plot, PICTURE, others)
 
 
 def require_folder(
