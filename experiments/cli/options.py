@@ -222,14 +222,11 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
 
 
 def require_pictures(
-    report: Path | None, plot: Path | None, others: Sequence[Path | str | None]
+    report: Path | None, plot: Path | None, inputs: Sequence[Path | str | None]
 ) -> None:
-    """Raise InputError unless a page and a picture can be written, and are no other file.
-
-    `others` are the inputs, and the other output, which need not exist yet.
-    """
-    require_file("--report", report, REPORT, others)
-    require_file("--plot", plot, PICTURE, others)
+    """Raise InputError unless a page and a picture can be written and are no input."""
+    require_file("--report", report, REPORT, inputs)
+    require_file("--plot", plot, PICTURE, inputs)
 
 
 def require_folder(

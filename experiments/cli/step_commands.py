@@ -132,13 +132,12 @@ def align(
     from experiments.scenario.suite import settings_of, with_aligners
 
     require_file("--output", output, DOCUMENT, [map_a, map_b, scenario])
-    require_pictures(report, plot, [map_a, map_b, scenario, output])
+    require_pictures(report, plot, [map_a, map_b, scenario])
     options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
     found, n_aligners = [], len(settings.align.aligners)
     with progress(quiet=as_json) as show:
-        show("align", 0, n_aligners)
         for each in single.align(map_a, map_b, settings):
             found.append(each)
             show("align", len(found), n_aligners)
@@ -178,7 +177,7 @@ def merge(
     from experiments.scenario.suite import settings_of, with_aligners
 
     require_map_file(output, [*maps, scenario], n_maps=max(len(maps) // 2, 1))
-    require_pictures(report, plot, [*maps, scenario, output])
+    require_pictures(report, plot, [*maps, scenario])
     options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)

@@ -275,7 +275,7 @@ def _add_totals(node: ET.Element) -> None:
 PAGE = Path(__file__).parents[1] / "docs" / "formats.md"
 TABLES_BEGIN = "<!-- From here on made by `python -m experiments.reports.export` -->"
 _OPEN = {
-    "A map: one file, `NAME.parquet` or `NAME.csv`": landmark_map.LANDMARKS,
+    "A map: one file, `NAME.parquet`, `NAME.csv` or `NAME.ply`": landmark_map.LANDMARKS,
     "A map's joint covariance: `NAME.joint.parquet` beside it, one row a landmark": (
         landmark_map.joint_schema(RANK)
     ),
