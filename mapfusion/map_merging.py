@@ -266,7 +266,7 @@ def sigma_text(covariance: Float, lower_bound: bool) -> str:
 
 
 def _html(text: str, table: "pd.DataFrame") -> str:
-    return f"<p>{html.escape(text)}</p>{table.to_html(max_rows=6, float_format='%.3f')}"
+    return f"<p>{html.escape(text)}</p>{table.to_html(max_rows=6, float_format='{:.3f}'.format)}"
 
 
 def best_alignment(found: Sequence[MapAlignment]) -> MapAlignment:

@@ -89,14 +89,14 @@ def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
 
 
 def read_open_table(
-    path: Path, table_schema: pa.Schema, table: pa.Table | None = None
+    path: Path, table_schema: pa.Schema, content: pa.Table | None = None
 ) -> tuple[pa.Table, dict[str, str]]:
     """Read a table written by this or another program.
 
     Args:
         path: path of the file; its suffix is that of CSV, PLY or g2o, or it is Parquet.
         table_schema: required and optional columns.
-        table: content that is not in a file; `path` is then its name in messages.
+        content: table that is not in a file; `path` is then its name in messages.
 
     Returns:
         The table with the columns of the schema, and its text attributes. The attribute `planar` is
@@ -107,14 +107,14 @@ def read_open_table(
             column with a similar name, or a cell without a number.
     """
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
-    if table is None:
-        suffix = path.suffix.lower()
-        if suffix in _OTHER_READERS:
-            table = _OTHER_READERS[suffix](path, kind)
-        elif is_csv(path):
-            table = _read_csv(path, table_schema)
-        else:
-            table = read_parquet(path, f"{kind} table")
+    if content is not None:
+        table = content
+    elif read := _OTHER_READERS.get(path.suffix.lower()):
+        table = read(path, kind)
+    elif is_csv(path):
+        table = _read_csv(path, table_schema)
+    else:
+        table = read_parquet(path, f"{kind} table")
     attributes = text_attributes(path, table)
     if "kind" in attributes:
         # Files of earlier versions are read, too: later columns have defaults.

@@ -95,7 +95,7 @@ def test_binary_point_clouds_of_other_programs_are_read(tmp_path: Path, order: s
     names = {f"{order}f4": "float", f"{order}f8": "double", "|u1": "uchar"}
     if order == "<":
         names |= {"<f4": "float32", "<f8": "float64"}
-    fields = [f"property {names[kind]} {name}" for name, kind in row.descr]
+    fields = [f"property {names[kind]} {name}" for name, kind, *_ in row.descr]
     form = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
     head = ["ply", f"format {form} 1.0", "element vertex 5", *fields, "element face 1"]
     head += ["property list uchar int vertex_indices", "end_header", ""]

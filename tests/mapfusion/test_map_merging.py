@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.collections import EllipseCollection
 from PIL import Image
 
 import mapfusion
@@ -259,9 +260,9 @@ def test_the_legend_tells_the_enlargement_of_the_ellipses(found: MapAlignment) -
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     (label,) = [text for text in texts if "ellipses" in text]
     factor = int(label.split(", ")[1].split()[0])
-    (collection, *_) = [c for c in figure.axes[0].collections if hasattr(c, "_widths")]
+    (collection, *_) = [c for c in figure.axes[0].collections if isinstance(c, EllipseCollection)]
     own = 2 * np.sqrt(ELLIPSE_BOUND) * 0.02  # full axis of an isotropic covariance
-    np.testing.assert_allclose(2 * np.asarray(collection._widths), factor * own, rtol=1e-9)
+    np.testing.assert_allclose(collection.get_widths(), factor * own, rtol=1e-9)
     assert largest_magnification(1.0, 12.0) == 10
     assert largest_magnification(5.0, 1.0) == 1
 

@@ -95,9 +95,9 @@ def test_the_menu_shows_the_traces_of_one_plan(maps: list[Path]) -> None:
     assert [trace["visible"] for trace in figure["data"]] == shown[0]
     n_points = [len(part.position_m) for plan in plans for part in plan.parts]
     markers = [
-        len(trace.x)
-        for trace in plans_figure(plans).data
-        if trace.mode == "markers" and trace.marker.symbol != "circle-open"
+        len(trace["x"])
+        for trace in list(plans_figure(plans).data)
+        if trace["mode"] == "markers" and trace["marker"]["symbol"] != "circle-open"
     ]
     assert markers == n_points
 
