@@ -262,7 +262,7 @@ def test_the_legend_tells_the_enlargement_of_the_ellipses(found: MapAlignment) -
     factor = int(label.split(", ")[1].split()[0])
     (collection, *_) = [c for c in figure.axes[0].collections if isinstance(c, EllipseCollection)]
     own = 2 * np.sqrt(ELLIPSE_BOUND) * 0.02  # full axis of an isotropic covariance
-    np.testing.assert_allclose(collection.get_widths(), factor * own, rtol=1e-9)
+    np.testing.assert_allclose(np.asarray(collection.get_widths(), float), factor * own, rtol=1e-9)
     assert largest_magnification(1.0, 12.0) == 10
     assert largest_magnification(5.0, 1.0) == 1
 

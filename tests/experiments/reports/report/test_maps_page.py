@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,6 +89,7 @@ def test_merge_draws_also_what_it_does_not_merge(
 def test_the_menu_shows_the_traces_of_one_plan(maps: list[Path]) -> None:
     plans = mapfusion.merge_maps(maps).plans()
     figure = plans_figure(plans).to_plotly_json()
+    traces: list[Any] = [*plans_figure(plans).data]
     shown = [
         button["args"][0]["visible"] for button in figure["layout"]["updatemenus"][0]["buttons"]
     ]
@@ -96,7 +98,7 @@ def test_the_menu_shows_the_traces_of_one_plan(maps: list[Path]) -> None:
     n_points = [len(part.position_m) for plan in plans for part in plan.parts]
     markers = [
         len(trace["x"])
-        for trace in list(plans_figure(plans).data)
+        for trace in traces
         if trace["mode"] == "markers" and trace["marker"]["symbol"] != "circle-open"
     ]
     assert markers == n_points
