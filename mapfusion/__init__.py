@@ -24,9 +24,10 @@ _NAMES_OF = {
     "fastslam.motion": ("MotionNoise",),
     "fastslam.proposal": ("Proposal",),
     "fusion.fusers": ("AlignedPair", "FusedMap", "Fusion", "MergeParameters", "make_fuser"),
-    "fusion.merge": ("merge_maps",),
+    "fusion.merge": ("fuse_maps",),
     "fusion.team_graph": ("EdgeStatus", "TeamParameters", "Unconfirmed"),
     "landmark_map": ("LandmarkMap", "read_map", "write_map"),
+    "map_merging": ("MapAlignment", "MergedMaps", "align_maps", "merge_maps"),
     "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
     "smoother.smooth": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),
@@ -35,7 +36,7 @@ _NAMES_OF = {
     "verification.verdict": ("Verifier",),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
-_CALLED_THERE = {"merge_maps": "merge"}
+_CALLED_THERE = {"fuse_maps": "merge"}
 
 __all__ = sorted(_MODULE_OF)  # pyright: ignore[reportUnsupportedDunderAll]
 

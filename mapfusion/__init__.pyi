@@ -29,6 +29,10 @@ from mapfusion.fusion.team_graph import Unconfirmed as Unconfirmed
 from mapfusion.landmark_map import LandmarkMap as LandmarkMap
 from mapfusion.landmark_map import read_map as read_map
 from mapfusion.landmark_map import write_map as write_map
+from mapfusion.map_merging import MapAlignment as MapAlignment
+from mapfusion.map_merging import MergedMaps as MergedMaps
+from mapfusion.map_merging import align_maps as align_maps
+from mapfusion.map_merging import merge_maps as merge_maps
 from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log
@@ -40,5 +44,5 @@ from mapfusion.verification.registration import Registered as Registered
 from mapfusion.verification.registration import Registration as Registration
 from mapfusion.verification.verdict import Verifier as Verifier
 
-merge_maps = _merge  # `merge` is the module
+fuse_maps = _merge  # `merge` is the module
 __version__: str

@@ -1,8 +1,9 @@
 """Landmark map of one robot in its own frame, and its files.
 
-A map is one Parquet file with one row a landmark, readable with plain pandas. It contains the
-descriptor (or label) of the observation that created each landmark. Files beside the map hold the
-joint covariance of the landmarks' errors and the viewing evidence, if they are known.
+A map is one file with one row a landmark: Parquet, readable with plain pandas, or CSV, PLY or g2o.
+It contains the descriptor (or label) of the observation that created each landmark. Files beside a
+Parquet map hold the joint covariance of the landmarks' errors and the viewing evidence, if they are
+known.
 
 The file of a joint covariance stores the independent part of each landmark's covariance in double
 precision, and the effect of the shared variables in single precision.
@@ -11,12 +12,14 @@ precision, and the effect of the shared variables in single precision.
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
 
 from mapfusion.camera import EXACT, CalibrationError, calibration_from
 from mapfusion.errors import InputError, TellingWarning
+from mapfusion.exchange import g2o_text, ply_text
 from mapfusion.files import (
     COVARIANCE_FIELDS,
     POSITION_FIELDS,
@@ -26,6 +29,7 @@ from mapfusion.files import (
     covariances_from,
     float_fields,
     name_in_text,
+    named_columns,
     point_columns,
     point_fields,
     points_from,
@@ -54,11 +58,14 @@ from mapfusion.tables import (
     appearance_from,
     csv_bytes,
     described,
-    is_csv,
+    is_alone,
     read_open_table,
     require_appearance,
 )
 from mapfusion.viewing import Viewing, read_viewing, viewing_writes
+
+if TYPE_CHECKING:  # maps are read and written without data frames
+    import pandas as pd
 
 _OWN_FIELDS = [f"own_{name}" for name in COVARIANCE_FIELDS]
 # Largest difference of marginal covariances as a share of the trace; errors of single precision are
@@ -215,48 +222,76 @@ class LandmarkMap:
         bare = with_rows(replace(self, joint=None, viewing=None), rows)
         return replace(bare, joint=joint, viewing=viewing)
 
+    def __repr__(self) -> str:
+        own = [name for name in ("descriptor", "label") if getattr(self, name) is not None]
+        looks = f", with {' and '.join(f'{each}s' for each in own)}" if own else ""
+        where = " in the plane" if self.planar else ""
+        return f"<LandmarkMap {self.name}: {len(self)} landmarks{where}{looks}>"
 
-MAP_ENDINGS = (".parquet", ".csv")  # of the files that `write_map` writes
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return the landmarks as a table with the columns of a map's file."""
+        import pandas as pd
+
+        columns = _known_columns(self)
+        return pd.DataFrame(
+            {n: each if each.ndim == 1 else list(each) for n, each in columns.items()}
+        )
+
+    @classmethod
+    def from_pandas(cls, table: "pd.DataFrame", name: str = "map") -> "LandmarkMap":
+        """Return the map of a table with the columns of a map's file.
+
+        Raises:
+            InputError: the table is not as documented.
+        """
+        return replace(
+            _map_from(Path(name), pa.Table.from_pandas(table, preserve_index=False)), name=name
+        )
 
 
-def write_map(path: Path, landmarks: LandmarkMap) -> None:
-    """Write a map as Parquet or CSV, by the ending of the path; replaces an existing file.
+MAP_ENDINGS = (".parquet", ".csv", ".ply", ".g2o")  # of the files that `write_map` writes
 
-    The joint covariance and the viewing evidence of a Parquet map are written beside it. A CSV map
-    is one file without these and without metadata; a TellingWarning names the omitted parts.
+
+def write_map(path: str | Path, landmarks: LandmarkMap) -> None:
+    """Write a map as Parquet, CSV, PLY or g2o, by the ending of the path; replaces the file.
+
+    The joint covariance and the viewing evidence of a Parquet map are written beside it. A map of
+    another kind is one file without these; g2o has neither descriptors, labels nor counts. A
+    TellingWarning names the omitted parts.
 
     Raises:
-        InputError: the path has another ending.
+        InputError: the path has another ending, or the map has no form of this kind.
         OSError: a file cannot be written; existing files are then unchanged.
     """
-    write_together(map_writes(path, landmarks))
+    write_together(map_writes(Path(path), landmarks))
 
 
 def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
     """Return the writes and removals of `write_map`, by file."""
     if path.suffix.lower() not in MAP_ENDINGS:
         raise InputError(f"{path}: maps are written as {' or '.join(MAP_ENDINGS)}")
-    columns = {
-        **point_columns(landmarks.position_m, landmarks.covariance_m2),
-        "count": landmarks.count.astype(np.int32),
-        "source_observation": landmarks.source_observation.astype(np.int64),
-        **appearance_columns(len(landmarks), landmarks.descriptor, landmarks.label),
-    }
-    if is_csv(path):
+    kind = path.suffix.lower().removeprefix(".")
+    if kind != "parquet":
         parts = {
             "joint covariance": landmarks.joint is not None,
             "viewing evidence": landmarks.viewing is not None,
             "calibration error": landmarks.calibration != EXACT,
         }
+        if kind == "g2o":
+            parts |= {"descriptors": landmarks.descriptor is not None}
+            parts |= {"labels": landmarks.label is not None}
         if lost := [name for name, there in parts.items() if there]:
-            text = f"{path}: CSV cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
+            which = kind if kind == "g2o" else kind.upper()
+            text = f"{path}: {which} cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
             warnings.warn(text, TellingWarning, stacklevel=3)
-        absent = {"label"} if landmarks.label is None else set()
-        absent |= {"descriptor"} if landmarks.descriptor is None else set()
-        absent |= set(HEIGHT) if landmarks.planar else set()
-        kept = {name: values for name, values in columns.items() if name not in absent}
-        text = csv_bytes(kept)
+        try:
+            text = _text_of(kind, landmarks)
+        except ValueError as error:
+            raise InputError(f"{path}: {error}") from error
         return {path: lambda temporary: temporary.write_bytes(text)}
+    columns = _columns(landmarks) | appearance_columns(
+        len(landmarks), landmarks.descriptor, landmarks.label
+    )
     attributes = {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
     attributes |= landmarks.calibration.attributes()
     return {
@@ -266,16 +301,70 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
     }
 
 
-def read_map(path: Path, alone: bool = False) -> LandmarkMap:
+def _columns(landmarks: LandmarkMap) -> dict[str, np.ndarray]:
+    """Return positions, covariances, counts and sources as columns by name."""
+    return {
+        **point_columns(landmarks.position_m, landmarks.covariance_m2),
+        "count": landmarks.count.astype(np.int32),
+        "source_observation": landmarks.source_observation.astype(np.int64),
+    }
+
+
+def _known_columns(landmarks: LandmarkMap) -> dict[str, np.ndarray]:
+    """Return the columns of a map without those that hold nothing."""
+    given = appearance_columns(len(landmarks), landmarks.descriptor, landmarks.label)
+    appearance = {
+        name: each for name, each in given.items() if getattr(landmarks, name) is not None
+    }
+    absent = set(HEIGHT) if landmarks.planar else set()
+    kept = {name: each for name, each in _columns(landmarks).items() if name not in absent}
+    return kept | appearance
+
+
+def _text_of(kind: str, landmarks: LandmarkMap) -> bytes:
+    """Return the content of a map's file as `csv`, `ply` or `g2o`; raises ValueError."""
+    if kind == "csv":
+        return csv_bytes(_known_columns(landmarks))
+    if kind == "ply":
+        return coloured_ply(landmarks).encode()
+    shape = landmarks.position_m, landmarks.covariance_m2, landmarks.name, landmarks.planar
+    return g2o_text(*shape).encode()
+
+
+def coloured_ply(landmarks: LandmarkMap, rgb: np.ndarray | None = None) -> str:
+    """Return a map as a PLY point cloud, with a colour (N, 3), 0 to 255, for each landmark.
+
+    Properties are x, y, z in metres in the frame of the map (z is 0 in planar maps); red, green,
+    blue if they are given; and the columns of the map's table.
+    """
+    columns = _known_columns(landmarks)
+    xyz = named_columns(POSITION_FIELDS, landmarks.position_m)
+    if rgb is not None:
+        require_shape("rgb", rgb, (len(landmarks), 3))
+        xyz |= named_columns(("red", "green", "blue"), rgb.astype(np.uint8))
+    return ply_text(xyz | columns, landmarks.name, landmarks.planar)
+
+
+def read_map(path: str | Path, alone: bool = False) -> LandmarkMap:
     """Read a map.
 
-    The files beside a Parquet map are read, too, unless `alone` is True. Files beside a CSV map are
-    not read, since they belong to the Parquet map of the same name.
+    The files beside a Parquet map are read, too, unless `alone` is True. Files beside a map of
+    another kind are not read, since they belong to the Parquet map of the same name.
 
     Raises:
         InputError: a file is missing, damaged or not as documented.
     """
-    table, attributes = read_open_table(path, LANDMARKS)
+    path = Path(path)
+    found = _map_from(path, None)
+    if alone or is_alone(path):
+        return found
+    viewing = read_viewing(path, len(found))
+    return replace(found, joint=read_joint(path, found.covariance_m2), viewing=viewing)
+
+
+def _map_from(path: Path, table: pa.Table | None) -> LandmarkMap:
+    """Return the map of a table, or of a file if the table is None; raises InputError."""
+    table, attributes = read_open_table(path, LANDMARKS, table)
     finite = "give a finite number, or remove the row"
     require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
     counted = "a landmark has at least one observation"
@@ -300,7 +389,4 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
-    if alone or is_csv(path):
-        return found
-    viewing = read_viewing(path, len(found))
-    return replace(found, joint=read_joint(path, covariance), viewing=viewing)
+    return found

@@ -309,14 +309,16 @@ def write_frames(
     )
 
 
-def write_log(folder: Path, log: RobotLog) -> None:
+def write_log(folder: str | Path, log: RobotLog) -> None:
     """Write a whole log (without truth) into `folder`."""
+    folder = Path(folder)
     write_frames(folder, log.robot, log.planar, log.time_s, log.odometry, log.calibration)
     write_observations(folder, log.iteration, log.observations)
 
 
-def read_log(folder: Path) -> RobotLog:
+def read_log(folder: str | Path) -> RobotLog:
     """Read a log; an InputError names the file."""
+    folder = Path(folder)
     path = table_path(folder, "frames")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a robot log with frames.parquet)")

@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.csv
 
 from mapfusion.errors import InputError
+from mapfusion.exchange import read_g2o, read_ply
 from mapfusion.files import (
     UNREADABLE,
     column,
@@ -32,6 +33,7 @@ HEIGHT = ("z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2")
 _HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "position_z", "p_z", "pz")
 _UNIT = re.compile(r"_?(\[.*\]|\(.*\)|[mc]?m2?|met(er|re)s?|ft|feet|m?s|rad|deg|px)$")
 _MAX_NAMED = 3  # columns with similar names in one message
+_OTHER_READERS = {".ply": read_ply, ".g2o": read_g2o}
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
 
 
@@ -65,6 +67,11 @@ def is_csv(path: Path) -> bool:
     return path.suffix.lower() == ".csv"
 
 
+def is_alone(path: Path) -> bool:
+    """Return True for a map in one file that is not Parquet, beside which nothing belongs to it."""
+    return is_csv(path) or path.suffix.lower() in _OTHER_READERS
+
+
 def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
     """Return columns as CSV, from which `read_open_table` recovers every bit.
 
@@ -81,12 +88,15 @@ def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
     return f"{','.join(apart)}\n".encode() + text.getvalue().to_pybytes()
 
 
-def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
+def read_open_table(
+    path: Path, table_schema: pa.Schema, content: pa.Table | None = None
+) -> tuple[pa.Table, dict[str, str]]:
     """Read a table written by this or another program.
 
     Args:
-        path: path of the file; `.csv` files are CSV, all others Parquet.
+        path: path of the file; its suffix is that of CSV, PLY or g2o, or it is Parquet.
         table_schema: required and optional columns.
+        content: table that is not in a file; `path` is then its name in messages.
 
     Returns:
         The table with the columns of the schema, and its text attributes. The attribute `planar` is
@@ -97,7 +107,14 @@ def read_open_table(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict
             column with a similar name, or a cell without a number.
     """
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
-    table = _read_csv(path, table_schema) if is_csv(path) else read_parquet(path, f"{kind} table")
+    if content is not None:
+        table = content
+    elif read := _OTHER_READERS.get(path.suffix.lower()):
+        table = read(path, kind)
+    elif is_csv(path):
+        table = _read_csv(path, table_schema)
+    else:
+        table = read_parquet(path, f"{kind} table")
     attributes = text_attributes(path, table)
     if "kind" in attributes:
         # Files of earlier versions are read, too: later columns have defaults.

@@ -153,9 +153,21 @@ DryRun = Annotated[
 Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stored already.")]
 Results = Annotated[Path, typer.Option(help="Folder that results go to.", show_default="results")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]
+MapFile = Annotated[
+    Path,
+    typer.Option("--output", "-o", help="Map to write: .parquet (keeps all), .csv, .ply or .g2o."),
+]
 OutputFolder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")]
 DocumentFile = Annotated[
     Path | None, typer.Option("--output", "-o", help="File for what --json prints.")
+]
+ReportFile = Annotated[
+    Path | None,
+    typer.Option("--report", help="HTML file with the maps, correspondences and other motions."),
+]
+PlotFile = Annotated[
+    Path | None,
+    typer.Option("--plot", help="Picture of the same: .png, .svg or .pdf."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document instead.")]
 
@@ -178,8 +190,9 @@ def announce_compilation(as_json: bool = False) -> None:
 
 
 DOCUMENT, JUNIT, REPORT = (".json",), (".xml",), (".html", ".htm")
+PICTURE = (".png", ".svg", ".pdf")
 # Suffixes of files that commands write; a folder with such a name is a mistake.
-_OF_FILES = {*DOCUMENT, *JUNIT, *REPORT, ".yaml", ".ply", ".g2o", ".tum", ".bag"}
+_OF_FILES = {*DOCUMENT, *JUNIT, *REPORT, *PICTURE, ".yaml", ".ply", ".g2o", ".tum", ".bag"}
 _OF_RESULTS = {".ply", ".g2o", ".tum", ".rrd"}
 # Tables of a robot log, as Parquet or CSV.
 _OF_LOGS = {"frames", "observations", "truth_poses", "truth_points"}
@@ -228,13 +241,13 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     The files of joint covariance and viewing evidence that belong to a Parquet map must not be
     files of an input either.
     """
-    from experiments.evaluation.single_steps import numbered_path
     from mapfusion.landmark_map import MAP_ENDINGS
-    from mapfusion.tables import is_csv
+    from mapfusion.map_merging import numbered_path
+    from mapfusion.tables import is_alone
 
     require_file("--output", path, MAP_ENDINGS, inputs)
     companion = next((each for each in _COMPANIONS if path.stem.lower().endswith(each)), None)
-    if companion and not is_csv(path):
+    if companion and not is_alone(path):
         owner = f"{path.stem[: -len(companion)]}.parquet"
         reason = f"a file NAME{companion}.parquet belongs to the map NAME.parquet ({owner})"
         raise InputError(f"--output {path}: {reason}; choose another name")
@@ -249,6 +262,14 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
                         f"--output {path}: its file {written.name} would replace the input {each}; "
                         "name another file"
                     )
+
+
+def require_pictures(
+    report: Path | None, plot: Path | None, inputs: Sequence[Path | str | None]
+) -> None:
+    """Raise InputError unless a page and a picture can be written and are no input."""
+    require_file("--report", report, REPORT, inputs)
+    require_file("--plot", plot, PICTURE, inputs)
 
 
 def require_folder(
@@ -305,7 +326,7 @@ def _is_same(path: Path, other: Path) -> bool:
 def _beside(path: Path) -> tuple[Path, ...]:
     """Return the files that belong to a map's file."""
     from mapfusion.landmark_map import joint_path
-    from mapfusion.tables import is_csv
+    from mapfusion.tables import is_alone
     from mapfusion.viewing import viewing_paths
 
-    return () if is_csv(path) else (joint_path(path), *viewing_paths(path))
+    return () if is_alone(path) else (joint_path(path), *viewing_paths(path))

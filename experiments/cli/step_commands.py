@@ -47,7 +47,7 @@ def record(
 def slam(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A robot log (folder).")],
     *,
-    output: options.Output,
+    output: options.MapFile,
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
@@ -106,6 +106,8 @@ def align(
     map_b: Annotated[Path, typer.Argument(metavar="MAP_B")],
     *,
     output: options.DocumentFile = None,
+    report: options.ReportFile = None,
+    plot: options.PlotFile = None,
     aligners: options.Aligners,
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
@@ -120,31 +122,30 @@ def align(
     T_a_b is the pose of map b in the frame of map a: p_a = R(theta) p_b + (tx, ty). Exit code 0
     also if no estimate is accepted, unless you ask for one with `--require-accepted`.
     """
-    from experiments.cli.options import DOCUMENT, require_file
+    from experiments.cli.options import DOCUMENT, require_file, require_pictures
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
-    from experiments.reports.layout import print_lines
-    from experiments.reports.run_screen import print_estimates, print_verdict
+    from experiments.reports.layout import progress
+    from experiments.reports.report.maps_page import write_pictures
+    from experiments.reports.run_screen import print_alignments
     from experiments.scenario.suite import settings_of, with_aligners
-    from mapfusion.align.alignment import Status
 
     require_file("--output", output, DOCUMENT, [map_a, map_b, scenario])
+    require_pictures(report, plot, [map_a, map_b, scenario])
     options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
-    rows = []
-    for row in single.align(map_a, map_b, settings):
-        rows.append(row)
-        if not as_json:
-            print_verdict(row)
-    accepted = any(single.final_status(row)[0] is Status.ACCEPTED for row in rows)
-    note = "" if accepted else single.align_note(map_a, map_b, settings)
-    found = export.alignment_document((map_a, map_b), settings.seed, rows, note)
-    export.publish_json("align", found, as_json, output)
+    found, n_aligners = [], len(settings.align.aligners)
+    with progress(quiet=as_json) as show:
+        for each in single.align(map_a, map_b, settings):
+            found.append(each)
+            show("align", len(found), n_aligners)
+    document = export.alignment_document((map_a, map_b), settings.seed, found)
+    export.publish_json("align", document, as_json, output)
+    write_pictures(report, plot, found, (map_a, map_b), settings.seed)
     if not as_json:
-        print_estimates(rows)
-        print_lines([note] if note else [])
-    if require_accepted and not accepted:
+        print_alignments(found)
+    if require_accepted and not any(each.accepted for each in found):
         options.print_to_stderr(f"{map_a} and {map_b}: no estimate of T_a_b is accepted")
         raise typer.Exit(options.EXIT_FAILED)
 
@@ -153,7 +154,9 @@ def align(
 def merge(
     maps: Annotated[list[Path], typer.Argument(metavar="MAP MAP...", help="Two maps or more.")],
     *,
-    output: options.Output,
+    output: options.MapFile,
+    report: options.ReportFile = None,
+    plot: options.PlotFile = None,
     aligners: options.Aligners,
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
@@ -162,16 +165,18 @@ def merge(
 ) -> None:
     """Fuse maps that alignments connect: `mapfusion merge A.parquet B.parquet -o F.parquet`.
 
-    Exit code 1, and nothing is written, if no two maps were merged.
+    Exit code 1, and no map is written, if no two maps were merged; a report and a picture then show
+    why.
     """
-    from experiments.cli.options import require_map_file
+    from experiments.cli.options import require_map_file, require_pictures
     from experiments.evaluation import single_steps as single
     from experiments.reports import export
-    from experiments.reports.layout import print_lines
-    from experiments.reports.run_screen import print_fused, print_unmerged
+    from experiments.reports.report.maps_page import write_pictures
+    from experiments.reports.run_screen import print_merged
     from experiments.scenario.suite import settings_of, with_aligners
 
     require_map_file(output, [*maps, scenario], n_maps=max(len(maps) // 2, 1))
+    require_pictures(report, plot, [*maps, scenario])
     options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
@@ -179,12 +184,9 @@ def merge(
     paths = single.save_fused(output, merged)
     found = export.fusion_document(paths, settings.seed, merged, maps)
     export.publish_json("merge", found, as_json)
+    write_pictures(report, plot, merged, maps, settings.seed)
+    if not as_json:
+        print_merged(merged, maps, paths)
     if not paths:
-        if not as_json:
-            print_unmerged(merged, maps)
         options.print_to_stderr(f"no two maps were merged; {output} is not written")
         raise typer.Exit(options.EXIT_FAILED)
-    if not as_json:
-        for path, fused in zip(paths, merged.fusion.fused, strict=True):
-            print_fused(path, fused, maps, merged.aligner, merged.is_lower_bound(fused))
-        print_lines([f"  note: {merged.note}"] if merged.note else [])

@@ -1,7 +1,6 @@
 """Single steps on a user's files: record, export as a dataset, slam, align, merge, calibrate."""
 
 import functools
-import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -22,8 +21,8 @@ from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
-from mapfusion.align.alignment import NOT_RUN, Pairs, Status
-from mapfusion.align.correspondences import match, why_not_unit_vectors
+from mapfusion.align.alignment import NOT_RUN, Pairs
+from mapfusion.align.correspondences import match
 from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.attitude import read_attitude
 from mapfusion.datasets.export import StereoDrive
@@ -32,11 +31,9 @@ from mapfusion.datasets.log_consistency import Finding, gate_finding
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
-from mapfusion.fusion.fusers import AlignedPair, FusedMap, Fusion, make_fuser, name_order
-from mapfusion.fusion.merge import merge as merge_maps
-from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.numerics import Float, generator
-from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
+from mapfusion.landmark_map import LandmarkMap, map_writes
+from mapfusion.map_merging import MapAlignment, MergedMaps, align_maps, load_map, merge_maps
 from mapfusion.robot_log import (
     TRUTH_FILES,
     read_log,
@@ -49,7 +46,6 @@ from mapfusion.smoother.odometry_calibration import Calibration, calibrate
 from mapfusion.smoother.smooth import SmootherParameters, with_path_errors
 from mapfusion.tables import NO_LABEL
 from mapfusion.verification.registration import Registration
-from mapfusion.verification.rivals import is_mirrored
 from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
 
@@ -185,89 +181,12 @@ def _save(path: Path, writes: Mapping[Path, Write]) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-# Reasons why the team does not use an accepted alignment.
-_TEAM_REASONS = {
-    EdgeStatus.UNCONFIRMED: "no other alignment confirms this one",
-    EdgeStatus.CONTRADICTED: "other alignments contradict this one",
-    EdgeStatus.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
-}
-
-
-class MergeResult(NamedTuple):
-    """Result of a merge of a user's maps.
-
-    Attributes:
-        fusion: fused maps.
-        pairs: alignments of all pairs of maps, in the order of `fusion.place`; with the
-            alternatives of ambiguous alignments.
-        aligner: name of the aligner.
-        notes: what the verdicts on accepted alignments say, by pair of maps; only if they say
-            anything.
-    """
-
-    fusion: Fusion
-    pairs: list[AlignedPair]
-    aligner: str
-    notes: Mapping[tuple[int, int], str]
-
-    @property
-    def note(self) -> str:
-        """Notes on the alignments that are used, in one line; empty if there is none."""
-        used = [pair for pair, reason in self.reasons().items() if not reason]
-        told = [self.notes[pair] for pair in used if pair in self.notes]
-        if not told:
-            return ""
-        others = f" (and for {len(told) - 1} more pairs of maps)" if len(told) > 1 else ""
-        return f"{told[0]}{others}"
-
-    def is_lower_bound(self, fused: FusedMap) -> bool:
-        """Return True if the covariances of a fused map's motions are lower bounds.
-
-        They are if a used alignment is of a map that does not state all errors that its landmarks
-        share.
-        """
-        used = {pair for pair, reason in self.reasons().items() if not reason}
-        members = set(fused.members.tolist())
-        of_fused = (p for p in self.pairs if (p.a, p.b) in used and {p.a, p.b} <= members)
-        return any(pair.alignment.lower_bound for pair in of_fused)
-
-    @property
-    def any_merged(self) -> bool:
-        """True if two or more maps were merged."""
-        return len(self.fusion.fused[0].members) > 1
-
-    def reasons(self) -> dict[tuple[int, int], str]:
-        """Return by pair of maps the reason why their alignment is not used; empty if it is."""
-        reasons: dict[tuple[int, int], str] = {}
-        for pair, place in zip(self.pairs, self.fusion.edge_status, strict=True):
-            reason = pair.alignment.reason or _TEAM_REASONS.get(place, "")
-            if place in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
-                reasons[pair.a, pair.b] = ""
-            else:
-                reasons.setdefault((pair.a, pair.b), reason)
-        return reasons
-
-
-def numbered_path(path: Path, k: int) -> Path:
-    """Return the path of the k-th fused map: `path` for k = 1, then `.2` and so on."""
-    return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
-
-
-def save_fused(path: Path, merged: MergeResult) -> list[Path]:
-    """Write all fused maps or none, the map of most robots to `path`; see `numbered_path`.
-
-    Returns:
-        The paths of the maps; none if no maps were merged.
-    """
-    if not merged.any_merged:
-        return []
-    fused = merged.fusion.fused
-    paths = [numbered_path(path, k) for k in range(1, len(fused) + 1)]
-    writes: dict[Path, Write] = {}
-    for place, each in zip(paths, fused, strict=True):
-        writes |= map_writes(place, each.landmarks)
-    _save(path, writes)
-    return paths
+def save_fused(path: Path, merged: MergedMaps) -> list[Path]:
+    """Write the fused maps (`MergedMaps.write`); raise InputError if a file cannot be written."""
+    try:
+        return merged.write(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _registration(entry: AlignerEntry, settings: Align) -> Registration:
@@ -275,98 +194,60 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     return Registration(aligner, settings.refinement, settings.verifier)
 
 
-def _read_map(path: Path) -> LandmarkMap:
-    """Read a map to be aligned; raise InputError also if its descriptors are no unit vectors."""
-    landmarks = read_map(path)
-    if why := why_not_unit_vectors(landmarks):
-        raise InputError(f"{path}: {why}")
-    return landmarks
-
-
-def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, Any]]:
-    """Yield for each aligner a row with its estimate, the refinement and the verdict.
+def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[MapAlignment]:
+    """Yield for each aligner the alignment of two maps.
 
     Each aligner is called twice with the same random numbers, and the second call is timed. The
     first call compiles kernels and starts processes.
+
+    Raises:
+        InputError: a map cannot be read.
     """
-    map_a, map_b = _read_map(path_a), _read_map(path_b)
+    map_a, map_b = load_map(path_a), load_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
     evidence = settings.align.verifier.on(Pairs(map_a, map_b, pairs)).evidence
     for entry in settings.align.aligners:
         registration = _registration(entry, settings.align)
-        given = map_a, map_b, pairs, evidence
-        done = registration.on(*given).register(generator(settings.seed, "align", entry.name))
-        if done.estimated.status not in NOT_RUN:
-            done = registration.on(*given).register(generator(settings.seed, "align", entry.name))
-        row = {"aligner": entry.name, "elapsed_s": done.estimated.elapsed_s}
-        row |= {"n_inliers": int(done.refined.inlier.sum())} | estimate_row(len(pairs), *done)
-        yield row
+        for _ in range(2):
+            found = align_maps(
+                map_a,
+                map_b,
+                aligner=registration,
+                name=entry.name,
+                matching=pairs,
+                evidence=evidence,
+                rng=generator(settings.seed, "align", entry.name),
+            )
+            if found.registered.estimated.status in NOT_RUN:
+                break
+        yield found
 
 
-def align_note(path_a: Path, path_b: Path, settings: Scenario) -> str:
-    """Return a cause for which every aligner fails on two maps; empty if none is found."""
-    map_a, map_b = read_map(path_a), read_map(path_b)
-    pairs = Pairs(map_a, map_b, match(map_a, map_b, settings.align.match))
-    return _mirror_note(pairs, settings.align)
+def alignment_row(found: MapAlignment) -> dict[str, Any]:
+    """Return an alignment as a row: estimate, refinement, verdict, time and inliers."""
+    row = {"aligner": found.aligner, "elapsed_s": found.registered.estimated.elapsed_s}
+    row |= {"n_inliers": int(found.inlier.sum())}
+    return row | estimate_row(len(found.correspondences), *found.registered)
 
 
-def _mirror_note(pairs: Pairs, settings: Align) -> str:
-    """Say that two maps look like mirror images of each other; empty if they do not."""
-    if not is_mirrored(pairs, settings.acceptance, settings.refinement):
-        return ""
-    a, b = pairs.map_a.name, pairs.map_b.name
-    return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"
-
-
-def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
-    """Return the final status of a row of `align`, and the reason."""
-    status = Status(row["verdict"])
-    if row["status"] in NOT_RUN:
-        status = Status(row["status"])
-    elif status is Status.DEGENERATE:
-        status = Status.REFUSED
-    return status, row["reason"] or row["refined_reason"] or row["acceptance_reason"]
-
-
-def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
+def merge(paths: Sequence[Path], settings: Scenario) -> MergedMaps:
     """Align all pairs of maps and fuse the maps.
-
-    The maps of a pair are in the order of their robots' names.
 
     Raises:
         InputError: there are fewer than two maps, a map cannot be read, or the aligner is unknown.
     """
-    if len(paths) < 2:
-        raise InputError("merge: give two maps or more")
     name, entries = settings.merge.aligner, {each.name: each for each in settings.align.aligners}
     if name not in entries:
         raise InputError(f"merge.aligner: {name} is not among {', '.join(entries)}")
-    maps = [_read_map(path) for path in paths]
-    registration, pairs = _registration(entries[name], settings.align), list[AlignedPair]()
-    notes: dict[tuple[int, int], str] = {}
-    order = sorted(range(len(maps)), key=lambda k: (name_order(maps[k].name), str(paths[k])))
-    for a, b in itertools.combinations(order, 2):
-        rng = generator(settings.seed, "align", name, maps[a].name, maps[b].name)
-        offered = match(maps[a], maps[b], settings.align.match)
-        ready = registration.on(maps[a], maps[b], offered)
-        done = ready.register(rng)
-        false_alarms = done.verdict.log10_false_alarms
-        found = done.applied
-        if found.status in NOT_RUN:  # the reason does not name the aligner
-            found = replace(found, reason=f"{name}: {found.status}: {found.reason}")
-        elif not found.ok and (
-            note := _mirror_note(Pairs(maps[a], maps[b], offered), settings.align)
-        ):
-            found = replace(found, reason=f"{found.reason}; {note}")
-        pairs.append(AlignedPair(a, b, found, offered, false_alarms))
-        if done.verdict.accepted and done.verdict.reason:
-            notes[a, b] = done.verdict.reason
-        if found.status is Status.AMBIGUOUS and ready.verifier is not None:
-            rivals = ready.verifier.rivals_of(done.refined)
-            pairs += [AlignedPair(a, b, rival, offered, false_alarms) for rival in rivals]
-    chosen = settings.merge
-    fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))
-    return MergeResult(fusion, pairs, name, notes)
+    return merge_maps(
+        paths,
+        aligner=_registration(entries[name], settings.align),
+        name=name,
+        matching=settings.align.match,
+        fuser=settings.merge.fuser,
+        parameters=settings.merge.parameters,
+        rng=lambda a, b: generator(settings.seed, "align", name, a.name, b.name),
+    )
 
 
 def write_drives(

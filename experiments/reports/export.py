@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from experiments.evaluation import tables
 from experiments.evaluation.metrics import CheckedScenario
-from experiments.evaluation.single_steps import MergeResult, final_status
+from experiments.evaluation.single_steps import alignment_row
 from experiments.pipeline.tables import COVARIANCE, MOTION
 from experiments.reports.formatting import plain
 from experiments.reports.inspect import unit_of
@@ -28,6 +28,7 @@ from mapfusion.datasets.log_consistency import Finding
 from mapfusion.files import write_whole
 from mapfusion.geometry.joint_covariance import RANK
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.map_merging import MapAlignment, MergedMaps, advice
 from mapfusion.tables import HEIGHT, default_of, description_of
 
 _SIGNIFICANT_DIGITS = 4  # in Markdown and LaTeX; CSV files have all digits
@@ -116,16 +117,16 @@ def _covariance(upper: Iterable[float]) -> dict[str, float]:
 
 
 def alignment_document(
-    maps: Sequence[Path], seed: int, rows: Sequence[Mapping[str, Any]], note: str = ""
+    maps: Sequence[Path], seed: int, alignments: Sequence[MapAlignment]
 ) -> dict[str, Any]:
-    """Return the document of `align`: T_a_b of every aligner, from one row each.
+    """Return the document of `align`: T_a_b of every aligner, and which one to use.
 
     `note` says why no estimate is accepted, if that is known.
     """
     aligners = []
-    for row in rows:
-        status, reason = final_status(row)
-        accepted, estimated = status is Status.ACCEPTED, row["status"] == Status.ACCEPTED
+    for found in alignments:
+        row, status, reason = alignment_row(found), found.status, found.reason
+        accepted, estimated = found.accepted, row["status"] == Status.ACCEPTED
         refined = {name: row[f"refined_{name}"] for name in MOTION}
         refined |= _covariance([row[name] for name in COVARIANCE])
         refined |= {name: row[name] for name in ("drift_sigma_m", "lower_bound")}
@@ -136,7 +137,10 @@ def alignment_document(
         numbers = ("n_inliers", "n_correspondences", "log10_false_alarms", "log10_evidence")
         numbers += ("n_confirmed", "n_contradicted", "elapsed_s")
         aligners.append(answer | {name: row[name] for name in numbers})
+    any_accepted = any(found.accepted for found in alignments)
+    note = "" if any_accepted else alignments[0].mirror_note
     head = {"map_a": maps[0], "map_b": maps[1], "seed": seed, "note": note or None}
+    head |= {"advice": advice(alignments)}
     return {**head, "aligners": aligners}
 
 
@@ -165,7 +169,7 @@ def map_document(
 
 
 def fusion_document(
-    paths: Sequence[Path], seed: int, merged: MergeResult, maps: Sequence[Path]
+    paths: Sequence[Path], seed: int, merged: MergedMaps, maps: Sequence[Path]
 ) -> dict[str, Any]:
     """Return the document of `merge`: the largest fused map, and the others.
 
@@ -197,7 +201,7 @@ def fusion_document(
     first, *others = documents
     if not paths:
         first |= {"n_landmarks": 0, "n_fused_of_several": 0, "duplicate_share": None}
-    head = {"seed": seed, "aligner": merged.aligner}
+    head = {"seed": seed, "aligner": merged.aligner, "advice": merged.advice}
     return {**head, **first, "others": others, "pairs": pairs}
 
 
@@ -271,7 +275,7 @@ def _add_totals(node: ET.Element) -> None:
 PAGE = Path(__file__).parents[1] / "docs" / "formats.md"
 TABLES_BEGIN = "<!-- From here on made by `python -m experiments.reports.export` -->"
 _OPEN = {
-    "A map: one file, `NAME.parquet` or `NAME.csv`": landmark_map.LANDMARKS,
+    "A map: one file, `NAME.parquet`, `NAME.csv` or `NAME.ply`": landmark_map.LANDMARKS,
     "A map's joint covariance: `NAME.joint.parquet` beside it, one row a landmark": (
         landmark_map.joint_schema(RANK)
     ),

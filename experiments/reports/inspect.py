@@ -13,7 +13,7 @@ from experiments.reports.layout import Column, print_lines, print_table
 from mapfusion import attitude, landmark_map, robot_log
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, read_parquet, read_table, text_attributes
-from mapfusion.tables import is_csv, read_open_table
+from mapfusion.tables import is_alone, is_csv, read_open_table
 from sim import trajectory
 
 _PREFIX, _KIND, _VERSION = "mapfusion.", "kind", "schema_version"
@@ -87,7 +87,8 @@ def contents_of(path: Path) -> Contents:
     if path.suffix in {".yaml", ".yml"}:
         return Contents("scenario", _brief(_resolved(path)))
     if path.suffix != ".json":
-        raise InputError(f"{path}: no file of mapfusion's (known: .parquet, .csv, .yaml, .json)")
+        known = ", ".join((*landmark_map.MAP_ENDINGS, ".yaml", ".json"))
+        raise InputError(f"{path}: no file of mapfusion's (known: {known})")
     found = _json(path)
     if found.kind == _RESOLVED:
         _resolved(path)  # raises if the settings are not valid
@@ -140,7 +141,7 @@ def _folder_contents(path: Path) -> Contents:
 
 def _table_contents(path: Path) -> Contents:
     """Describe a table by the kind in its metadata, or by its file's name without metadata."""
-    if is_csv(path):
+    if is_alone(path):
         return _open_table(path, _open_schema(path))
     table = read_parquet(path, "table")
     facts: dict[str, Any] = dict(text_attributes(path, table))

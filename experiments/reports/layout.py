@@ -47,13 +47,16 @@ def _console(stderr: bool = False) -> Console:
 
 
 @contextmanager
-def progress() -> Iterator[OnProgress]:
+def progress(quiet: bool = False) -> Iterator[OnProgress]:
     """Show progress on stderr; yield the function to call with (label, done, total).
 
     A terminal gets bars. Other outputs get a line at the start and at the end of each task, and
-    every `_LINE_EVERY_S` seconds between.
+    every `_LINE_EVERY_S` seconds between. A quiet one shows nothing.
     """
     console = _console(stderr=True)
+    if quiet:
+        yield lambda label, done, total: None
+        return
     if not console.is_terminal:
         printed: dict[str, tuple[int, float]] = {}  # number done and time of the last line
 

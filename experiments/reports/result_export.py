@@ -19,17 +19,17 @@ from experiments.evaluation.result import require_result
 from experiments.pipeline.stages.align import alignment_of
 from experiments.reports.export import write_text
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
-from experiments.reports.figures.style import FUSED_COLOUR
 from experiments.scenario.world_settings import NAME_PATTERN
-from mapfusion.datasets.export import G2oGraph, ply_text
 from mapfusion.datasets.kitti import kitti_text
 from mapfusion.datasets.text_files import tum_text
 from mapfusion.errors import InputError, not_installed
+from mapfusion.exchange import G2oGraph
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import POSE_FIELDS, write_whole
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
-from mapfusion.landmark_map import joint_path, read_map
+from mapfusion.landmark_map import coloured_ply, joint_path, read_map
+from mapfusion.plotting import FUSED_COLOUR
 from mapfusion.viewing import viewing_paths
 
 # Smallest standard deviation of an odometry edge. A solver needs a positive one, but the motion
@@ -175,7 +175,7 @@ def _ply_files(data: ResultTables) -> Iterator[tuple[str, str]]:
             for parent, colour in data.colours.items():
                 alone = (rows["n_parents"] == 1) & (rows["robot_a"] == parent)
                 colours[alone.to_numpy()] = _rgb(colour)
-        yield f"{name}.ply", ply_text(landmarks, colours)
+        yield f"{name}.ply", coloured_ply(landmarks, colours)
 
 
 def _rgb(colour: str) -> tuple[int, ...]:

@@ -2,10 +2,10 @@
 
 import math
 import shlex
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,7 +30,7 @@ from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.result import renderer
 from experiments.evaluation.run_plan import RunPlan
-from experiments.evaluation.single_steps import MergeResult, final_status
+from experiments.evaluation.single_steps import alignment_row
 from experiments.evaluation.tables import SHOWN, read_provenance
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
@@ -46,9 +46,16 @@ from experiments.reports.layout import (
 from experiments.studies.method_comparison import Recommendation, aligner_summary, recommend
 from experiments.studies.statistics import ROBOT_PAIR, error_bands
 from mapfusion.align.alignment import NOT_RUN, Status
-from mapfusion.fusion.fusers import FusedMap
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.se2 import motion_sigma
+from mapfusion.map_merging import (
+    MapAlignment,
+    MergedMaps,
+    advice,
+    best_alignment,
+    motion_text,
+    sigma_text,
+)
 from sim.renderer import NAMES
 
 
@@ -355,31 +362,18 @@ def print_checks(checks: Sequence[CheckedScenario]) -> None:
     print_lines([f"{n_passed} passed, {n_failed} failed{errors}"])
 
 
-_MOTIONS = columns("", aligner="aligner")
-_MOTIONS |= columns(".3f", tx_m="estim.\ntx, m", ty_m="\nty, m")
-_MOTIONS |= columns(".4f", theta_rad="\ntheta, rad")
-_MOTIONS |= columns(".3f", refined_tx_m="refined\ntx, m", refined_ty_m="\nty, m")
-_MOTIONS |= columns(".4f", refined_theta_rad="\ntheta, rad")
-_MOTIONS |= columns(">", sigma_m="sigma\nm", sigma_rad="\nrad")
-_VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
-_VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
-_VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
-_VERDICTS |= columns(">", time="time\nms")
-
-
-def print_verdict(row: dict[str, Any]) -> None:
-    """Print the verdict on one aligner's estimate, as soon as there is one."""
-    status, why = final_status(row)
-    reason = why or row["reason"]
-    print_lines([f"  {row['aligner']}: {status}" + (f": {reason}" if reason else "")])
-
-
+_ALIGNMENTS = columns("", aligner="aligner", verdict="verdict")
+_ALIGNMENTS |= columns(".3f", refined_tx_m="T_a_b\nx, m", refined_ty_m="\ny, m")
+_ALIGNMENTS |= columns(".4f", refined_theta_rad="\nrad")
+_ALIGNMENTS |= columns(">", sigma_m="sigma\nm", sigma_rad="\nrad", inliers="pairs\n")
+_ALIGNMENTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
+_ALIGNMENTS |= columns(">", time="time\nms")
 _LOWER_BOUND = "≥: a lower bound, since a map does not state the errors that its landmarks share"
 
 
-def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the estimates of all aligners on two maps, and the verdicts on them."""
-    found = pd.DataFrame(rows)
+def print_alignments(alignments: Sequence[MapAlignment]) -> None:
+    """Print the alignments of two maps by all methods in one table, and what to use."""
+    found = pd.DataFrame(map(alignment_row, alignments))
     sigma_m, sigma_rad = motion_sigma(covariances_of(found))
     bounds = ["≥ " if each else "" for each in found["lower_bound"]]
 
@@ -387,53 +381,51 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         both = zip(bounds, sigma, strict=True)
         return ["–" if math.isnan(x) else f"{bound}{x:{form}}" for bound, x in both]
 
-    stated = found.assign(sigma_m=texts(sigma_m, ".3f"), sigma_rad=texts(sigma_rad, ".4f"))
-    note = "sigma: stated for the refined estimate, of distance and angle"
-    if found["lower_bound"].any():
+    shown = found.assign(
+        verdict=[str(each.status).replace("_", " ") for each in alignments],
+        sigma_m=texts(sigma_m, ".3f"),
+        sigma_rad=texts(sigma_rad, ".4f"),
+        inliers=found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str),
+        time=(1e3 * found["elapsed_s"]).map(two_digits),
+    )
+    note = "T_a_b: refined; pairs: supporting correspondences; NFA: number of alignments\n"
+    note += "with as much support by chance; time: of the estimate; more with --json"
+    if found["lower_bound"].any() and np.isfinite(sigma_m).any():
         note += f"\n{_LOWER_BOUND}"
-    print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
-    inliers = found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str)
-    verdicts = [str(final_status(row)[0]) for row in rows]
-    times = (1e3 * found["elapsed_s"]).map(two_digits)
-    print_frame(
-        found.assign(inliers=inliers, time=times, verdict=verdicts),
-        _VERDICTS,
-        "Verdicts on the refined estimates",
-        "NFA: expected number of alignments with as much support by chance; evidence:\n"
-        "likelihood ratio of both robots' observations; time: of the estimate",
-    )
+    print_frame(shown, _ALIGNMENTS, "", note)
+    said = best_alignment(alignments).reason  # in the advice
+    names = defaultdict[str, list[str]](list)  # of the methods, by the reason that they give
+    for each in alignments:
+        if not each.accepted and each.reason != said:
+            reason = each.reason.removesuffix(f"; {each.hint}")
+            names[f"{str(each.status).replace('_', ' ')}: {reason}"].append(each.aligner)
+    print_lines(f"{listed(methods)}: {reason}" for reason, methods in names.items())
+    print_lines([advice(alignments)])
 
 
-def print_fused(
-    path: Path, fused: FusedMap, maps: Sequence[Path], aligner: str, lower_bound: bool
-) -> None:
-    """Print the landmarks and the motions of a fused map, and the aligner of the motions."""
-    several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
-    n_maps = len(fused.members)
-    lines = [
-        f"{len(fused.landmarks)} landmarks in {path}: fused from {n_maps} maps, aligned by "
-        f"{aligner}; {several} landmarks are of several maps, {fused.duplicate_share:.1%} look "
-        "like remaining duplicates"
-    ]
-    sigmas = zip(*motion_sigma(fused.motion_covariance), strict=True)
-    for name, (x_m, y_m, theta_rad), sigma in zip(maps, fused.T_first_map, sigmas, strict=True):
-        if not math.isnan(x_m):
-            bound = "≥ " if lower_bound else ""
-            stated = f"sigma {bound}{sigma[0]:.3f} m, {bound}{sigma[1]:.4f} rad"
-            stated = stated if any(sigma) else "the frame"
-            T = f"({x_m:.3f} m, {y_m:.3f} m, {theta_rad:.4f} rad)"
-            lines.append(f"  {name}: T_first_map = {T}, {stated}")
-    lines += [f"  {_LOWER_BOUND}"] if lower_bound else []
-    lines += [f"  {name}: left out ({reason})" for name, reason in fused.left_out]
-    print_lines(lines)
-
-
-def print_unmerged(merged: MergeResult, maps: Sequence[Path]) -> None:
-    """Print the reason for each pair of maps that was not merged."""
-    print_lines(
-        f"  {maps[a]} and {maps[b]}: not merged: {reason}"
-        for (a, b), reason in merged.reasons().items()
-    )
+def print_merged(merged: MergedMaps, maps: Sequence[Path], paths: Sequence[Path]) -> None:
+    """Print the landmarks and motions of the fused maps, or why there are none, and what to do."""
+    lines = []
+    for path, fused in zip(paths, merged.fusion.fused, strict=False):
+        several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
+        lines.append(
+            f"{len(fused.landmarks)} landmarks in {path}: fused from {len(fused.members)} maps, "
+            f"aligned by {merged.aligner}; {several} landmarks are of several maps, "
+            f"{fused.duplicate_share:.1%} look like remaining duplicates"
+        )
+        is_bound = merged.is_lower_bound(fused)
+        motions = zip(maps, fused.T_first_map, fused.motion_covariance, strict=True)
+        for name, T, covariance in motions:
+            if not math.isnan(T[0]):
+                stated = sigma_text(covariance, is_bound) if covariance.any() else "the frame"
+                lines.append(f"  {name}: T_first_map = {motion_text(T)}, {stated}")
+        lines += [f"  {_LOWER_BOUND}"] if is_bound else []
+    if not paths and len(maps) > 2:  # of two maps the last sentence tells all
+        lines += [
+            f"  {maps[a]} and {maps[b]}: not merged: {reason}"
+            for (a, b), reason in merged.reasons().items()
+        ]
+    print_lines([*lines, merged.advice])
 
 
 _MOST_DROPPED = 5  # pictures that are listed

@@ -1,10 +1,4 @@
-"""Exports: stereo drives for dataset writers, g2o pose graphs, PLY point clouds.
-
-Kuemmerle, Grisetti, Strasdat, Konolige, Burgard (2011), "g2o: A general framework for graph
-optimization". The error of an EDGE_SE2 with measurement Z is Z^-1 (X_i^-1 X_j), whose position is
-in the frame at the end of Z. Covariances of this package are in the frame at the start and are
-therefore rotated.
-"""
+"""Stereo drives for the writers of datasets."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +13,6 @@ from mapfusion.datasets.text_files import NS, ODOMETRY_FILE, tum_text
 from mapfusion.files import write_whole
 from mapfusion.geometry import se2, se3
 from mapfusion.geometry.numerics import Float, require_shape
-from mapfusion.geometry.se2 import rotation
-from mapfusion.landmark_map import LandmarkMap
 
 OnFrame = Callable[[int, int], None]  # called with the numbers of written and of all frames
 
@@ -110,86 +102,3 @@ def write_picture(path: Path, image: np.ndarray) -> None:
     """Write a picture (H, W) uint8 as PNG atomically."""
     data = cv2.imencode(".png", image)[1].tobytes()
     write_whole(path, lambda temporary: temporary.write_bytes(data))
-
-
-_UPPER_3, _UPPER_2 = np.triu_indices(3), np.triu_indices(2)
-
-
-class G2oGraph:
-    """Pose graph in the g2o format; vertices are numbered from 0 as they are added."""
-
-    def __init__(self) -> None:
-        self._vertices: list[str] = []
-        self._edges: list[str] = []
-        self._n = 0
-
-    def add_comment(self, text: str) -> None:
-        """Add a comment line before the following vertices."""
-        self._vertices.append(f"# {text}")
-
-    def add_poses(self, T: Float) -> np.ndarray:
-        """Add poses (n, 3) in the frame of the graph and return their numbers (n,)."""
-        require_shape("T", T, (len(T), 3))
-        return self._add("VERTEX_SE2", T)
-
-    def add_points(self, p: Float) -> np.ndarray:
-        """Add landmarks (n, 2) in the frame of the graph and return their numbers (n,)."""
-        require_shape("p", p, (len(p), 2))
-        return self._add("VERTEX_XY", p)
-
-    def _add(self, kind: str, values: Float) -> np.ndarray:
-        numbers = np.arange(self._n, self._n + len(values))
-        self._n += len(values)
-        rows = zip(numbers.tolist(), values.tolist(), strict=True)
-        self._vertices += [f"{kind} {number} {_text(row)}" for number, row in rows]
-        return numbers
-
-    def add_motion(self, i: int, j: int, T_i_j: Float, covariance: Float) -> None:
-        """Add a measured motion (3,) from pose i to j with its covariance (3, 3) in frame i."""
-        turn = np.eye(3)
-        turn[:2, :2] = rotation(T_i_j[2]).T
-        information = turn @ np.linalg.inv(covariance) @ turn.T
-        numbers = [*T_i_j.tolist(), *information[_UPPER_3].tolist()]
-        self._edges.append(f"EDGE_SE2 {i} {j} {_text(numbers)}")
-
-    def add_sighting(self, i: int, point: int, p_i: Float, covariance: Float) -> None:
-        """Add a landmark (2,) observed from pose i with its covariance (2, 2) in frame i."""
-        information = np.linalg.inv(covariance)
-        numbers = [*p_i.tolist(), *information[_UPPER_2].tolist()]
-        self._edges.append(f"EDGE_SE2_XY {i} {point} {_text(numbers)}")
-
-    def text(self) -> str:
-        """Return the text of the file; reading it restores every number exactly."""
-        return "\n".join([*self._vertices, *self._edges, ""])
-
-
-def _text(numbers: list[float]) -> str:
-    """Return numbers separated by spaces."""
-    return " ".join(map(str, numbers))
-
-
-_PROPERTIES = (
-    *(f"double {name}" for name in ("x", "y", "z")),
-    *(f"uchar {name}" for name in ("red", "green", "blue")),
-    *(f"double sigma_{axis}" for axis in "xyz"),
-    "int count",
-)
-
-
-def ply_text(landmarks: LandmarkMap, rgb: np.ndarray) -> str:
-    """Return a map as a PLY point cloud with a colour (N, 3), 0 to 255, for each landmark.
-
-    Properties are x, y, z in metres in the frame of the map; red, green, blue; sigma_x, sigma_y,
-    sigma_z, the standard deviations in metres along the axes (0 for the height of planar maps);
-    count, the number of observations of the landmark. Reading the text restores every number
-    exactly.
-    """
-    n = len(landmarks)
-    require_shape("rgb", rgb, (n, 3))
-    sigma_m = np.sqrt(np.diagonal(landmarks.covariance_m2, axis1=1, axis2=2))
-    parts = (landmarks.position_m, rgb.astype(int), sigma_m, landmarks.count[:, None].astype(int))
-    columns = [column for part in parts for column in part.T.tolist()]
-    header = ["ply", "format ascii 1.0", f"comment map of {landmarks.name}, metres"]
-    header += [f"element vertex {n}", *(f"property {each}" for each in _PROPERTIES), "end_header"]
-    lines = (" ".join(map(str, row)) for row in zip(*columns, strict=True))
-    return "\n".join([*header, *lines, ""])

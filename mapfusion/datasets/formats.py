@@ -112,7 +112,7 @@ def settings_class(format_name: str) -> type[Any]:
 
 
 def read_recording(
-    format_name: str, folder: Path, settings: Any = None, read_yaml: "ReadYaml | None" = None
+    format_name: str, folder: str | Path, settings: Any = None, read_yaml: "ReadYaml | None" = None
 ) -> "StereoRecording":
     """Read a stereo recording: pairs of pictures with calibration, and truth if it is recorded.
 
@@ -134,13 +134,13 @@ def read_recording(
     def no_yaml(path: Path) -> Any:
         raise InputError(f"{path}: give `read_yaml`, a function that reads YAML, to read it")
 
-    return function(folder, chosen, read_yaml or no_yaml)
+    return function(Path(folder), chosen, read_yaml or no_yaml)
 
 
 def import_recording(
     format_name: str,
-    folder: Path,
-    destination: Path,
+    folder: str | Path,
+    destination: str | Path,
     settings: Any = None,
     read_yaml: "ReadYaml | None" = None,
 ) -> list[Path]:
@@ -153,12 +153,12 @@ def import_recording(
     """
     importer, function = _find_importer(format_name)
     if not importer.stereo:
-        return function(folder, destination, settings)
+        return function(Path(folder), Path(destination), settings)
     from mapfusion.datasets.stereo_import import RecordingPart, StereoImport, write_imported
 
     recording = read_recording(format_name, folder, settings, read_yaml)
     whole = RecordingPart(robot_name(recording.name), slice(None))
-    return write_imported(destination, [StereoImport(recording).log_of(whole)])
+    return write_imported(Path(destination), [StereoImport(recording).log_of(whole)])
 
 
 def export_drive(

@@ -70,14 +70,18 @@ def test_own_maps_are_aligned_and_merged_also_by_an_own_aligner(
     maps, aligner = (block for kind, block in BLOCKS if kind == "python")
     exec(compile(maps, "README", "exec"), {})
     (tmp_path / "mine.py").write_text(aligner)
-    own = [words for words in COMMANDS if words[0] in ("align", "merge")]
+    assert len(read_map(tmp_path / "fused.csv")) == 60
+    assert "Use T_a_b = (2.000 m, 1.000 m, 0.0000 rad)" in capsys.readouterr().out
+    inline = [shlex.split(each)[1:] for each in INLINE]
+    own = [words for words in [*inline, *COMMANDS] if words[0] in ("align", "merge")]
     assert [words[0] for words in own] == ["align", "merge", "align"]
     for words in own:
         reply = command(capsys, *words)
         assert reply.code == 0, reply.err
-    assert re.search(r"^ +Nearest: accepted$", reply.out, re.MULTILINE)
-    assert re.search(r"^Nearest +2\.0\d+ +1\.0\d+", reply.out, re.MULTILINE)
+    assert re.search(r"^Nearest +accepted +2\.0\d+ +1\.0\d+", reply.out, re.MULTILINE)
     assert len(read_map(tmp_path / "fused.parquet")) == 60
+    for name in ("fused.png", "aligned.html"):
+        assert (tmp_path / name).stat().st_size > 10_000
 
 
 def test_scenarios_run_as_shown(

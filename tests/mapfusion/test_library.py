@@ -35,7 +35,7 @@ def test_editors_see_the_names_that_exist():
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    seen["merge_maps"] = seen.pop("_merge")
+    seen["fuse_maps"] = seen.pop("_merge")
     assert sorted(seen) == mapfusion.__all__
     for name, (module, called_there) in seen.items():
         assert getattr(mapfusion, name) is getattr(sys.modules[module], called_there)

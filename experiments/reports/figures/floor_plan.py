@@ -1,4 +1,4 @@
-"""Floor plans: equal scales, walls, error ellipses, and a view without outliers."""
+"""Floor plans: equal scales, walls, and a view without outliers."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,18 +6,13 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from experiments.reports.figures.result_tables import ResultTables
 from experiments.reports.figures.style import BLACK, PAGE_WIDTH_IN, WALL_GRAY
-from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.numerics import Float
+from mapfusion.plotting import largest_magnification
 
-LEVEL_TEXT = "95 %"
-_LEVEL, _PLANE_DIMENSIONS = 0.95, 2
-ELLIPSE_BOUND = chi_square_bound(_LEVEL, _PLANE_DIMENSIONS)  # squared Mahalanobis distance
-_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 _WIDEST_SHARE = 1 / 10  # of the map's extent, for the widest particle set drawn
 _OUTLIER_SHARE = 0.005  # on each side: a distant outlier must not shrink the map
 _SURROUNDINGS = 1.0  # walls are shown up to this distance, as a multiple of the map's extent
@@ -55,43 +50,7 @@ def add_frame(axes: Axes, length_m: float = 1.0) -> None:
 
 def magnification(extent_m: float, widest_m: float) -> int:
     """Return the largest round factor at which particle sets stay small in a map."""
-    share = _WIDEST_SHARE * extent_m
-    return max((m for m in _MAGNIFICATIONS if m * widest_m <= share), default=1)
-
-
-def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float, Float]:
-    """Compute the error ellipses that contain a share `level` of a normal distribution.
-
-    The squared Mahalanobis distance of a normal point is chi-square with two degrees of freedom, so
-    the semi-axes are sqrt(eigenvalue * quantile), along the eigenvectors.
-
-    Args:
-        covariance_m2: covariances, shape (N, 2 or more, 2 or more).
-        level: probability of the ellipses.
-
-    Returns:
-        Semi-major axes (N,) and semi-minor axes (N,) in metres; direction of the major axis (N,)
-        in rad.
-    """
-    values, vectors = np.linalg.eigh(covariance_m2[:, :2, :2])
-    lengths = np.sqrt(np.maximum(values, 0.0) * chi_square_bound(level, _PLANE_DIMENSIONS))
-    direction = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
-    return lengths[:, 1], lengths[:, 0], direction
-
-
-def add_ellipses(axes: Axes, position_m: Float, covariance_m2: Float, **style: Any) -> None:
-    """Draw 95 % ellipses to scale, from positions (N, 2 or 3) and covariances."""
-    major, minor, direction = semi_axes(covariance_m2)
-    place = {"units": "xy", "offsets": position_m[:, :2], "offset_transform": axes.transData}
-    sizes = (2 * major, 2 * minor, np.degrees(direction))
-    collection = EllipseCollection(*sizes, facecolors="none", **place, **style)
-    axes.add_collection(collection, autolim=False)
-
-
-def ellipse_handle(colour: str) -> Line2D:
-    """Return the legend entry of the ellipses, with their level."""
-    style = {"marker": "o", "markerfacecolor": "none", "markersize": 7, "linestyle": "none"}
-    return Line2D([], [], color=colour, label=f"{LEVEL_TEXT} ellipses, to scale", **style)
+    return largest_magnification(widest_m, _WIDEST_SHARE * extent_m)
 
 
 def set_view(axes: Axes, landmarks_m: Float, path_m: Float, walls_m: Sequence[Float] = ()) -> str:

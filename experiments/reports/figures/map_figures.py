@@ -27,9 +27,17 @@ from experiments.reports.figures.result_tables import (
     ResultTables,
     of_pair,
 )
-from experiments.reports.figures.style import BLACK, FUSED_COLOUR, GRAY, PAGE_WIDTH_IN, PURPLE
+from experiments.reports.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, PURPLE
 from mapfusion.files import POSITION_FIELDS
 from mapfusion.geometry.numerics import Float
+from mapfusion.plotting import (
+    ELLIPSE_BOUND,
+    FUSED_COLOUR,
+    LEVEL_TEXT,
+    add_ellipses,
+    ellipse_handle,
+    semi_axes,
+)
 
 # Figure 7. Outliers must not shrink the picture: landmarks beyond this quantile on each side,
 # widened by a share of the extent, are left out.
@@ -85,7 +93,7 @@ def draw_two_maps(data: ResultTables) -> Figure:
         points = {"marker": ".", "markersize": 1.5, "color": colour, "zorder": 2}
         plan.add_points(axes, position, label="landmarks", **points)
         ellipses = {"edgecolors": colour, "linewidths": 0.4, "alpha": 0.6, "zorder": 2}
-        plan.add_ellipses(axes, position, covariance, rasterized=True, **ellipses)
+        add_ellipses(axes, position, covariance, rasterized=True, **ellipses)
         axes.plot(*path.T, color=GRAY, label="path of the best particle", zorder=3)
         if len(smoothed := data.smoothed_path_of(robot)):
             line = {"color": BLACK, "linewidth": 0.5, "zorder": 4}
@@ -102,7 +110,7 @@ def draw_two_maps(data: ResultTables) -> Figure:
         axes.set_title(f"{robot}, k = {k}: {n_landmarks}\n({data.sightings})")
     plan.set_one_scale(panels)
     handles, _ = panels[0].get_legend_handles_labels()
-    handles.insert(1, plan.ellipse_handle(data.colours[robots[0]]))
+    handles.insert(1, ellipse_handle(data.colours[robots[0]]))
     plan.finish_plans(figure, panels, handles, 3)
     return figure
 
@@ -284,13 +292,13 @@ def draw_fused_landmark(data: ResultTables) -> Figure:
     for k, (name, marker, colour) in enumerate(parts):
         here, dashes = slice(k, k + 1), ("--", "-.", "-")[k]
         look: dict[str, Any] = {"edgecolors": colour, "linestyles": dashes}
-        plan.add_ellipses(axes, position[here], covariance[here], **look)
+        add_ellipses(axes, position[here], covariance[here], **look)
         whose = "fused" if k == 2 else f"{name}'s"
         look = {"marker": marker, "markersize": 6, "linestyle": dashes}
         axes.plot(*position[k, :2], color=colour, label=f"{whose} landmark $L_{'ijF'[k]}$", **look)
     own = pairs.own_covariance_m2[:, chosen]
     thin = {"edgecolors": [colour for *_, colour in parts[:2]], "linewidths": 0.6}
-    plan.add_ellipses(axes, position[:2], own, **thin)
+    add_ellipses(axes, position[:2], own, **thin)
     axes.plot(*position[:2, :2].T, color="gray", linewidth=0.6, linestyle=":", zorder=1)
     # Label the points; the labels of the parents point away from each other.
     along = position[1, :2] - position[0, :2]
@@ -303,13 +311,13 @@ def draw_fused_landmark(data: ResultTables) -> Figure:
         offset = {"xytext": tuple(14 * side), "textcoords": "offset points"}
         axes.annotate(f"$L_{name}$", xy=(x, y), **offset, **text)
     centre = position[2, :2]
-    reach = (np.abs(position[:, :2] - centre).max(axis=1) + plan.semi_axes(covariance)[0]).max()
+    reach = (np.abs(position[:, :2] - centre).max(axis=1) + semi_axes(covariance)[0]).max()
     plan.set_square(axes, centre, _MARGIN * reach)
     plan.label_plan(axes, data.fused_frame)
     note = "thin: the maps' own covariances, before drift is added"
     if (n_more := pairs.n_parents[chosen] - 2) > 0:
         note += f"; {n_more} more robot{'s' if n_more > 1 else ''} knew it"
-    axes.set_title(f"{plan.LEVEL_TEXT} ellipses, to scale\n({note})")
+    axes.set_title(f"{LEVEL_TEXT} ellipses, to scale\n({note})")
     figure.legend(loc="outside lower center", ncols=3)
     return figure
 
@@ -321,7 +329,7 @@ def choose_landmark(pairs: FusedPairs) -> int | None:
     one with the largest gain of the fusion over the better parent is chosen: there the ellipses
     cross. Weaker conditions apply if there is no candidate. None if no covariance is regular.
     """
-    axes = [plan.semi_axes(covariance)[:2] for covariance in pairs.covariance_m2]
+    axes = [semi_axes(covariance)[:2] for covariance in pairs.covariance_m2]
     major, minor = np.stack(axes, axis=1)
     regular = np.all(minor > 0, axis=0)
     if not regular.any():
@@ -363,7 +371,7 @@ def draw_aligned_maps(data: ResultTables) -> Figure:
             plan.add_points(axes, position[k], label=label, **style)
             style = {"edgecolors": colour, "linewidths": (1.4 if k == 2 else 0.8) * scale}
             style |= {"rasterized": True, "zorder": 2 + 0.1 * k}
-            plan.add_ellipses(axes, position[k], covariance[k], **style)
+            add_ellipses(axes, position[k], covariance[k], **style)
     plan.set_view(overview, fused, fused[:0])
     zoom.set(xlim=(x, x + side), ylim=(y, y + side), aspect="equal")
     # The square is much smaller than the map: a label with a line points to it, and a circle shows
@@ -384,7 +392,7 @@ def draw_aligned_maps(data: ResultTables) -> Figure:
     cut = f", without {part.n_cut} on its rim" if part.n_cut else ""
     zoom.set_title(f"{part.whole.sum()} of them, enlarged: a square of {100 * side:.2g} cm{cut}")
     handles, _ = zoom.get_legend_handles_labels()
-    legend = {"title": f"{plan.LEVEL_TEXT} ellipses, to scale", "title_fontsize": 7.5}
+    legend = {"title": f"{LEVEL_TEXT} ellipses, to scale", "title_fontsize": 7.5}
     plan.finish_plans(figure, [overview, zoom], handles, len(handles), **legend)
     return figure
 
@@ -413,7 +421,7 @@ def choose_zoom(position_m: Float, covariance_m2: Float) -> Zoom:
         covariance_m2: their covariances, shape (3, N, 3, 3).
     """
     variance = np.diagonal(covariance_m2[..., :2, :2], axis1=2, axis2=3)
-    reach = np.sqrt(variance * plan.ELLIPSE_BOUND)
+    reach = np.sqrt(variance * ELLIPSE_BOUND)
     low = (position_m[..., :2] - reach).min(axis=0)
     high = (position_m[..., :2] + reach).max(axis=0)
     middle = (low + high) / 2

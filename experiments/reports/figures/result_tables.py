@@ -15,12 +15,13 @@ from PIL import Image
 
 from experiments.evaluation.criteria import methods_in
 from experiments.evaluation.tables import ALL, read, read_scenario, read_world, table_path
-from experiments.reports.figures.style import FUSED_COLOUR, ROBOT_COLOURS, aligner_styles
+from experiments.reports.figures.style import aligner_styles
 from mapfusion.align.alignment import Status
 from mapfusion.errors import DamagedFileError, InputError
 from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, points_from, require_file
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, inverse, transform_covariances, transform_points
+from mapfusion.plotting import FUSED_COLOUR, ROBOT_COLOURS
 
 Pair = tuple[str, str]
 

@@ -15,12 +15,9 @@ from matplotlib.ticker import FuncFormatter, LogFormatter
 from experiments.evaluation.criteria import ORACLE
 from experiments.evaluation.map_errors import FILTERED, SMOOTHED
 from mapfusion.fusion.fusers import REFERENCE
+from mapfusion.plotting import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 
 PAGE_WIDTH_IN = 7.2  # two columns of a journal page
-# Okabe and Ito (2008): distinct for readers with any common colour blindness. Their yellow is left
-# out: it is too pale for lines on white.
-BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
-PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
 # Four colours of Tol's (2021) muted scheme, for comparisons of many methods.
 INDIGO, WINE, OLIVE, TEAL = "#332288", "#882255", "#999933", "#44AA99"
 BLACK, GRAY, WALL_GRAY, PALE_GRAY = "#000000", "#7F7F7F", "#A8A8A8", "#C8C8C8"
@@ -80,8 +77,6 @@ _DASHES_AND_GAPS = [(2, 2), (9, 1, 2, 1), (), (4, 1, 1, 1), (1, 2), (7, 3)]
 _DASHES_AND_GAPS += [(5, 1, 1, 1, 1, 1, 1, 1), (3, 3), (10, 2, 4, 2)]
 _OTHER_DASHES = [(0, lengths) if lengths else "-" for lengths in _DASHES_AND_GAPS]
 _OTHER_MARKERS = ("p", "h", "d", "8", "H", "1", "2", "3", "4")
-ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
-FUSED_COLOUR = BLACK
 
 
 class _Between(LogFormatter):

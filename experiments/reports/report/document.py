@@ -36,7 +36,7 @@ from experiments.reports.figures.result_tables import (
     parse_json_object,
     read_png,
 )
-from experiments.reports.figures.style import ROBOT_COLOURS, aligner_styles
+from experiments.reports.figures.style import aligner_styles
 from experiments.reports.report.charts import (
     NEUTRAL,
     chart_style,
@@ -67,6 +67,7 @@ from experiments.studies.paper_claims import SCENARIOS, compare_with_paper
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
 from mapfusion.errors import InputError, install_command
+from mapfusion.plotting import ROBOT_COLOURS
 
 _SOURCE_DIGITS = 16
 
@@ -380,31 +381,44 @@ def write_report(path: Path, output: Path | None = None) -> Path:
     The file is `report.html` in the folder by default. The policy in the page lets it fetch nothing
     and run only its own scripts. Raises InputError as `contents_of` does.
     """
+    contents = contents_of(path)
+    colours = [style["hex"] for style in contents["styles"].values()] + [*ROBOT_COLOURS, NEUTRAL]
+    target = path / "report.html" if output is None else output
+    write_page(target, "report.html.j2", contents | {"band": BAND}, colours)
+    return target
+
+
+def write_page(
+    target: Path, template: str, contents: dict[str, Any], colours: Collection[str]
+) -> None:
+    """Write a page with charts as one file that fetches nothing and runs only its own scripts.
+
+    Args:
+        target: the file.
+        template: name of the page's template.
+        contents: values of the template; `charts` holds figures of Plotly, or None, by name.
+        colours: colours of the charts, for which the dark page has lighter ones.
+    """
     from plotly.offline import get_plotlyjs
 
-    contents = contents_of(path)
     scripts = {"plotly": get_plotlyjs(), "script": (_PAGE / "draw.js").read_text(encoding="utf-8")}
     digests = [hashlib.sha256(text.encode()).digest() for text in scripts.values()]
     charts = {name: figure for name, figure in contents["charts"].items() if figure is not None}
-    colours = [style["hex"] for style in contents["styles"].values()] + [*ROBOT_COLOURS, NEUTRAL]
     shown = palette(colours)
     data = {
         "charts": {name: json.loads(figure.to_json()) for name, figure in charts.items()},
         "templates": {theme: chart_template(theme) for theme in ("light", "dark")},
         "lighter": {colour: shown["dark"][css_name(colour)] for colour in colours},
     }
-    page = templates().get_template("report.html.j2")
+    page = templates().get_template(template)
     html = page.render(
         contents | scripts,
         data=data,
         palette=shown,
-        band=BAND,
         style=(_PAGE / "report.css").read_text(encoding="utf-8"),
         script_hashes=[base64.b64encode(digest).decode() for digest in digests],
     )
-    target = path / "report.html" if output is None else output
     write_text(target, html)
-    return target
 
 
 def templates() -> jinja2.Environment:

@@ -15,13 +15,13 @@ import pandas as pd
 import plotly.graph_objects as go
 
 from experiments.pipeline.stages.align import unpacked
-from experiments.reports.figures.floor_plan import LEVEL_TEXT, semi_axes
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
 from experiments.reports.figures.style import ORANGE
 from experiments.reports.formatting import metres, radians
 from experiments.reports.report.charts import NEUTRAL, Attributes, Styles, escaped, faint, thinned
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
+from mapfusion.plotting import LEVEL_TEXT, semi_axes
 
 MAP_TABLES = ("map_history", "true_pairs", "clouds", "paths")
 MAP_TABLES += ("correspondences", "fused_history", "estimates")
@@ -30,7 +30,7 @@ _BYTES_OF_POINT = 2 * 4 * 4 / 3  # two single-precision numbers, in base64
 # Plotly draws a closed smooth curve through the four ends of an ellipse's axes. At its strongest
 # smoothing the curve lies at most 6 % of the radius inside of the ellipse.
 _ELLIPSE_ENDS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [1, 0], [np.nan, np.nan]])
-_SMOOTH = {"shape": "spline", "smoothing": 1.3, "width": 0}
+SMOOTH = {"shape": "spline", "smoothing": 1.3, "width": 0}
 _MAX_PATH_POINTS = 200
 # Outline in metres of a robot that drives along x
 _ROBOT_M = 0.4 * np.array([[1, 0], [-0.7, 0.65], [-0.35, 0], [-0.7, -0.65], [1, 0]])
@@ -429,7 +429,7 @@ class _Maps:
         carpet = None if pair is None else self.carpet_of(pair[0])
         meta = {"robot": robot} if pair is None else {"pair": list(pair)}
         ellipses = {"name": f"{LEVEL_TEXT} ellipses, {name}", "mode": "none", "hoverinfo": "skip"}
-        ellipses |= {"fill": "toself", "fillcolor": faint(colour, 0.25), "line": _SMOOTH}
+        ellipses |= {"fill": "toself", "fillcolor": faint(colour, 0.25), "line": SMOOTH}
         yield _Layer(
             _in_frame(**ellipses, carpet=carpet, meta=meta | {"layer": "ellipses"}),
             lambda k: _ab(ellipse_ends(rows(k))),
@@ -492,14 +492,19 @@ class _Maps:
 
 
 def ellipse_ends(rows: pd.DataFrame) -> Float:
-    """Return closed polygons of the ellipses of N landmarks with gaps, shape (6 N, 2)."""
+    """Return the polygons of `ellipse_polygons` for rows of a table of landmarks."""
     covariance_m2 = rows[_COVARIANCE].to_numpy(dtype=np.float64).reshape(-1, 2, 2)
+    return ellipse_polygons(_points(rows), covariance_m2)
+
+
+def ellipse_polygons(position_m: Float, covariance_m2: Float) -> Float:
+    """Return closed polygons of the ellipses of N landmarks with gaps, shape (6 N, 2)."""
     major, minor, direction = semi_axes(covariance_m2)
     ends = _ELLIPSE_ENDS * np.stack([major, minor], -1)[:, None]
     cos, sin = np.cos(direction)[:, None], np.sin(direction)[:, None]
     x, y = ends[..., 0], ends[..., 1]
     turned = np.stack([cos * x - sin * y, sin * x + cos * y], -1)
-    return (_points(rows)[:, None] + turned).reshape(-1, 2)
+    return (position_m[:, None] + turned).reshape(-1, 2)
 
 
 def _points(rows: pd.DataFrame, prefix: str = "") -> Float:

@@ -71,7 +71,11 @@ def test_what_is_refused_is_null_with_a_reason(
     assert row["status"] == "refused"
     assert row["refined"] is None
     assert row["reason"]
-    assert command(capsys, "align", *maps[::2], *ONE).out.count(row["reason"]) == 1
+    assert row["reason"].partition(";")[0] in found["advice"]
+    told = command(capsys, "align", *maps[::2], *ONE).out
+    assert told.count(row["reason"].partition(";")[0]) == 1
+    assert told.count("20 labels are in both maps") == 1
+    assert told.splitlines()[-1] == found["advice"]
 
 
 def test_merge(maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -169,7 +169,11 @@ def test_a_file_of_a_log_is_no_output_under_another_name(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ("merge a.csv b.csv -o f.ply", ["ends in .ply", ".parquet or .csv", "mapfusion export"]),
+        ("merge a.csv b.csv -o f.tum", ["ends in .tum", ".ply or .g2o", "mapfusion export"]),
+        ("merge a.csv b.csv -o f.xyz", ["ends in .xyz", ".parquet or .csv or .ply or .g2o"]),
+        ("merge a.csv b.csv -o f.g2o --report f.txt", ["--report f.txt", ".html"]),
+        ("align a.csv b.csv --plot a.csv", ["--plot a.csv", "ends in .csv", ".png"]),
+        ("align a.csv b.csv --report log", ["--report log: is a folder"]),
         ("merge a.csv b.csv -o f", ["has no ending", ".parquet or .csv"]),
         ("merge a.csv b.csv -o .", ["is a folder"]),
         ("merge a.csv b.csv -o b.joint.parquet", ["belongs to the map NAME.parquet"]),
@@ -288,8 +292,9 @@ def test_a_merge_of_nothing_writes_nothing_and_tells_why(
     before = contents(maps[0].parent)
     reply = command(capsys, "merge", maps[0], maps[2], *ONE, "-o", output)
     assert reply.code == 1
-    assert f"{maps[0]} and {maps[2]}: not merged: " in reply.out
-    assert "20 labels are in both maps" in reply.out
+    names = [read_map(path).name for path in (maps[0], maps[2])]
+    assert f"No two maps were merged. {names[0]} and {names[1]}: svd: refused: " in reply.out
+    assert reply.out.count("20 labels are in both maps") == 1
     assert reply.complaints == [f"mapfusion: no two maps were merged; {output} is not written"]
     assert contents(maps[0].parent) == before
     reply = command(capsys, "merge", maps[0], maps[2], *ONE, "-o", output, "--json")

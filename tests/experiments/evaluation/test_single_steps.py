@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.evaluation.single_steps import align, merge
+from experiments.evaluation.single_steps import align, alignment_row, merge
 from experiments.pipeline.tables import COVARIANCE
 from experiments.scenario.loading import default_settings
 from mapfusion.align.alignment import Pairs
@@ -57,7 +57,7 @@ def test_a_call_that_is_timed_finds_nothing_of_the_one_before(
 
     monkeypatch.setattr(Icp, "find", find)
     rows = align(paths[0], paths[1], default_settings([], 0))
-    assert {row["aligner"] for row in rows} >= {"icp", "ransac"}
+    assert {row.aligner for row in rows} >= {"icp", "ransac"}
     first, timed = given
     assert first is not timed
 
@@ -87,7 +87,8 @@ def test_a_merge_tells_that_no_evidence_could_be_sought(
     a, b, _ = described
     told = command(capsys, "merge", a, b, *ONE, "-o", tmp_path / "f.parquet").out.splitlines()
     note = "no evidence to the contrary could be sought: map a has no viewing evidence"
-    assert [line.strip() for line in told if "evidence" in line] == [f"note: {note}"]
+    assert note in told[-1]
+    assert not any("evidence" in line for line in told[:-1])
     assert note in command(capsys, "align", a, b, *ONE).out
 
 
@@ -99,7 +100,7 @@ def test_a_failed_aligner_is_named(
     maps = ("merge", *described[:2], "-o", tmp_path / "f.parquet", "--aligner", f"{own}:Odd")
     reply = command(capsys, *maps)
     assert reply.code == 1
-    assert "not merged: Odd: failed: raised ZeroDivisionError" in reply.out
+    assert "a and b: Odd: failed: raised ZeroDivisionError" in reply.out
 
 
 def test_a_mirrored_map_is_named_once_and_no_other(
@@ -159,7 +160,7 @@ def test_align_and_merge_state_the_same_about_exact_labelled_maps(tmp_path: Path
     merged = merge(paths, settings)
     stated = merged.fusion.fused[0].motion_covariance[1]
     assert merged.is_lower_bound(merged.fusion.fused[0])
-    for row in align(paths[0], paths[1], settings):
+    for row in map(alignment_row, align(paths[0], paths[1], settings)):
         assert row["lower_bound"]
         refined = [row[name] for name in COVARIANCE]
         np.testing.assert_allclose(refined, stated[np.triu_indices(3)], rtol=0.02, atol=1e-12)

@@ -264,8 +264,8 @@ def test_ply(trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
             read_map(trio_result / f"maps/{name}.parquet"),
         )
         np.testing.assert_array_equal(cloud[["x", "y", "z"]], own.position_m)
-        sigma = np.sqrt(own.covariance_m2[:, [0, 1, 2], [0, 1, 2]])
-        np.testing.assert_array_equal(cloud[["sigma_x", "sigma_y", "sigma_z"]], sigma)
+        variance = own.covariance_m2[:, [0, 1, 2], [0, 1, 2]]
+        np.testing.assert_array_equal(cloud[["cov_xx_m2", "cov_yy_m2", "cov_zz_m2"]], variance)
         np.testing.assert_array_equal(cloud["count"], own.count)
         colours = [f"#{int(r):02X}{int(g):02X}{int(b):02X}" for r, g, b in colours_of(cloud)]
         if name.partition(".")[0] in ROBOTS:

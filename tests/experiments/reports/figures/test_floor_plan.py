@@ -9,8 +9,8 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from experiments.reports.figures import floor_plan
-from experiments.reports.figures.floor_plan import add_ellipses, semi_axes
 from experiments.reports.figures.style import write_plainly
+from mapfusion.plotting import add_ellipses, ellipse_handle, semi_axes
 
 
 def test_strays_are_out_of_view_and_counted() -> None:
@@ -72,7 +72,7 @@ def test_axes_tell_unit_and_frame_and_the_start_pose_is_drawn() -> None:
 
 
 def test_a_legend_says_the_ellipses_level() -> None:
-    handle = floor_plan.ellipse_handle("#112233")
+    handle = ellipse_handle("#112233")
     assert handle.get_label() == "95 % ellipses, to scale"
     assert to_hex(handle.get_color()) == "#112233"
 

@@ -1,0 +1,610 @@
+"""Align two maps, or merge several, in one call; the results describe, draw and convert themselves.
+
+A map is a `LandmarkMap`, the path of its file, or a pandas table with the columns of such a file.
+"""
+
+import html
+import itertools
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mapfusion.align.aligners import make_aligner
+from mapfusion.align.alignment import NOT_RUN, Alignment, Method, Pairs, Status
+from mapfusion.align.correspondences import (
+    Correspondences,
+    MatchParameters,
+    match,
+    why_not_unit_vectors,
+)
+from mapfusion.align.rigid_motion import residuals
+from mapfusion.errors import InputError
+from mapfusion.files import Write, write_together
+from mapfusion.fusion.fusers import (
+    USUAL,
+    AlignedPair,
+    FusedMap,
+    Fuser,
+    Fusion,
+    MergeParameters,
+    make_fuser,
+    name_order,
+)
+from mapfusion.fusion.merge import merge
+from mapfusion.fusion.team_graph import EdgeStatus
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import motion_sigma
+from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
+from mapfusion.plotting import Plan, fused_plan, pair_plan, plot_plans
+from mapfusion.verification.false_alarms import Acceptance
+from mapfusion.verification.registration import Aligner, Registered, Registration
+from mapfusion.verification.rivals import (
+    DISTINCT_M,
+    SupportedMotion,
+    distinct_motions,
+    is_mirrored,
+    rms_distance_m,
+)
+from mapfusion.verification.verdict import PairEvidence, PairVerifier
+
+if TYPE_CHECKING:  # results are printed and written without data frames and figures
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    MapLike = LandmarkMap | str | os.PathLike[str] | pd.DataFrame
+
+_MOST_RIVALS = 3  # motions beside the estimate; pictures of more are not legible
+_MOST_PAIRS = 6  # of maps in a picture, two rows of plans
+# What a user can do about an alignment that is not accepted.
+_REMEDIES = {
+    Status.AMBIGUOUS: "Merge with a third map that overlaps both, or map more of the places that "
+    "do not look alike",
+    Status.TOO_UNCERTAIN: "Map more common landmarks, farther apart",
+    Status.REFUSED: "If both maps show the same place, map more of it with both robots; if they do "
+    "not, they cannot be aligned",
+    Status.FAILED: "Correct the aligner, or choose another one",
+    Status.ABSENT: "Choose another aligner",
+}
+# Reasons why the team does not use an accepted alignment.
+_TEAM_REASONS = {
+    EdgeStatus.UNCONFIRMED: "no other alignment confirms this one",
+    EdgeStatus.CONTRADICTED: "other alignments contradict this one",
+    EdgeStatus.AMBIGUOUS: "several motions fit, and other alignments do not tell which is right",
+}
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class MapAlignment:
+    """Alignment of two maps by one method, with refinement and verdict.
+
+    Attributes:
+        map_a: map in frame a.
+        map_b: map in frame b.
+        correspondences: N correspondences of the two maps.
+        aligner: name of the method.
+        registered: the estimate, its refinement and the verdict.
+        registration: settings of refinement and verdict.
+        verifier: verifier of these maps; None without one.
+    """
+
+    map_a: LandmarkMap
+    map_b: LandmarkMap
+    correspondences: Correspondences
+    aligner: str
+    registered: Registered
+    registration: Registration
+    verifier: PairVerifier | None = None
+
+    @property
+    def status(self) -> Status:
+        """Outcome: accepted, refused, ambiguous, too uncertain, failed or absent."""
+        if self.registered.estimated.status in NOT_RUN:
+            return self.registered.estimated.status
+        status = self.registered.verdict.status
+        return Status.REFUSED if status is Status.DEGENERATE else status
+
+    @property
+    def accepted(self) -> bool:
+        """True if the motion may be used."""
+        return self.status is Status.ACCEPTED
+
+    @property
+    def reason(self) -> str:
+        """Reason of a refusal, or a remark on an accepted alignment; empty if there is none."""
+        estimated, refined, verdict = self.registered
+        return estimated.reason or refined.reason or verdict.reason
+
+    @property
+    def T_a_b(self) -> Float:  # noqa: N802  # a motion, as everywhere
+        """Refined motion (3,): tx_m, ty_m, theta_rad; NaN if there is none."""
+        return self.registered.refined.T_a_b
+
+    @property
+    def covariance(self) -> Float:
+        """Covariance (3, 3) of the refined motion."""
+        return self.registered.refined.covariance
+
+    @property
+    def inlier(self) -> np.ndarray:
+        """Correspondences that support the refined motion, bool (N,)."""
+        return self.registered.refined.inlier
+
+    @property
+    def alignment(self) -> Alignment:
+        """Refined alignment with the status of the verdict, for `fuse_maps`."""
+        found = self.registered.applied
+        if found.status in NOT_RUN:  # the reason does not name the aligner
+            return replace(found, reason=f"{self.aligner}: {found.status}: {found.reason}")
+        if not found.ok and self.mirror_note:
+            return replace(found, reason=f"{found.reason}; {self.mirror_note}")
+        return found
+
+    @cached_property
+    def mirror_note(self) -> str:
+        """Say that the maps look like mirror images of each other; empty if they do not."""
+        if self.accepted or not is_mirrored(self._pairs, self._acceptance, self._refinement):
+            return ""
+        a, b = self.map_a.name, self.map_b.name
+        return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"
+
+    @property
+    def hint(self) -> str:
+        """Property of the maps that may explain a refusal; empty if none is found."""
+        if self.accepted or self.status in NOT_RUN:
+            return ""
+        return self._pairs.note(int(np.count_nonzero(self.inlier))) or self.mirror_note
+
+    @cached_property
+    def other_motions(self) -> list[SupportedMotion]:
+        """Other motions that many correspondences support, the best supported first."""
+        p_b, T = self.map_b.position_m[:, :2], self.T_a_b
+        found = distinct_motions(self._pairs, _MOST_RIVALS + 1, self._acceptance, self._refinement)
+        rivals = [each for each in found if not rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M]
+        return sorted(rivals, key=lambda each: -np.count_nonzero(each.inlier))[:_MOST_RIVALS]
+
+    @cached_property
+    def _pairs(self) -> Pairs:
+        return Pairs(self.map_a, self.map_b, self.correspondences)
+
+    @property
+    def _acceptance(self) -> Acceptance:
+        verifier = self.registration.verifier
+        return Acceptance() if verifier is None else verifier.acceptance
+
+    @property
+    def _refinement(self) -> Any:
+        return self.registration.refinement
+
+    @property
+    def refusal(self) -> str:
+        """Why the motion is not accepted, and what to do about it."""
+        reason = self.reason.removesuffix(f"; {self.hint}")
+        remedy = self.hint or _REMEDIES[self.status]
+        why = f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}"
+        return f"{_sentence(why)} {_sentence(remedy)}"
+
+    @property
+    def advice(self) -> str:
+        """Which motion to use, how sure it is, or why there is none and what to do."""
+        return advice([self])
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return a row for each correspondence.
+
+        Columns are the rows of both maps, the distance of the descriptors, whether the
+        correspondence supports the motion, and the distance in the plane under the motion.
+        """
+        import pandas as pd
+
+        off = residuals(self.T_a_b, self._pairs.p_a, self._pairs.p_b)
+        return pd.DataFrame(
+            {
+                "landmark_a": self.correspondences.index_a,
+                "landmark_b": self.correspondences.index_b,
+                "descriptor_distance": self.correspondences.distance,
+                "inlier": self.inlier,
+                "residual_m": np.hypot(*off[:, :2].T),
+            }
+        )
+
+    def plans(self) -> list[Plan]:
+        """Return the plans of both maps under the motion, and under each of the other motions."""
+        status = str(self.status).replace("_", " ")
+        title = f"{status}: {self.map_b.name} in the frame of {self.map_a.name} by {self.aligner}"
+        if np.isnan(self.T_a_b).any():
+            title = f"{status}: {self.map_b.name} drawn beside {self.map_a.name}"
+        motions = [(title, self.T_a_b, self.inlier)]
+        for each in self.other_motions:
+            title = f"another motion: {motion_text(each.T_a_b)},\n"
+            title += f"{np.count_nonzero(each.inlier)} of {len(self.inlier)} correspondences"
+            motions.append((title, each.T_a_b, each.inlier))
+        return [self.plan(title, np.zeros(3), T, inlier) for title, T, inlier in motions]
+
+    def plan(
+        self,
+        title: str,
+        T_a: Float,
+        T_b: Float,
+        inlier: np.ndarray,
+        places: tuple[int, int] = (0, 1),
+    ) -> Plan:
+        """Return the plan of both maps at two poses (3,), with some correspondences accepted."""
+        index = self.correspondences.index_a, self.correspondences.index_b
+        return pair_plan(title, (self.map_a, self.map_b), (T_a, T_b), index, inlier, places)
+
+    def plot(self) -> "Figure":
+        """Draw `plans` with `advice`; returns a figure of Matplotlib, for its `savefig`."""
+        return plot_plans(self.plans(), self.advice)
+
+    def __repr__(self) -> str:
+        a, b = self.map_a.name, self.map_b.name
+        n = f"{np.count_nonzero(self.inlier)} of {len(self.inlier)} correspondences"
+        motion = f", T_a_b = {motion_text(self.T_a_b)}" if self.accepted else ""
+        return f"<MapAlignment of {a} and {b} by {self.aligner}: {self.status}{motion}, {n}>"
+
+    def _repr_html_(self) -> str:
+        return _html(self.advice, self.to_pandas())
+
+
+def motion_text(T: Float) -> str:
+    """Write a motion (3,) with its units."""
+    x, y, theta = (0.0 if abs(each) < 5e-5 else float(each) for each in T)  # no "-0.000"
+    return f"({x:.3f} m, {y:.3f} m, {theta:.4f} rad)"
+
+
+def sigma_text(covariance: Float, lower_bound: bool) -> str:
+    """Write the standard deviations of the distance and the angle of a motion."""
+    m, rad = motion_sigma(covariance)
+    bound = "≥ " if lower_bound else ""
+    return f"sigma {bound}{m:.3f} m, {bound}{rad:.4f} rad"
+
+
+def _html(text: str, table: "pd.DataFrame") -> str:
+    return f"<p>{html.escape(text)}</p>{table.to_html(max_rows=6, float_format='{:.3f}'.format)}"
+
+
+def best_alignment(found: Sequence[MapAlignment]) -> MapAlignment:
+    """Return the accepted alignment that chance explains least; else the nearest to acceptance."""
+    return min(found, key=lambda each: (_RANKS.index(each.status), _log10_chance(each)))
+
+
+def _log10_chance(found: MapAlignment) -> float:
+    log10 = found.registered.verdict.log10_false_alarms
+    return math.inf if math.isnan(log10) else log10
+
+
+def advice(found: Sequence[MapAlignment]) -> str:
+    """Say in a few sentences which motion to use, how sure it is, or why not and what to do.
+
+    Args:
+        found: alignments of the same two maps by different methods, at least one.
+    """
+    best, several = best_alignment(found), len(found) > 1
+    if not best.accepted:
+        tried = f"None of {len(found)} methods has an accepted motion. " if several else ""
+        return f"Use no T_a_b. {tried}{best.refusal}"
+    p_b = best.map_b.position_m[:, :2]
+    accepted = [each for each in found if each.accepted]
+    others = [e for e in accepted if rms_distance_m(best.T_a_b, e.T_a_b, p_b) >= DISTINCT_M]
+    if others:
+        listed = ", ".join(f"{motion_text(e.T_a_b)} of {e.aligner}" for e in [best, *others])
+        return (
+            f"Use no T_a_b without a check: accepted motions contradict each other: {listed}. "
+            "Merge with a third map that overlaps both, which can decide."
+        )
+    refined = best.registered.refined
+    text = f"Use T_a_b = {motion_text(best.T_a_b)} of {best.aligner}"
+    text += f", {sigma_text(refined.covariance, refined.lower_bound)}. It is accepted"
+    text += f": {np.count_nonzero(best.inlier)} of {len(best.inlier)} correspondences support it, "
+    text += f"chance gives as much once in {_times(-_log10_chance(best))} pairs of maps"
+    if several:
+        agree = "all" if len(accepted) == len(found) else f"{len(accepted)} of"
+        text += f", and {agree} {len(found)} methods agree"
+    text += "."
+    return f"{text} {_sentence(best.reason)}" if best.reason else text
+
+
+_RANKS = [Status.ACCEPTED, Status.AMBIGUOUS, Status.TOO_UNCERTAIN, Status.REFUSED]
+_RANKS += [Status.DEGENERATE, Status.FAILED, Status.ABSENT]
+
+
+def _times(log10: float) -> str:
+    return f"1e{log10:.0f}" if math.isfinite(log10) else "an unknown number of"
+
+
+def _sentence(text: str) -> str:
+    return text if text.endswith((".", "?")) else f"{text}."
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class MergedMaps:
+    """Maps that were aligned and merged.
+
+    Attributes:
+        maps: the M maps.
+        alignments: alignment of each pair of maps, by their numbers.
+        pairs: the same in the order of `fusion.edge_status`, with the alternatives of ambiguous
+            alignments.
+        fusion: fused maps.
+        aligner: name of the aligner.
+    """
+
+    maps: tuple[LandmarkMap, ...]
+    alignments: Mapping[tuple[int, int], MapAlignment]
+    pairs: Sequence[AlignedPair]
+    fusion: Fusion
+    aligner: str
+
+    @property
+    def any_merged(self) -> bool:
+        """True if two or more maps were merged."""
+        return len(self.fused.members) > 1
+
+    @property
+    def fused(self) -> FusedMap:
+        """Fused map of most maps; of the first map only if no two maps were merged."""
+        return self.fusion.fused[0]
+
+    @property
+    def landmarks(self) -> LandmarkMap:
+        """Landmarks of the fused map.
+
+        Raises:
+            InputError: no two maps were merged.
+        """
+        if not self.any_merged:
+            raise InputError(self.advice)
+        return self.fused.landmarks
+
+    def reasons(self) -> dict[tuple[int, int], str]:
+        """Return by pair of maps the reason why their alignment is not used; empty if it is."""
+        reasons: dict[tuple[int, int], str] = {}
+        for pair, place in zip(self.pairs, self.fusion.edge_status, strict=True):
+            reason = pair.alignment.reason or _TEAM_REASONS.get(place, "")
+            if place in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
+                reasons[pair.a, pair.b] = ""
+            else:
+                reasons.setdefault((pair.a, pair.b), reason)
+        return reasons
+
+    @property
+    def notes(self) -> dict[tuple[int, int], str]:
+        """Remarks on accepted alignments, by pair of maps."""
+        return {
+            pair: found.registered.verdict.reason
+            for pair, found in self.alignments.items()
+            if found.registered.verdict.accepted and found.registered.verdict.reason
+        }
+
+    @property
+    def note(self) -> str:
+        """Notes on the alignments that are used, in one line; empty if there is none."""
+        used, notes = [pair for pair, reason in self.reasons().items() if not reason], self.notes
+        told = [notes[pair] for pair in used if pair in notes]
+        if not told:
+            return ""
+        others = f" (and for {len(told) - 1} more pairs of maps)" if len(told) > 1 else ""
+        return f"{told[0]}{others}"
+
+    def is_lower_bound(self, fused: FusedMap) -> bool:
+        """Return True if the covariances of a fused map's motions are lower bounds.
+
+        They are if a used alignment is of a map that does not state all errors that its landmarks
+        share.
+        """
+        used = {pair for pair, reason in self.reasons().items() if not reason}
+        members = set(fused.members.tolist())
+        of_fused = (p for p in self.pairs if (p.a, p.b) in used and {p.a, p.b} <= members)
+        return any(pair.alignment.lower_bound for pair in of_fused)
+
+    @property
+    def advice(self) -> str:
+        """What was merged, how sure it is, and what to do about maps that were left out."""
+        if not self.any_merged:
+            (a, b), first = min(
+                self.alignments.items(), key=lambda each: _RANKS.index(each[1].status)
+            )
+            why = _sentence(self.reasons()[a, b]) if first.accepted else first.refusal
+            return f"No two maps were merged. {self.maps[a].name} and {self.maps[b].name}: {why}"
+        fused, names = self.fused, [self.maps[k].name for k in self.fused.members]
+        several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
+        largest = max(fused.motion_covariance[fused.members], key=lambda S: S[0, 0] + S[1, 1])
+        text = (
+            f"Merged {len(names)} of {len(self.maps)} maps ({', '.join(names)}): "
+            f"{len(fused.landmarks)} landmarks in the frame of {names[0]}, {several} of several "
+            f"maps. Largest {sigma_text(largest, self.is_lower_bound(fused))}."
+        )
+        if self.note:
+            text += f" {_sentence(self.note)}"
+        left = [f"{name} is left out: {_sentence(reason)}" for name, reason in fused.left_out]
+        return " ".join([text, *left])
+
+    def write(self, path: str | os.PathLike[str]) -> list[Path]:
+        """Write all fused maps or none, as `write_map` does, and return the paths.
+
+        The map of most robots is written to `path`, others beside it (see `numbered_path`). Nothing
+        is written if no maps were merged.
+
+        Raises:
+            OSError: a file cannot be written; existing files are then unchanged.
+        """
+        if not self.any_merged:
+            return []
+        fused = self.fusion.fused
+        paths = [numbered_path(Path(path), k) for k in range(1, len(fused) + 1)]
+        writes: dict[Path, Write] = {}
+        for place, each in zip(paths, fused, strict=True):
+            writes |= map_writes(place, each.landmarks)
+        write_together(writes)
+        return paths
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """Return the fused landmarks, and for each of the M maps the row of its landmark or -1.
+
+        Raises:
+            InputError: no two maps were merged.
+        """
+        table = self.landmarks.to_pandas()
+        for k in range(len(self.maps)):
+            table[f"row_in_map_{k + 1}"] = self.fused.parents[:, k]
+        return table
+
+    def plans(self) -> list[Plan]:
+        """Return the plans of the fused map and of the first pairs of maps.
+
+        Without a fused map they are those of the first pair, with its other motions.
+        """
+        if not self.any_merged:
+            return next(iter(self.alignments.values())).plans()
+        fused = self.fused
+        title = f"fused map, in the frame of {self.maps[fused.members[0]].name}"
+        plans = [fused_plan(title, fused.landmarks, fused.parents, self.maps)]
+        for (a, b), found in itertools.islice(self.alignments.items(), _MOST_PAIRS):
+            both = f"{found.map_a.name} and {found.map_b.name}"
+            T_a, T_b = fused.T_first_map[a], fused.T_first_map[b]
+            title = f"{both}:\n{str(found.status).replace('_', ' ')}"
+            if np.isnan(T_a).any() or np.isnan(T_b).any():
+                T_a, T_b = np.zeros(3), found.T_a_b
+                title = f"{title}, not merged"
+            plans.append(found.plan(title, T_a, T_b, found.inlier, (a, b)))
+        return plans
+
+    def plot(self) -> "Figure":
+        """Draw `plans` with `advice`; returns a figure of Matplotlib, for its `savefig`."""
+        return plot_plans(self.plans(), self.advice)
+
+    def __repr__(self) -> str:
+        if not self.any_merged:
+            return f"<MergedMaps: no two of {len(self.maps)} maps were merged>"
+        n, n_maps = len(self.fused.landmarks), len(self.fused.members)
+        return f"<MergedMaps: {n} landmarks of {n_maps} of {len(self.maps)} maps, {self.aligner}>"
+
+    def _repr_html_(self) -> str:
+        if not self.any_merged:
+            return f"<p>{html.escape(self.advice)}</p>"
+        return _html(self.advice, self.to_pandas())
+
+
+def numbered_path(path: Path, k: int) -> Path:
+    """Return the path of the k-th fused map: `path` for k = 1, then `.2` and so on."""
+    return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
+
+
+def load_map(given: "MapLike", name: str = "map") -> LandmarkMap:
+    """Return a map given as such, by path or as a table, which is then named `name`.
+
+    Raises:
+        InputError: a file or a table is not as documented, or descriptors are no unit vectors.
+    """
+    if isinstance(given, LandmarkMap):
+        landmarks, place = given, given.name
+    elif isinstance(given, str | os.PathLike):
+        landmarks, place = read_map(Path(given)), os.fspath(given)
+    else:
+        landmarks, place = LandmarkMap.from_pandas(given, name), name
+    if why := why_not_unit_vectors(landmarks):
+        raise InputError(f"{place}: {why}")
+    return landmarks
+
+
+def _registration(aligner: "str | Method | Aligner | Registration") -> Registration:
+    if isinstance(aligner, Registration):
+        return aligner
+    return Registration(make_aligner(aligner) if isinstance(aligner, str) else aligner)
+
+
+def _name_of(aligner: Any) -> str:
+    return aligner if isinstance(aligner, str) else type(_registration(aligner).method).__name__
+
+
+def align_maps(
+    map_a: "MapLike",
+    map_b: "MapLike",
+    *,
+    aligner: "str | Method | Aligner | Registration" = "ransac",
+    name: str = "",
+    matching: MatchParameters | Correspondences = MatchParameters(),  # noqa: B008  # frozen
+    evidence: PairEvidence | None = None,
+    rng: np.random.Generator | int = 0,
+) -> MapAlignment:
+    """Align two maps: match their landmarks, estimate T_a_b, refine and verify it.
+
+    Args:
+        map_a: map in frame a.
+        map_b: map in frame b.
+        aligner: name of a built-in method, a method, or a `Registration` with settings of the
+            refinement and the verdict.
+        name: name of the aligner in the result; empty: that of its class.
+        matching: parameters of the matching, or the correspondences if they are known.
+        evidence: evidence found earlier for these maps; None to compute it.
+        rng: generator, or its seed.
+
+    Raises:
+        InputError: a map cannot be read.
+        ValueError: the aligner is unknown.
+    """
+    a, b = load_map(map_a, "a"), load_map(map_b, "b")
+    registration = _registration(aligner)
+    pairs = matching if isinstance(matching, Correspondences) else match(a, b, matching)
+    ready = registration.on(a, b, pairs, evidence)
+    done = ready.register(np.random.default_rng(rng))
+    return MapAlignment(a, b, pairs, name or _name_of(aligner), done, registration, ready.verifier)
+
+
+def merge_maps(
+    maps: "Sequence[MapLike]",
+    *,
+    aligner: "str | Method | Aligner | Registration" = "ransac",
+    name: str = "",
+    matching: MatchParameters = MatchParameters(),  # noqa: B008  # frozen
+    fuser: str | Fuser = USUAL,
+    parameters: MergeParameters = MergeParameters(),  # noqa: B008  # frozen
+    rng: "int | Callable[[LandmarkMap, LandmarkMap], np.random.Generator]" = 0,
+) -> MergedMaps:
+    """Align all pairs of maps, and fuse the maps that accepted alignments connect.
+
+    The maps of a pair are in the order of their names. Other arguments are those of `align_maps`.
+
+    Args:
+        maps: M maps, at least two.
+        aligner: method that aligns each pair.
+        name: name of the aligner in the result.
+        matching: parameters of the matching.
+        fuser: name of a fuser, or a fuser.
+        parameters: parameters of the merge.
+        rng: seed of the generator of each pair, or a function that returns this generator.
+
+    Raises:
+        InputError: there are fewer than two maps, or a map cannot be read.
+        ValueError: the aligner or the fuser is unknown.
+    """
+    if len(maps) < 2:
+        raise InputError("merge: give two maps or more")
+    loaded = tuple(load_map(each, f"map {k}") for k, each in enumerate(maps, start=1))
+    places = [os.fspath(each) if isinstance(each, str | os.PathLike) else "" for each in maps]
+    order = sorted(range(len(maps)), key=lambda k: (name_order(loaded[k].name), places[k]))
+    alignments, pairs = dict[tuple[int, int], MapAlignment](), list[AlignedPair]()
+    for a, b in itertools.combinations(order, 2):
+        found = align_maps(
+            loaded[a],
+            loaded[b],
+            aligner=_registration(aligner),
+            name=name or _name_of(aligner),
+            matching=matching,
+            rng=rng(loaded[a], loaded[b]) if callable(rng) else rng,
+        )
+        alignments[a, b] = found
+        offered, chance = found.correspondences, found.registered.verdict.log10_false_alarms
+        pairs.append(AlignedPair(a, b, found.alignment, offered, chance))
+        if found.status is Status.AMBIGUOUS and found.verifier is not None:
+            rivals = found.verifier.rivals_of(found.registered.refined)
+            pairs += [AlignedPair(a, b, rival, offered, chance) for rival in rivals]
+    by = make_fuser(fuser) if isinstance(fuser, str) else fuser
+    fusion = merge(loaded, pairs, parameters, by)
+    return MergedMaps(loaded, alignments, pairs, fusion, name or _name_of(aligner))

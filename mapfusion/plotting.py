@@ -1,0 +1,283 @@
+"""Plans of aligned and of fused maps: what they show, and their drawing with Matplotlib.
+
+A `Plan` holds what is drawn, so that other drawing packages show the same. Matplotlib is imported
+only to draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.se2 import transform_covariances, transform_points
+from mapfusion.landmark_map import LandmarkMap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+# Okabe and Ito (2008): distinct for readers with any common colour blindness. Their yellow is left
+# out: it is too pale for lines on white.
+BLUE, VERMILLION, GREEN = "#0072B2", "#D55E00", "#009E73"
+PURPLE, ORANGE, SKY = "#CC79A7", "#E69F00", "#56B4E9"
+ROBOT_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+FUSED_COLOUR = "#000000"
+ACCEPTED_COLOUR, REJECTED_COLOUR = GREEN, "#7F7F7F"
+
+LEVEL_TEXT = "95 %"
+_LEVEL, _PLANE_DIMENSIONS = 0.95, 2
+ELLIPSE_BOUND = chi_square_bound(_LEVEL, _PLANE_DIMENSIONS)  # squared Mahalanobis distance
+_OUTLIER_SHARE = 0.005  # on each side: a distant outlier must not shrink the map
+_MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
+_ELLIPSE_SHARE = 1 / 60  # of the view, for the semi-axis of a typical ellipse
+_GAP = 0.15  # between maps that are not aligned, as a share of the width of the first
+_MARKERS = ("o", "^", "v", "x", "d", "*")
+_PAGE_WIDTH_IN, _SMALL_ROW_IN, _TEXT_IN, _LABELS_IN = 8.0, 2.8, 1.3, 0.6
+_LARGEST_RATIO, _LEAST_RATIO = 1.3, 0.35  # of height to width of the large plan
+_SMALL_PER_ROW = 3
+_WRAP = 105  # characters of a line of the heading
+_RC: dict[str, Any] = {
+    "font.family": "DejaVu Sans",  # part of Matplotlib: the same on every machine
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.alpha": 0.35,
+    "grid.linewidth": 0.4,
+    "figure.constrained_layout.use": True,
+}
+
+
+class Part(NamedTuple):
+    """Landmarks that are drawn alike.
+
+    Attributes:
+        name: text of the legend.
+        colour: colour of points and ellipses.
+        marker: Matplotlib's marker.
+        position_m: positions (N, 2) in the frame of the plan.
+        covariance_m2: covariances (N, 2, 2) in this frame.
+    """
+
+    name: str
+    colour: str
+    marker: str
+    position_m: Float
+    covariance_m2: Float
+
+
+class Plan(NamedTuple):
+    """Plan of maps in one frame, with the correspondences between them.
+
+    Attributes:
+        title: title of the plan.
+        parts: landmarks.
+        accepted: ends (n, 2, 2) of the correspondences that support the motion.
+        rejected: ends (n, 2, 2) of the other ones.
+    """
+
+    title: str
+    parts: tuple[Part, ...]
+    accepted: Float
+    rejected: Float
+
+
+def part_of(
+    landmarks: LandmarkMap, T: Float, place: int, name: str, rows: np.ndarray | slice = slice(None)
+) -> Part:
+    """Return landmarks of a map, moved by T (3,), in the style of the map with this number."""
+    moved = transform_points(T, landmarks.position_m[rows, :2])
+    covariance = transform_covariances(T, landmarks.covariance_m2[rows])[:, :2, :2]
+    k = place % len(ROBOT_COLOURS)
+    return Part(name, ROBOT_COLOURS[k], _MARKERS[k], moved, covariance)
+
+
+def pair_plan(
+    title: str,
+    maps: tuple[LandmarkMap, LandmarkMap],
+    motions: tuple[Float, Float],
+    index: tuple[np.ndarray, np.ndarray],
+    inlier: np.ndarray,
+    places: tuple[int, int] = (0, 1),
+) -> Plan:
+    """Return the plan of two maps and their correspondences.
+
+    Args:
+        title: title of the plan.
+        maps: both maps.
+        motions: pose (3,) of each map in the frame of the plan; a pose with NaN places the map
+            beside the other one, in its own frame.
+        index: rows of the N correspondences in each map.
+        inlier: correspondences that support the motion, bool (N,).
+        places: number of each map, which gives its colour.
+    """
+    T_a, T_b = motions
+    if np.isnan(T_b).any():
+        x_a, x_b = (each.position_m[:, 0] for each in maps)
+        gap = _GAP * np.ptp(x_a) if len(x_a) else 1.0
+        T_b = np.array([x_a.max(initial=0.0) + gap - x_b.min(initial=0.0), 0.0, 0.0])
+    moved = zip(maps, (T_a, T_b), places, strict=True)
+    parts = tuple(
+        part_of(each, T, k, f"{each.name}: {len(each)} landmarks") for each, T, k in moved
+    )
+    ends = np.stack([part.position_m[rows] for part, rows in zip(parts, index, strict=True)], 1)
+    return Plan(title, parts, ends[inlier], ends[~inlier])
+
+
+def fused_plan(
+    title: str, landmarks: LandmarkMap, parents: np.ndarray, maps: Sequence[LandmarkMap]
+) -> Plan:
+    """Return the plan of a fused map: landmarks of one map alone, and of several.
+
+    Args:
+        title: title of the plan.
+        landmarks: the N fused landmarks.
+        parents: row of each landmark in each map, shape (N, M); negative for none.
+        maps: the M maps.
+    """
+    several, frame = (parents >= 0).sum(axis=1) > 1, np.zeros(3)
+    parts = []
+    for k, each in enumerate(maps):
+        rows = np.flatnonzero((parents[:, k] >= 0) & ~several)
+        if len(rows):
+            parts.append(part_of(landmarks, frame, k, f"of {each.name} alone: {len(rows)}", rows))
+    rows = np.flatnonzero(several)
+    common = part_of(landmarks, frame, 0, f"fused from several maps: {len(rows)}", rows)
+    parts.append(common._replace(colour=FUSED_COLOUR, marker="s"))
+    none = np.zeros((0, 2, 2))
+    return Plan(title, tuple(parts), none, none)
+
+
+def bounds(plan: Plan) -> tuple[Float, Float]:
+    """Return the lowest and highest coordinates (2,) of a view without outliers."""
+    points = [part.position_m for part in plan.parts if len(part.position_m)]
+    if not points:
+        return -np.ones(2), np.ones(2)
+    ends = np.concatenate(
+        [np.quantile(each, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=0) for each in points]
+    )
+    low, high = ends.min(axis=0), ends.max(axis=0)
+    margin = max(_MARGIN * float((high - low).max()), _MIN_MARGIN_M)
+    return low - margin, high + margin
+
+
+_MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
+
+
+def largest_magnification(size_m: float, limit_m: float) -> int:
+    """Return the largest round factor at which a size stays within a limit."""
+    return max((m for m in _MAGNIFICATIONS if m * size_m <= limit_m), default=1)
+
+
+def magnification(plan: Plan) -> int:
+    """Return the factor at which most ellipses of a plan are legible and do not cover others."""
+    (low, high), parts = bounds(plan), [part.covariance_m2 for part in plan.parts]
+    sizes_m = np.concatenate([semi_axes(covariance)[0] for covariance in parts])
+    typical_m = float(np.median(sizes_m)) if len(sizes_m) else 0.0
+    return largest_magnification(typical_m, _ELLIPSE_SHARE * float((high - low).max()))
+
+
+def ellipses_text(factor: int) -> str:
+    """Return the legend of ellipses that are drawn enlarged by a factor."""
+    return f"{LEVEL_TEXT} ellipses, {f'{factor} x enlarged' if factor > 1 else 'to scale'}"
+
+
+def plot_plans(plans: Sequence[Plan], heading: str) -> Figure:
+    """Draw plans: the first one large, the others in rows below it; the heading is above."""
+    import textwrap
+
+    import matplotlib.style
+    from matplotlib.figure import Figure
+
+    with matplotlib.style.context(["default", _RC]):
+        first, *others = plans
+        low, high = bounds(first)
+        ratio = np.clip((high - low)[1] / (high - low)[0], _LEAST_RATIO, _LARGEST_RATIO)
+        n_rows = -(-len(others) // _SMALL_PER_ROW)
+        lines = textwrap.wrap(heading, _WRAP)
+        heights = [ratio * (_PAGE_WIDTH_IN - _LABELS_IN), *[_SMALL_ROW_IN] * n_rows]
+        figure = Figure(figsize=(_PAGE_WIDTH_IN, sum(heights) + _TEXT_IN))
+        figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8.5)
+        n_columns = max(min(len(others), _SMALL_PER_ROW), 1)
+        grid = figure.add_gridspec(n_rows + 1, n_columns, height_ratios=heights)
+        axes = figure.add_subplot(grid[0, :])
+        factor = magnification(first)
+        _draw(axes, first, 1.0, factor)
+        handles = [*axes.get_legend_handles_labels()[0], ellipse_handle(FUSED_COLOUR, factor)]
+        figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+        for k, plan in enumerate(others):
+            place = grid[1 + k // _SMALL_PER_ROW, k % _SMALL_PER_ROW]
+            _draw(figure.add_subplot(place), plan, 0.6, factor)
+    return figure
+
+
+def _draw(axes: Axes, plan: Plan, scale: float, factor: int) -> None:
+    """Draw one plan; `scale` shrinks its markers and lines, `factor` enlarges its ellipses."""
+    from matplotlib.collections import LineCollection
+
+    for ends, name, colour, width, style in (
+        (plan.rejected, "rejected", REJECTED_COLOUR, 0.4, "dotted"),
+        (plan.accepted, "accepted", ACCEPTED_COLOUR, 1.2, "solid"),
+    ):
+        if len(ends):
+            label = f"{name} correspondences: {len(ends)}"
+            look: dict[str, Any] = {"colors": colour, "linewidths": width * scale}
+            look |= {"linestyles": style, "label": label, "zorder": 2}
+            axes.add_collection(LineCollection(list(ends), **look), autolim=False)
+    if len(plan.accepted):  # ends that coincide have no visible line
+        ring: dict[str, Any] = {"marker": "o", "markersize": 10 * scale, "linestyle": "none"}
+        ring |= {"markerfacecolor": "none", "markeredgewidth": scale, "color": ACCEPTED_COLOUR}
+        axes.plot(*plan.accepted.mean(axis=1).T, **ring, zorder=2)
+    for part in plan.parts:
+        look = {"edgecolors": part.colour, "linewidths": 0.6 * scale, "alpha": 0.7, "zorder": 3}
+        add_ellipses(axes, part.position_m, factor**2 * part.covariance_m2, **look)
+        look = {"marker": part.marker, "markersize": 4.0 * scale, "linestyle": "none"}
+        look |= {"markerfacecolor": "none" if part.marker != "x" else part.colour, "zorder": 4}
+        look |= {"color": part.colour, "markeredgewidth": 0.8 * scale, "label": part.name}
+        axes.plot(*part.position_m.T, **look)
+    (x0, y0), (x1, y1) = bounds(plan)
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    axes.set_title(plan.title)
+
+
+def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float, Float]:
+    """Compute the error ellipses that contain a share `level` of a normal distribution.
+
+    The squared Mahalanobis distance of a normal point is chi-square with two degrees of freedom, so
+    the semi-axes are sqrt(eigenvalue * quantile), along the eigenvectors.
+
+    Args:
+        covariance_m2: covariances, shape (N, 2 or more, 2 or more).
+        level: probability of the ellipses.
+
+    Returns:
+        Semi-major axes (N,) and semi-minor axes (N,) in metres; direction of the major axis (N,)
+        in rad.
+    """
+    values, vectors = np.linalg.eigh(covariance_m2[:, :2, :2])
+    lengths = np.sqrt(np.maximum(values, 0.0) * chi_square_bound(level, _PLANE_DIMENSIONS))
+    direction = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    return lengths[:, 1], lengths[:, 0], direction
+
+
+def add_ellipses(axes: Axes, position_m: Float, covariance_m2: Float, **style: Any) -> None:
+    """Draw 95 % ellipses to scale, from positions (N, 2 or 3) and covariances."""
+    from matplotlib.collections import EllipseCollection
+
+    major, minor, direction = semi_axes(covariance_m2)
+    place = {"units": "xy", "offsets": position_m[:, :2], "offset_transform": axes.transData}
+    sizes = (2 * major, 2 * minor, np.degrees(direction))
+    collection = EllipseCollection(*sizes, facecolors="none", **place, **style)
+    axes.add_collection(collection, autolim=False)
+
+
+def ellipse_handle(colour: str, factor: int = 1) -> Line2D:
+    """Return the legend entry of the ellipses, with their level."""
+    from matplotlib.lines import Line2D
+
+    style = {"marker": "o", "markerfacecolor": "none", "markersize": 7, "linestyle": "none"}
+    return Line2D([], [], color=colour, label=ellipses_text(factor), **style)

@@ -1,0 +1,276 @@
+"""Alignment and merge of maps in one call, what the results say, and what is drawn of them."""
+
+import io
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.collections import EllipseCollection
+from PIL import Image
+
+import mapfusion
+from mapfusion.align.alignment import Status
+from mapfusion.geometry import se2
+from mapfusion.landmark_map import LandmarkMap, write_map
+from mapfusion.map_merging import MapAlignment, advice, best_alignment
+from mapfusion.plotting import ELLIPSE_BOUND, bounds, largest_magnification
+from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
+
+T_A_B = np.array([3.0, -1.0, 0.5])
+
+
+def two_maps(n_common: int = 40, seed: int = 0) -> tuple[LandmarkMap, LandmarkMap]:
+    """Maps with 20 landmarks of their own each, and common ones; b has its own frame."""
+    rng = np.random.default_rng(seed)
+    n = n_common + 40
+    p, look = rng.uniform(0, 20, (n, 3)) * [1, 1, 0], unit_vectors(rng, n)
+    rows = np.arange(n_common + 20), np.r_[np.arange(n_common), np.arange(n_common + 20, n)]
+    made = []
+    for name, own, T in zip(("north", "south"), rows, (np.zeros(3), T_A_B), strict=True):
+        seen = se2.transform_points(se2.inverse(T), p[own])
+        seen[:, :2] += rng.normal(0, 0.02, (len(own), 2))
+        made.append(landmarks(seen, 0.02, look[own], planar=True, name=name))
+    return made[0], made[1]
+
+
+@pytest.fixture(scope="module")
+def found() -> MapAlignment:
+    return mapfusion.align_maps(*two_maps())
+
+
+def test_one_call_is_all_steps_one_by_one(found: MapAlignment) -> None:
+    a, b = two_maps()
+    pairs = mapfusion.match(a, b)
+    registration = mapfusion.Registration(mapfusion.make_aligner("ransac"))
+    done = registration.register(a, b, pairs, np.random.default_rng(0))
+    np.testing.assert_array_equal(found.T_a_b, done.refined.T_a_b)
+    np.testing.assert_array_equal(found.covariance, done.refined.covariance)
+    assert found.accepted
+    np.testing.assert_allclose(found.T_a_b, T_A_B, atol=0.03)
+    off = found.to_pandas()
+    assert off["inlier"].sum() >= 35
+    moved = se2.transform_points(found.T_a_b, b.position_m[off["landmark_b"], :2])
+    apart = np.hypot(*(a.position_m[off["landmark_a"], :2] - moved).T)
+    np.testing.assert_allclose(off["residual_m"], apart, atol=1e-12)
+
+
+def test_files_tables_and_maps_give_the_same(tmp_path: Path) -> None:
+    a, b = two_maps()
+    paths = [tmp_path / "north.parquet", tmp_path / "south.ply"]
+    for path, own in zip(paths, (a, b), strict=True):
+        write_map(path, own)
+    of_maps = mapfusion.merge_maps([a, b]).to_pandas()
+    for given in (paths, [str(path) for path in paths], [a.to_pandas(), b.to_pandas()]):
+        other = mapfusion.merge_maps(given).to_pandas()
+        pd.testing.assert_frame_equal(
+            of_maps.drop(columns="descriptor"), other.drop(columns="descriptor")
+        )
+
+
+def test_tables_become_maps_and_maps_tables() -> None:
+    a, _ = two_maps()
+    again = LandmarkMap.from_pandas(a.to_pandas(), "again")
+    np.testing.assert_array_equal(again.position_m, a.position_m)
+    np.testing.assert_array_equal(again.descriptor, a.descriptor)  # type: ignore[arg-type]
+    assert (again.planar, again.name) == (True, "again")
+    with pytest.raises(mapfusion.InputError, match=r"^a: has no column cov_xx_m2"):
+        mapfusion.align_maps(a.to_pandas().drop(columns="cov_xx_m2"), a)
+    long = a.to_pandas()
+    long["descriptor"] = [8 * each for each in long["descriptor"]]
+    with pytest.raises(mapfusion.InputError, match=r"^map 2: descriptor: row 0 has norm 8"):
+        mapfusion.merge_maps([a, long])
+
+
+def test_results_are_described_in_a_line(found: MapAlignment) -> None:
+    merged = mapfusion.merge_maps(two_maps())
+    for result in (found, merged, found.map_a):
+        assert len(repr(result)) < 160
+        assert "\n" not in repr(result)
+    assert "60 landmarks in the plane, with descriptors" in repr(found.map_a)
+    assert "<MapAlignment of north and south by ransac: accepted, T_a_b = (" in repr(found)
+    assert "landmarks of 2 of 2 maps, ransac>" in repr(merged)
+    for result in (found, merged):
+        page = result._repr_html_()
+        assert page.startswith("<p>")
+        assert page.count("<table") == 1
+    hostile = replace(found, map_a=replace(found.map_a, name="<b>&"), aligner="<i>")
+    assert "<i>" not in hostile._repr_html_()
+    assert "&lt;i&gt;" in hostile._repr_html_()
+
+
+def test_the_advice_says_what_to_use_and_how_sure_it_is(found: MapAlignment) -> None:
+    x, y, theta = found.T_a_b
+    sigma_m, sigma_rad = se2.motion_sigma(found.covariance)
+    said = found.advice
+    assert f"Use T_a_b = ({x:.3f} m, {y:.3f} m, {theta:.4f} rad) of ransac" in said
+    assert f"sigma ≥ {sigma_m:.3f} m, ≥ {sigma_rad:.4f} rad" in said
+    assert f"{found.inlier.sum()} of {len(found.inlier)} correspondences" in said
+    again = replace(found, aligner="other")
+    assert "all 2 methods agree" in advice([found, again])
+    away = replace(found.registered.refined, T_a_b=found.T_a_b + np.array([2.0, 0.0, 0.0]))
+    other = replace(again, registered=found.registered._replace(refined=away))
+    said = advice([found, other])
+    assert said.startswith("Use no T_a_b without a check: accepted motions contradict each other")
+    assert "of other" in said
+
+
+def with_status(found: MapAlignment, status: Status, reason: str) -> MapAlignment:
+    verdict = replace(found.registered.verdict, status=status, reason=reason)
+    return replace(found, registered=found.registered._replace(verdict=verdict))
+
+
+def test_the_advice_says_why_not_and_what_to_do(found: MapAlignment) -> None:
+    for status, remedy in (
+        (Status.REFUSED, "cannot be aligned"),
+        (Status.AMBIGUOUS, "third map"),
+        (Status.TOO_UNCERTAIN, "farther apart"),
+        (Status.DEGENERATE, "cannot be aligned"),
+    ):
+        one = with_status(found, status, "it is so")
+        assert one.advice.startswith("Use no T_a_b. ransac: ")
+        assert "it is so. " in one.advice
+        assert remedy in one.advice
+        assert one.advice.count("it is so") == 1
+        assert advice([one, one]).startswith("Use no T_a_b. None of 2 methods")
+        assert best_alignment([one, found]) is found
+        assert "1 of 2 methods agree" in advice([one, found])
+    rng = np.random.default_rng(0)
+    p, look = rng.uniform(-6, 6, (60, 3)) * [1, 1, 0.1], unit_vectors(rng, 60)
+    image = se2.transform_points(T_A_B, p) * [1, -1, 1]
+    pair = (landmarks(p, 0.02, look, name="north"), landmarks(image, 0.02, look, name="south"))
+    told = mapfusion.align_maps(*pair).advice
+    assert "north and south look like mirror images of each other" in told
+    assert told.count("mirror") == 1
+
+
+def test_a_merge_of_nothing_has_no_landmarks(tmp_path: Path) -> None:
+    a, _ = two_maps()
+    _, other = two_maps(seed=1)
+    merged = mapfusion.merge_maps([a, other])
+    assert not merged.any_merged
+    assert merged.advice.startswith("No two maps were merged. north and south: ransac: refused: ")
+    with pytest.raises(mapfusion.InputError, match="No two maps were merged"):
+        _ = merged.landmarks
+    assert merged.write(tmp_path / "f.csv") == []
+    assert list(tmp_path.iterdir()) == []
+    assert merged.plot().get_suptitle().replace("\n", " ") == merged.advice
+
+
+def test_maps_that_are_left_out_are_named(tmp_path: Path) -> None:
+    (a, b), (_, other) = two_maps(), two_maps(seed=1)
+    merged = mapfusion.merge_maps([a, b, replace(other, name="west")])
+    assert merged.advice.startswith("Merged 2 of 3 maps (north, south): ")
+    assert "west is left out: " in merged.advice
+    table = merged.to_pandas()
+    assert (table["row_in_map_3"] == -1).all()
+    n_common = ((table["row_in_map_1"] >= 0) & (table["row_in_map_2"] >= 0)).sum()
+    assert (
+        f"{len(table)} landmarks in the frame of north, {n_common} of several maps" in merged.advice
+    )
+    for name in ("f.csv", "f.ply", "f.parquet"):
+        (path,) = merged.write(str(tmp_path / name))
+        np.testing.assert_array_equal(
+            mapfusion.read_map(path).position_m, merged.landmarks.position_m
+        )
+
+
+def ambiguous_maps() -> tuple[LandmarkMap, LandmarkMap]:
+    """A map of one place, and a map in which this place occurs twice, 9 m apart."""
+    rng = np.random.default_rng(0)
+    p, look = rng.uniform(0, 3, (40, 3)) * [1, 1, 0], unit_vectors(rng, 40)
+
+    def noisy(values: np.ndarray) -> np.ndarray:
+        moved = values + rng.normal(0, 0.01, values.shape)
+        return (moved / np.linalg.norm(moved, axis=1, keepdims=True)).astype(np.float32)
+
+    both = np.concatenate([p, p + np.array([9, 2, 0])])
+    twice = landmarks(both, 0.02, noisy(np.tile(look, (2, 1))), planar=True, name="twice")
+    return twice, landmarks(p, 0.02, noisy(look), planar=True, name="once")
+
+
+def test_rivals_are_the_motions_that_were_made() -> None:
+    found = mapfusion.align_maps(*ambiguous_maps())
+    assert found.status is Status.AMBIGUOUS
+    motions = [found.T_a_b, *(each.T_a_b for each in found.other_motions)]
+    assert len(motions) == 2
+    by_x = sorted(motions, key=lambda T: T[0])
+    np.testing.assert_allclose(by_x, [[0, 0, 0], [9, 2, 0]], atol=0.05)
+    n_pairs = sum(each.inlier.sum() for each in found.other_motions) + found.inlier.sum()
+    assert n_pairs <= len(found.inlier)  # a correspondence supports one of them
+    plans = found.plans()
+    assert len(plans) == 2
+    assert "another motion: (" in plans[1].title
+
+
+def test_a_plan_shows_each_landmark_and_correspondence_once(found: MapAlignment) -> None:
+    (plan, *_) = found.plans()
+    a, b = plan.parts
+    np.testing.assert_array_equal(a.position_m, found.map_a.position_m[:, :2])
+    moved = se2.transform_points(found.T_a_b, found.map_b.position_m[:, :2])
+    np.testing.assert_allclose(b.position_m, moved)
+    np.testing.assert_allclose(b.covariance_m2, found.map_b.covariance_m2[:, :2, :2], atol=1e-12)
+    assert len(plan.accepted) == found.inlier.sum()
+    assert len(plan.accepted) + len(plan.rejected) == len(found.inlier)
+    apart = np.hypot(*np.diff(plan.accepted, axis=1)[:, 0].T)
+    np.testing.assert_allclose(apart, found.to_pandas().query("inlier")["residual_m"])
+    low, high = bounds(plan)
+    inside = ((a.position_m >= low) & (a.position_m <= high)).all(axis=1)
+    assert inside.mean() > 0.95
+
+
+def test_the_plan_of_a_fused_map_counts_as_its_table() -> None:
+    merged = mapfusion.merge_maps(two_maps())
+    first, *pairs = merged.plans()
+    table = merged.to_pandas()
+    several = (table["row_in_map_1"] >= 0) & (table["row_in_map_2"] >= 0)
+    assert [len(part.position_m) for part in first.parts] == [
+        (~several & (table["row_in_map_1"] >= 0)).sum(),
+        (~several & (table["row_in_map_2"] >= 0)).sum(),
+        several.sum(),
+    ]
+    assert len(pairs) == 1
+
+
+def test_maps_without_a_motion_are_drawn_side_by_side(found: MapAlignment) -> None:
+    nothing = found.registered.refined
+    nothing = replace(nothing, T_a_b=np.full(3, np.nan), inlier=np.zeros(len(found.inlier), bool))
+    apart = replace(found, registered=found.registered._replace(refined=nothing))
+    a, b = apart.plans()[0].parts
+    assert a.position_m[:, 0].max() < b.position_m[:, 0].min()
+
+
+def test_pictures_are_the_same_each_time(found: MapAlignment) -> None:
+    pictures = []
+    for _ in range(2):
+        file = io.BytesIO()
+        found.plot().savefig(file, format="png", dpi=60)
+        pictures.append(file.getvalue())
+    assert pictures[0] == pictures[1]
+    image = np.asarray(Image.open(io.BytesIO(pictures[0])).convert("RGB")).reshape(-1, 3)
+    for colour in ((0, 114, 178), (213, 94, 0), (0, 158, 115)):  # both maps, accepted
+        assert (np.abs(image - np.array(colour)).max(axis=1) < 40).sum() > 15
+
+
+def test_the_legend_tells_the_enlargement_of_the_ellipses(found: MapAlignment) -> None:
+    figure = found.plot()
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    (label,) = [text for text in texts if "ellipses" in text]
+    factor = int(label.split(", ")[1].split()[0])
+    (collection, *_) = [c for c in figure.axes[0].collections if isinstance(c, EllipseCollection)]
+    own = 2 * np.sqrt(ELLIPSE_BOUND) * 0.02  # full axis of an isotropic covariance
+    np.testing.assert_allclose(np.asarray(collection.get_widths(), float), factor * own, rtol=1e-9)
+    assert largest_magnification(1.0, 12.0) == 10
+    assert largest_magnification(5.0, 1.0) == 1
+
+
+def test_matplotlib_and_pandas_are_imported_only_to_draw_and_convert() -> None:
+    code = (
+        "import sys, mapfusion; mapfusion.align_maps, mapfusion.merge_maps\n"
+        "print([m for m in ('matplotlib', 'pandas', 'plotly') if m in sys.modules])"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == "[]"
