@@ -9,6 +9,7 @@ precision, and the effect of the shared variables in single precision.
 """
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,6 +46,7 @@ from mapfusion.tables import (
     APPEARANCE_FIELDS,
     DESCRIPTOR_LENGTH,
     HEIGHT,
+    NO_LABEL,
     appearance_columns,
     appearance_from,
     csv_bytes,
@@ -136,6 +138,12 @@ def read_joint(map_path: Path, covariance_m2: Float) -> JointCovariance | None:
     return joint
 
 
+ATTRIBUTE_FIELDS = [
+    described(pa.field("size_m", pa.float64()), "size of the landmark, empty for none", np.nan),
+    described(
+        pa.field("category", pa.int32()), "class of the landmark, -1 for none", NO_LABEL
+    ),
+]
 LANDMARKS = schema(
     "landmark_map",
     1,
@@ -147,6 +155,7 @@ LANDMARKS = schema(
             "row of the log that created the landmark, -1 for none",
             -1,
         ),
+        *ATTRIBUTE_FIELDS,
         *APPEARANCE_FIELDS,
     ],
 )
@@ -163,6 +172,8 @@ class LandmarkMap:
         source_observation: (N,) int64 row in the robot's log of the observation that created it.
         descriptor: (N, 64) float32, or None.
         label: (N,) int32, or None.
+        size_m: (N,) size of each landmark, such as a diameter, NaN for none; or None.
+        category: (N,) int32 class of each landmark, -1 for none; or None.
         planar: z is 0 and carries no information (2 degrees of freedom).
         name: name of the map.
         joint: joint covariance of the landmarks' errors, or None. Its marginals are covariance_m2,
@@ -183,6 +194,8 @@ class LandmarkMap:
     joint: JointCovariance | None = None
     viewing: Viewing | None = None
     calibration: CalibrationError = EXACT
+    size_m: Float | None = None
+    category: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -194,8 +207,9 @@ class LandmarkMap:
         require_finite("covariance_m2", self.covariance_m2)
         if self.descriptor is not None:
             require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
-        if self.label is not None:
-            require_shape("label", self.label, (n,))
+        for name in ("label", "size_m", "category"):
+            if getattr(self, name) is not None:
+                require_shape(name, getattr(self, name), (n,))
         if self.joint is not None and len(self.joint) != n:
             raise ValueError(f"joint: of {len(self.joint)} landmarks, the map has {n}")
         if self.viewing is not None and len(self.viewing) != n:
@@ -237,6 +251,8 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
         "source_observation": landmarks.source_observation.astype(np.int64),
         **appearance_columns(len(landmarks), landmarks.descriptor, landmarks.label),
     }
+    attributes_held = {"size_m": landmarks.size_m, "category": landmarks.category}
+    columns |= {name: values for name, values in attributes_held.items() if values is not None}
     if is_csv(path):
         parts = {
             "joint covariance": landmarks.joint is not None,
@@ -255,10 +271,16 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
     attributes = {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
     attributes |= landmarks.calibration.attributes()
     return {
-        path: table_write(columns, LANDMARKS, attributes),
+        path: table_write(columns, _schema_of(columns), attributes),
         **joint_writes(path, landmarks.joint, landmarks.covariance_m2),
         **viewing_writes(path, landmarks.viewing),
     }
+
+
+def _schema_of(columns: Mapping[str, np.ndarray]) -> pa.Schema:
+    """Return the schema of a map with these columns; attributes that it lacks are left out."""
+    kept = [field for field in LANDMARKS if field.name in columns]
+    return pa.schema(kept, metadata=LANDMARKS.metadata)
 
 
 def read_map(path: Path, alone: bool = False) -> LandmarkMap:
@@ -278,6 +300,11 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
     of_log = "give -1 for none, or a row of the log: 0 and more"
     require_cells(path, table, ["source_observation"], lambda row: row >= -1, of_log)
     require_appearance(path, table)
+    known_size = "a size is positive, or empty for none"
+    require_cells(path, table, ["size_m"], lambda size: ~(size <= 0) & ~np.isinf(size), known_size)
+    known_category = f"categories are {NO_LABEL} for none, or 0 and more"
+    require_cells(path, table, ["category"], lambda each: each >= NO_LABEL, known_category)
+    size_m, category = column(table, "size_m"), column(table, "category")
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
     try:
@@ -290,6 +317,8 @@ def read_map(path: Path, alone: bool = False) -> LandmarkMap:
             planar,
             attributes.get("name", name_in_text(path.stem)),
             calibration=calibration_from(attributes, path),
+            size_m=None if np.isnan(size_m).all() else size_m,
+            category=None if np.all(category == NO_LABEL) else category,
         )
         require_points(position, covariance, planar)
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))

@@ -145,6 +145,11 @@ class Pairs:
         """True if both maps carry labels, so that landmarks are paired by label."""
         return self.map_a.label is not None and self.map_b.label is not None
 
+    @property
+    def by_geometry(self) -> bool:
+        """True if landmarks were matched by geometry alone."""
+        return self.correspondences.by_geometry
+
     @cached_property
     def p_a(self) -> Float:
         """Positions in metres in frame a, shape (N, 3)."""
@@ -227,10 +232,6 @@ def why_too_few(
     for landmarks in (map_a, map_b):
         if len(landmarks) == 0:
             return f"map {landmarks.name} is empty"
-    if n_pairs == 0 and not shortage:
-        for landmarks in (map_a, map_b):
-            if landmarks.descriptor is None and landmarks.label is None:
-                return f"map {landmarks.name} has neither descriptors nor labels to match by"
     few = f"{n_pairs} correspondences, at least {needed} are needed"
     return f"{few}: {shortage}" if shortage else few
 

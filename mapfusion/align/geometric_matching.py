@@ -15,15 +15,16 @@ and votes are counted for one part of map b at a time.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
 from mapfusion.align.rigid_motion import fit_rigid
-from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.geometry.se2 import rotation, transform_points
+from mapfusion.geometry.numerics import Float, chi_square_bound, kernel
+from mapfusion.geometry.se2 import rms_distance_m, rotation, transform_points
+from mapfusion.landmark_map import LandmarkMap
 
 
 class Site(NamedTuple):
@@ -43,6 +44,30 @@ class Site(NamedTuple):
     most_z_m2: Float
     size_m: Float
     category: np.ndarray
+
+    @classmethod
+    def of(cls, landmarks: LandmarkMap, height_bound: float, floor_m2: float) -> "Site":
+        """Return the landmarks of a map.
+
+        `height_bound` is the largest squared difference of two heights over its variance, which
+        has the part `floor_m2` beyond the landmarks' own; infinite to ignore heights.
+        """
+        n = len(landmarks)
+        most = np.full(n, np.inf)
+        if math.isfinite(height_bound):
+            most = height_bound * (landmarks.covariance_m2[:, 2, 2] + floor_m2 / 2)
+        return cls(
+            np.ascontiguousarray(landmarks.position_m[:, :2]),
+            landmarks.position_m[:, 2].copy(),
+            most,
+            np.full(n, np.nan) if landmarks.size_m is None else landmarks.size_m,
+            np.full(n, -1) if landmarks.category is None else landmarks.category,
+        )
+
+    @property
+    def has_attributes(self) -> bool:
+        """True if a landmark has a size or a category."""
+        return bool((self.category >= 0).any()) or not np.isnan(self.size_m).all()
 
 
 class Placement(NamedTuple):
@@ -373,6 +398,26 @@ class PlacedSearch:
         kept = first_i & first_j
         return i[kept], j[kept], 0.0 if math.isnan(up_m) else up_m, share
 
+    def agreeing(self, rows_b: np.ndarray, moved: Float, gate_m: float, up_m: float) -> np.ndarray:
+        """Return True, shape (S,), for landmarks of b that agree with a landmark of a if displaced.
+
+        Args:
+            rows_b: rows of map b, shape (S,).
+            moved: their displaced places in frame a, shape (S, 2).
+            gate_m: largest distance in the plane.
+            up_m: height of frame b in frame a.
+        """
+        a, b = self._a, self._b
+        near = self._tree.sparse_distance_matrix(
+            scipy.spatial.KDTree(moved), gate_m, output_type="ndarray"
+        )
+        i, j = near["i"], rows_b[near["j"]]
+        agree = attributes_of_pairs_agree(a, b, i, j, self._size_tolerance)
+        agree &= (a.z[i] - b.z[j] - up_m) ** 2 <= a.most_z_m2[i] + b.most_z_m2[j]
+        found = np.zeros(len(rows_b), np.bool_)
+        found[near["j"][agree]] = True
+        return found
+
     def refit(self, T_a_b: Float, centre: Float, reach_m: float, tolerance_m: float) -> Float:
         """Return a motion refitted to its support, which grows from a part of map b.
 
@@ -392,7 +437,7 @@ class PlacedSearch:
                 return T
             reach_m *= 2
 
-    def place(self, T_a_b: Float, gates_m: tuple[float, ...]) -> Placement:
+    def place(self, T_a_b: Float, gates_m: Float) -> Placement:
         """Return the placement of a motion at the gate of largest surprise."""
         rows = np.arange(len(self._b.p))
         density = self.density(transform_points(T_a_b, self._b.p))
@@ -404,12 +449,6 @@ class PlacedSearch:
             if value > best.surprise:
                 best = Placement(T_a_b, up_m, gate_m, i, j, value)
         return best
-
-
-def rms_distance_m(T_a_b: Float, other: Float, p_b: Float) -> float:
-    """Return the RMS distance between points (n, 2) under two motions (3,)."""
-    apart = transform_points(T_a_b, p_b) - transform_points(other, p_b)
-    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 
 def surprise(count: int, expected: float) -> float:
@@ -445,7 +484,10 @@ _CANDIDATES = 48  # bins that are refitted
 _OF_PART = 6  # bins of each of several parts of map b
 _BIN_SHIFT = 1.0  # width of a bin in tolerances; neighbouring bins are counted together
 _BIN_ANGLE = 2.0  # width in tolerances over the longest segment
-_MOST_BINS = 2**22  # largest length of the hash table
+_MOST_SLOTS = 2**22  # largest length of the hash table
+_LEAST_LANDMARKS = 3  # of a map; fewer cannot contradict a motion
+_TRUE_WITHIN = 0.99  # probability that a common pair lies within the stated tolerance
+_WIDER = 1.5  # ratio of tolerances that differ
 
 
 def parts_of(segments: Segments, longest_m: float) -> list[tuple[np.ndarray, Float]]:
@@ -463,57 +505,98 @@ def parts_of(segments: Segments, longest_m: float) -> list[tuple[np.ndarray, Flo
     return [(np.sort(rows), segments.middle[rows].mean(axis=0)) for rows in groups]
 
 
-def find_placements(
-    a: Site, b: Site, tolerance_m: float, size_tolerance: float, most: int, distinct_m: float
-) -> list[Placement]:
-    """Find up to `most` distinct motions between two maps, of largest surprise first.
+N_MOTIONS = 4  # motions of which pairs are offered: the best one and its rivals
+# Motions with a smaller RMS distance of the moved landmarks count as equal: twice the largest error
+# of a correct alignment.
+DISTINCT_M = 1.0
+_GATES = np.array([0.25, 0.5, 1.0, 2.0])  # gates of a motion's support, in tolerances
+
+
+def find_placements(a: Site, b: Site, tolerance_m: float, size_tolerance: float) -> list[Placement]:
+    """Find placements of map b on map a, of largest surprise first.
 
     Args:
         a, b: both maps.
         tolerance_m: distance in the plane within which common landmarks agree.
         size_tolerance: largest relative difference of two sizes.
-        most: largest number of motions.
-        distinct_m: smallest RMS distance of map b under two distinct motions.
     """
-    if min(len(a.p), len(b.p)) < 3:
+    if min(len(a.p), len(b.p)) < _LEAST_LANDMARKS:
         return []
     shortest, longest = segment_lengths(a, b, tolerance_m)
     of_a = both_directions(segments_of(a, shortest, longest))
     of_b = segments_of(b, shortest, longest)
     if not len(of_a.length) or not len(of_b.length):
         return []
-    width = min(_BIN_ANGLE * tolerance_m / longest, math.pi / 4)
-    n_theta = math.ceil(2 * math.pi / width)
+    n_theta = math.ceil(2 * math.pi / min(_BIN_ANGLE * tolerance_m / longest, math.pi / 8))
     bins = Bins(2 * math.pi / n_theta, _BIN_SHIFT * tolerance_m, n_theta)
-    search, found = PlacedSearch(a, b, size_tolerance), list[Placement]()
-    parts = parts_of(of_b, longest)
-    has_attributes = any((each.category >= 0).any() or not np.isnan(each.size_m).all() for each in (a, b))
-    proposed = []
+    off_m = math.sqrt(2) * tolerance_m  # largest difference of two lengths
+    parts, proposed = parts_of(of_b, longest), []
+    most = _CANDIDATES if len(parts) == 1 else _OF_PART
+    sizes = size_tolerance if a.has_attributes and b.has_attributes else -1.0
     for rows, centre in parts:
         own = Segments(*(part[rows] for part in of_b))
-        n = _CANDIDATES if len(parts) == 1 else _OF_PART
-        off_m = math.sqrt(2) * tolerance_m  # largest difference of two lengths
         high, low = (np.searchsorted(of_a.length, own.length + off) for off in (off_m, -off_m))
-        n_votes = int(np.sum(high - low))
-        counts = np.zeros(min(2 ** (2 * n_votes).bit_length(), _MOST_BINS), np.int32)
-        sizes = size_tolerance if has_attributes else -1.0
-        given = ((a, b), of_a, own, centre, bins, off_m, sizes)
+        n_slots = 2 ** (2 * int(np.sum(high - low))).bit_length()
+        counts = np.zeros(min(n_slots, _MOST_SLOTS), np.int32)
         reach_m = float(np.hypot(*(own.middle - centre).T).max()) + longest / 2
-        for votes, theta, x, y in fullest_bins(*given, counts, n):
-            turned = rotation(theta) @ centre
-            proposed.append((votes, np.array([x - turned[0], y - turned[1], theta]), centre, reach_m))
+        given = (a, b), of_a, own, centre, bins, off_m, sizes, counts, most
+        for votes, theta, x, y in fullest_bins(*given):
+            T_a_b = np.array([x, y, theta])
+            T_a_b[:2] -= rotation(theta) @ centre
+            proposed.append((votes, T_a_b, centre, reach_m))
     proposed.sort(key=lambda each: -each[0])
-    gates_m = (tolerance_m / 4, tolerance_m / 2, tolerance_m, 2 * tolerance_m)
-    for _, T, centre, reach_m in proposed[: max(_CANDIDATES, 1)]:
-        T_a_b = search.refit(T, centre, reach_m, tolerance_m)
-        found.append(search.place(T_a_b, gates_m))
-    found.sort(key=lambda each: -each.surprise)
+    search, found = PlacedSearch(a, b, size_tolerance), list[Placement]()
+    for _, T_a_b, centre, reach_m in proposed[:_CANDIDATES]:
+        T_a_b = search.refit(T_a_b, centre, reach_m, tolerance_m)
+        found.append(search.place(T_a_b, tolerance_m * _GATES))
+    return distinct_placements(found, b.p)
+
+
+def distinct_placements(found: Sequence[Placement], p_b: Float) -> list[Placement]:
+    """Return the distinct placements of map b (N, 2) of largest surprise, best first."""
     distinct = list[Placement]()
-    for each in found:
-        if len(distinct) == most:
-            break
-        if each.surprise > 0 and all(
-            rms_distance_m(each.T_a_b, other.T_a_b, b.p) >= distinct_m for other in distinct
-        ):
+    for each in sorted(found, key=lambda each: -each.surprise):
+        apart = (rms_distance_m(each.T_a_b, other.T_a_b, p_b) for other in distinct)
+        if each.surprise > 0 and all(distance_m >= DISTINCT_M for distance_m in apart):
             distinct.append(each)
-    return distinct
+    return distinct[:N_MOTIONS]
+
+
+def match_by_geometry(
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    height_bound: float,
+    floor_m2: float,
+    tolerance_m: float,
+    size_tolerance: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pairs (K,) of landmarks that the best motions lay on each other.
+
+    Args:
+        map_a, map_b: maps with any landmarks.
+        height_bound: see `Site.of`.
+        floor_m2: see `Site.of`.
+        tolerance_m: distance in the plane within which common landmarks agree. If the covariances
+            of the maps state more, this is tried as well.
+        size_tolerance: largest relative difference of two sizes.
+    """
+    a, b = (Site.of(each, height_bound, floor_m2) for each in (map_a, map_b))
+    tolerances = [tolerance_m]
+    if len(a.p) and len(b.p):
+        variances = (np.median(each.covariance_m2[:, [0, 1], [0, 1]]) for each in (map_a, map_b))
+        stated_m = math.sqrt(chi_square_bound(_TRUE_WITHIN, 2) * float(sum(variances)))
+        tolerances += [stated_m] if stated_m > _WIDER * tolerance_m else []
+    found = [
+        placement
+        for each_m in tolerances
+        for placement in find_placements(a, b, each_m, size_tolerance)
+    ]
+    pairs = np.concatenate(
+        [np.zeros((0, 2), np.int64)]
+        + [
+            np.column_stack([each.index_a, each.index_b])
+            for each in distinct_placements(found, b.p)
+        ]
+    )
+    index_a, index_b = np.unique(pairs, axis=0).T
+    return index_a, index_b

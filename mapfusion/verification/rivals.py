@@ -10,10 +10,11 @@ import scipy
 from mapfusion.align.alignment import MIN_PAIRS, Pairs, Undetermined
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_descriptors
+from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.geometry.se2 import transform_points
+from mapfusion.geometry.se2 import rms_distance_m, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
 
@@ -135,9 +136,6 @@ def longest_patch_side_m(p: Float, reach_m: float, least: int) -> float:
     return longest
 
 
-# Motions with a smaller RMS distance of the moved landmarks count as equal: twice the largest error
-# of a correct alignment.
-DISTINCT_M = 1.0
 _LEAST_PAIRS = 6  # no motion among fewer pairs passes the test against chance
 
 
@@ -153,12 +151,6 @@ class SupportedMotion(NamedTuple):
     T_a_b: Float
     log10_false_alarms: float
     inlier: np.ndarray
-
-
-def rms_distance_m(T_a_b: Float, other: Float, p_b: Float) -> float:
-    """Return the RMS distance between points (n, 2) under two motions (3,)."""
-    apart = transform_points(T_a_b, p_b) - transform_points(other, p_b)
-    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 
 def distinct_motions(
