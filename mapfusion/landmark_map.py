@@ -140,9 +140,7 @@ def read_joint(map_path: Path, covariance_m2: Float) -> JointCovariance | None:
 
 ATTRIBUTE_FIELDS = [
     described(pa.field("size_m", pa.float64()), "size of the landmark, empty for none", np.nan),
-    described(
-        pa.field("category", pa.int32()), "class of the landmark, -1 for none", NO_LABEL
-    ),
+    described(pa.field("category", pa.int32()), "class of the landmark, -1 for none", NO_LABEL),
 ]
 LANDMARKS = schema(
     "landmark_map",

@@ -313,7 +313,7 @@ def align_note(path_a: Path, path_b: Path, settings: Scenario) -> str:
 
 def _mirror_note(pairs: Pairs, settings: Align) -> str:
     """Say that two maps look like mirror images of each other; empty if they do not."""
-    if not is_mirrored(pairs, settings.acceptance, settings.refinement):
+    if not is_mirrored(pairs, settings.acceptance, settings.refinement, settings.match):
         return ""
     a, b = pairs.map_a.name, pairs.map_b.name
     return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"

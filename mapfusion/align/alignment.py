@@ -116,7 +116,7 @@ class Pairs:
         return Pairs(self.map_a, self.map_b, self.correspondences[rows])
 
     @cached_property
-    def cache(self) -> dict[type, Any]:
+    def cache(self) -> dict[Any, Any]:
         """Values that methods keep between calls with the same pairs, by type."""
         return {}
 

@@ -372,7 +372,7 @@ def match(
             return _no_pairs(f"map {name} is empty")
     height_bound = math.inf if map_a.planar or map_b.planar else parameters.height.bound
     floor_m2 = parameters.height.floor_m**2
-    if any(each.descriptor is None and each.label is None for each in (map_a, map_b)):
+    if matched_by_geometry(map_a, map_b):
         gates = height_bound, floor_m2, parameters.tolerance_m, parameters.size_tolerance
         index_a, index_b = match_by_geometry(map_a, map_b, *gates)
         shortage = ""
@@ -392,6 +392,11 @@ def match(
     kept &= attributes_of_pairs_agree(*sites, rows, nearest_b, parameters.size_tolerance)
     shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
     return Correspondences(rows[kept], nearest_b[kept], distance[kept], shortage)
+
+
+def matched_by_geometry(map_a: LandmarkMap, map_b: LandmarkMap) -> bool:
+    """Return True if one of two maps has neither descriptors nor labels."""
+    return any(each.descriptor is None and each.label is None for each in (map_a, map_b))
 
 
 def _no_pairs(shortage: str) -> Correspondences:

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import Float, chi_square_bound, kernel
 from mapfusion.geometry.se2 import rms_distance_m, rotation, transform_points
@@ -64,11 +65,6 @@ class Site(NamedTuple):
             np.full(n, -1) if landmarks.category is None else landmarks.category,
         )
 
-    @property
-    def has_attributes(self) -> bool:
-        """True if a landmark has a size or a category."""
-        return bool((self.category >= 0).any()) or not np.isnan(self.size_m).all()
-
 
 class Placement(NamedTuple):
     """Motion between two maps, and the landmarks that it lays on each other.
@@ -89,10 +85,15 @@ class Placement(NamedTuple):
     surprise: float
 
 
+def have_attributes(a: Site, b: Site) -> bool:
+    """Return True if both maps have sizes, or both have categories."""
+    sized = (np.isnan(each.size_m).all() for each in (a, b))
+    named = ((each.category < 0).all() for each in (a, b))
+    return not any(sized) or not any(named)
+
+
 @kernel
-def attributes_agree(
-    a: Site, b: Site, i: int, j: int, size_tolerance: float
-) -> bool:
+def attributes_agree(a: Site, b: Site, i: int, j: int, size_tolerance: float) -> bool:
     """Return True if the attributes of landmark i of a and j of b agree, or one has none."""
     if a.category[i] >= 0 and b.category[j] >= 0 and a.category[i] != b.category[j]:
         return False
@@ -340,6 +341,53 @@ _SHARE_OF_BIN = 27  # a bin and its neighbours; the fullest of them has this sha
 _NEIGHBOURS = 8  # nearest landmarks that give the density of a map at a place
 
 
+@kernel
+def near_pairs(
+    moved: Float,
+    rows_b: np.ndarray,
+    sites: tuple[Site, Site],
+    near_a: Grid,
+    limits: tuple[float, float],
+) -> tuple[np.ndarray, Float]:
+    """Return landmarks of a near moved landmarks of b, with attributes that agree.
+
+    Args:
+        moved: places in frame a, shape (n, 2).
+        rows_b: rows of map b at these places, shape (n,).
+        sites: both maps.
+        near_a: grid over map a.
+        limits: largest distance in the plane, and `size_tolerance` of `fullest_bins`.
+
+    Returns:
+        Row of a and number of the place of each pair, shape (K, 2), and the distances, shape (K,).
+    """
+    (a, b), (gate_m, size_tolerance) = sites, limits
+    runs = np.empty((near_a.shape[1], 2), np.int64)
+    pairs, distances = np.empty((0, 2), np.int64), np.empty(0)
+    n = 0
+    for filled in range(2):  # counts the pairs first
+        n = 0
+        for q in range(len(moved)):
+            x, y = moved[q, 0], moved[q, 1]
+            for run in range(ranges_within(x, y, gate_m, near_a, runs)):
+                for k in range(runs[run, 0], runs[run, 1]):
+                    dx, dy = near_a.p[k, 0] - x, near_a.p[k, 1] - y
+                    square = dx * dx + dy * dy
+                    if square > gate_m * gate_m:
+                        continue
+                    i = near_a.row[k]
+                    if size_tolerance >= 0 and not attributes_agree(
+                        a, b, i, rows_b[q], size_tolerance
+                    ):
+                        continue
+                    if filled:
+                        pairs[n, 0], pairs[n, 1], distances[n] = i, q, math.sqrt(square)
+                    n += 1
+        if not filled:
+            pairs, distances = np.empty((n, 2), np.int64), np.empty(n)
+    return pairs, distances
+
+
 class PlacedSearch:
     """Refits motions to the landmarks that they lay on each other.
 
@@ -349,8 +397,14 @@ class PlacedSearch:
     """
 
     def __init__(self, a: Site, b: Site, size_tolerance: float) -> None:
-        self._a, self._b, self._size_tolerance = a, b, size_tolerance
-        self._tree = scipy.spatial.KDTree(a.p)
+        self._a, self._b = a, b
+        self._size_tolerance = size_tolerance if have_attributes(a, b) else -1.0
+        self._tree, self._grid = scipy.spatial.KDTree(a.p), Grid.of(a.p)
+        self._has_heights = bool(np.isfinite(a.most_z_m2).all() and np.isfinite(b.most_z_m2).all())
+
+    def _near(self, rows_b: np.ndarray, moved: Float, gate_m: float) -> tuple[np.ndarray, Float]:
+        limits = float(gate_m), float(self._size_tolerance)
+        return near_pairs(moved, rows_b, (self._a, self._b), self._grid, limits)
 
     def density(self, moved: Float) -> Float:
         """Return the density of map a in landmarks per square metre at some places (n, 2).
@@ -377,14 +431,10 @@ class PlacedSearch:
             agree.
         """
         a, b = self._a, self._b
-        moved = scipy.spatial.KDTree(transform_points(T_a_b, b.p[rows_b]))
-        near = self._tree.sparse_distance_matrix(moved, gate_m, output_type="ndarray")
-        i, j, distance = near["i"], rows_b[near["j"]], near["v"]
-        agree = attributes_of_pairs_agree(a, b, i, j, self._size_tolerance)
-        i, j, distance = i[agree], j[agree], distance[agree]
-        rise, reach2 = a.z[i] - b.z[j], a.most_z_m2[i] + b.most_z_m2[j]
-        share = 1.0
-        if len(i) and np.isfinite(reach2).all():
+        near, distance = self._near(rows_b, transform_points(T_a_b, b.p[rows_b]), gate_m)
+        i, j, share = near[:, 0], rows_b[near[:, 1]], 1.0
+        if len(i) and self._has_heights:
+            rise, reach2 = a.z[i] - b.z[j], a.most_z_m2[i] + b.most_z_m2[j]
             if math.isnan(up_m):
                 up_m = _densest(rise, math.sqrt(np.median(reach2)))
             agree = (rise - up_m) ** 2 <= reach2
@@ -408,14 +458,11 @@ class PlacedSearch:
             up_m: height of frame b in frame a.
         """
         a, b = self._a, self._b
-        near = self._tree.sparse_distance_matrix(
-            scipy.spatial.KDTree(moved), gate_m, output_type="ndarray"
-        )
-        i, j = near["i"], rows_b[near["j"]]
-        agree = attributes_of_pairs_agree(a, b, i, j, self._size_tolerance)
-        agree &= (a.z[i] - b.z[j] - up_m) ** 2 <= a.most_z_m2[i] + b.most_z_m2[j]
+        near, _ = self._near(rows_b, moved, gate_m)
+        i, j = near[:, 0], rows_b[near[:, 1]]
+        agree = (a.z[i] - b.z[j] - up_m) ** 2 <= a.most_z_m2[i] + b.most_z_m2[j]
         found = np.zeros(len(rows_b), np.bool_)
-        found[near["j"][agree]] = True
+        found[near[agree, 1]] = True
         return found
 
     def refit(self, T_a_b: Float, centre: Float, reach_m: float, tolerance_m: float) -> Float:
@@ -516,7 +563,8 @@ def find_placements(a: Site, b: Site, tolerance_m: float, size_tolerance: float)
     """Find placements of map b on map a, of largest surprise first.
 
     Args:
-        a, b: both maps.
+        a: map in frame a.
+        b: map in frame b.
         tolerance_m: distance in the plane within which common landmarks agree.
         size_tolerance: largest relative difference of two sizes.
     """
@@ -532,7 +580,7 @@ def find_placements(a: Site, b: Site, tolerance_m: float, size_tolerance: float)
     off_m = math.sqrt(2) * tolerance_m  # largest difference of two lengths
     parts, proposed = parts_of(of_b, longest), []
     most = _CANDIDATES if len(parts) == 1 else _OF_PART
-    sizes = size_tolerance if a.has_attributes and b.has_attributes else -1.0
+    sizes = size_tolerance if have_attributes(a, b) else -1.0
     for rows, centre in parts:
         own = Segments(*(part[rows] for part in of_b))
         high, low = (np.searchsorted(of_a.length, own.length + off) for off in (off_m, -off_m))
@@ -573,7 +621,8 @@ def match_by_geometry(
     """Return the pairs (K,) of landmarks that the best motions lay on each other.
 
     Args:
-        map_a, map_b: maps with any landmarks.
+        map_a: map in frame a.
+        map_b: map in frame b.
         height_bound: see `Site.of`.
         floor_m2: see `Site.of`.
         tolerance_m: distance in the plane within which common landmarks agree. If the covariances

@@ -45,7 +45,7 @@ _NEIGHBOURS = 8  # lines along which a landmark is displaced
 # place nor that of the neighbour is among them.
 _SHARES = np.array([-5, -3, -1, 1, 3, 5]) / 6
 _MOST_PLACES = 50_003  # of displaced landmarks; a prime, so that each step takes all directions
-_SAMPLES = 2**18  # quadruples of landmarks that give M; its relative error is a few percent
+_SAMPLES = 2**17  # quadruples of landmarks that give M; its relative error is a few percent
 _SEED = 0
 
 
@@ -60,11 +60,13 @@ class RandomPlacement:
     def __init__(self, a: Site, b: Site, size_tolerance: float) -> None:
         self._a, self._b, self._size_tolerance = a, b, size_tolerance
         self._search = PlacedSearch(a, b, size_tolerance)
-        self._motions: dict[float, float] = {}
 
     @classmethod
     def of(cls, pairs: Pairs, height: HeightGate, patch_m: float) -> "RandomPlacement":
         """Return the null hypothesis of two maps, without landmarks closer than `patch_m`."""
+        key = cls, height, patch_m
+        if key in pairs.cache:
+            return pairs.cache[key]
         sites = []
         gates = math.inf if pairs.planar else height.bound, height.floor_m**2
         for landmarks in (pairs.map_a, pairs.map_b):
@@ -72,7 +74,8 @@ class RandomPlacement:
             p = np.ascontiguousarray(landmarks.position_m[often, :2])
             rows = often[independent_rows(p, p, patch_m)]
             sites.append(Site.of(landmarks[np.sort(rows)], *gates))
-        return cls(*sites, pairs.correspondences.size_tolerance or 0.0)
+        pairs.cache[key] = cls(*sites, pairs.correspondences.size_tolerance or 0.0)
+        return pairs.cache[key]
 
     @cached_property
     def _displaced(self) -> tuple[np.ndarray, Float]:
@@ -95,28 +98,31 @@ class RandomPlacement:
         agree = self._search.agreeing(rows, transform_points(T_a_b, places), gate_m, up_m)
         return (np.count_nonzero(agree) + 1) / (len(rows) + 1)
 
+    @cached_property
+    def _consistent(self) -> tuple[Float, float]:
+        """Least gates of sampled quadruples, ascending; and log10 of quadruples per sample."""
+        a, b, n_a, n_b = self._a, self._b, len(self._a.p), len(self._b.p)
+        rng = np.random.default_rng(_SEED)
+        i, j = rng.integers(n_a, size=_SAMPLES), rng.integers(n_b, size=_SAMPLES)
+        k = (i + rng.integers(1, n_a, size=_SAMPLES)) % n_a
+        l = (j + rng.integers(1, n_b, size=_SAMPLES)) % n_b  # noqa: E741
+        rise = (a.z[i] - b.z[j]) - (a.z[k] - b.z[l])
+        reach_m = np.sqrt(a.most_z_m2[i] + b.most_z_m2[j])
+        agree = np.abs(rise) <= reach_m + np.sqrt(a.most_z_m2[k] + b.most_z_m2[l])
+        agree &= attributes_of_pairs_agree(a, b, i, j, self._size_tolerance)
+        agree &= attributes_of_pairs_agree(a, b, k, l, self._size_tolerance)
+        i, j, k, l = i[agree], j[agree], k[agree], l[agree]  # noqa: E741
+        longer = np.hypot(*(a.p[i] - a.p[k]).T) - np.hypot(*(b.p[j] - b.p[l]).T)
+        total = math.log10(n_a * (n_a - 1) / 2) + math.log10(n_b * (n_b - 1))
+        return np.sort(np.abs(longer) / 2), total - math.log10(_SAMPLES + 1)
+
     def log10_motions(self, gate_m: float) -> float:
         """Return log10 of M, the number of motions of two pairs that agree within a gate.
 
-        M is estimated from a sample of all quadruples of landmarks.
+        M is estimated from a sample of all quadruples of landmarks. One is added to the count.
         """
-        if gate_m not in self._motions:
-            a, b, n_a, n_b = self._a, self._b, len(self._a.p), len(self._b.p)
-            rng = np.random.default_rng(_SEED)
-            i, j = rng.integers(n_a, size=_SAMPLES), rng.integers(n_b, size=_SAMPLES)
-            k = (i + rng.integers(1, n_a, size=_SAMPLES)) % n_a
-            l = (j + rng.integers(1, n_b, size=_SAMPLES)) % n_b  # noqa: E741
-            longer = np.hypot(*(a.p[i] - a.p[k]).T) - np.hypot(*(b.p[j] - b.p[l]).T)
-            agree = np.abs(longer) <= 2 * gate_m
-            rise = (a.z[i] - b.z[j]) - (a.z[k] - b.z[l])
-            reaches = np.sqrt(a.most_z_m2[[i, k]] + b.most_z_m2[[j, l]])
-            agree &= np.abs(rise) <= reaches.sum(axis=0)
-            agree &= attributes_of_pairs_agree(a, b, i, j, self._size_tolerance)
-            agree &= attributes_of_pairs_agree(a, b, k, l, self._size_tolerance)
-            share = (np.count_nonzero(agree) + 1) / (_SAMPLES + 1)
-            total = math.log10(n_a * (n_a - 1) / 2) + math.log10(n_b * (n_b - 1))
-            self._motions[gate_m] = math.log10(share) + total
-        return self._motions[gate_m]
+        gates_m, each = self._consistent
+        return math.log10(np.searchsorted(gates_m, gate_m, side="right") + 1) + each
 
     def fewest_false_alarms(self, T_a_b: Float, gates_m: Float) -> tuple[float, float, int, int]:
         """Return the smallest NFA over the gates (G,).

@@ -9,7 +9,13 @@ import scipy
 
 from mapfusion.align.alignment import MIN_PAIRS, Pairs, Undetermined
 from mapfusion.align.clique import Clique
-from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_descriptors
+from mapfusion.align.correspondences import (
+    Correspondences,
+    HeightGate,
+    MatchParameters,
+    match,
+    nearest_descriptors,
+)
 from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
@@ -179,10 +185,13 @@ def distinct_motions(
     return found
 
 
-def is_mirrored(pairs: Pairs, acceptance: Acceptance, refinement: Refinement) -> bool:
+def is_mirrored(
+    pairs: Pairs, acceptance: Acceptance, refinement: Refinement, matching: MatchParameters
+) -> bool:
     """Return True if the mirror image of map b fits map a beyond chance, and map b does not.
 
-    Maps are mirror images of each other if one of them has y to the right.
+    Maps are mirror images of each other if one of them has y to the right. Pairs by geometry alone
+    belong to a motion, so that the mirror image is matched again.
     """
     flip = np.array([1.0, -1.0, 1.0])
     own, bound = pairs.map_b, math.log10(acceptance.false_alarms)
@@ -196,10 +205,15 @@ def is_mirrored(pairs: Pairs, acceptance: Acceptance, refinement: Refinement) ->
         own.label,
         own.planar,
         own.name,
+        size_m=own.size_m,
+        category=own.category,
     )
 
     def fits(map_b: LandmarkMap) -> bool:
-        given = Pairs(pairs.map_a, map_b, pairs.correspondences)
+        found = pairs.correspondences
+        if pairs.by_geometry and map_b is image:
+            found = match(pairs.map_a, image, matching)
+        given = Pairs(pairs.map_a, map_b, found)
         motions = distinct_motions(given, 1, acceptance, refinement)
         return any(each.log10_false_alarms <= bound for each in motions)
 
