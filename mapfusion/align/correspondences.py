@@ -388,8 +388,8 @@ def match(
         )
     rows, nearest_b, distance = _mutually_nearest(map_a, map_b, height_bound, floor_m2)
     kept = distance <= parameters.max_descriptor_distance
-    sites = (Site.of(each, height_bound, floor_m2) for each in (map_a, map_b))
-    kept &= attributes_of_pairs_agree(*sites, rows, nearest_b, parameters.size_tolerance)
+    a, b = (Site.of(each, height_bound, floor_m2) for each in (map_a, map_b))
+    kept &= attributes_of_pairs_agree(a, b, rows, nearest_b, parameters.size_tolerance)
     shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
     return Correspondences(rows[kept], nearest_b[kept], distance[kept], shortage)
 

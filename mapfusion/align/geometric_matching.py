@@ -101,6 +101,9 @@ def attributes_agree(a: Site, b: Site, i: int, j: int, size_tolerance: float) ->
     return not off > size_tolerance * max(a.size_m[i], b.size_m[j])
 
 
+_TINY_M = 1e-9  # avoids a division by the distance of equal places
+
+
 class Segments(NamedTuple):
     """Segments between landmarks of one map, by ascending length.
 
@@ -132,7 +135,7 @@ class Segments(NamedTuple):
         i, j, off, length = i[order], j[order], off[order], length[order]
         return cls(
             length,
-            off / length[:, None],
+            off / np.maximum(length, _TINY_M)[:, None],
             np.arctan2(off[:, 1], off[:, 0]),
             (site.p[i] + site.p[j]) / 2,
             site.z[j] - site.z[i],
@@ -413,7 +416,7 @@ class PlacedSearch:
         """
         k = min(_NEIGHBOURS, len(self._a.p))
         radius = self._tree.query(moved, k=[k])[0][:, 0]
-        return max(k - 1, 1) / (math.pi * radius**2)
+        return max(k - 1, 1) / (math.pi * np.maximum(radius, _TINY_M) ** 2)
 
     def pairs_within(
         self, T_a_b: Float, rows_b: np.ndarray, gate_m: float, up_m: float = math.nan

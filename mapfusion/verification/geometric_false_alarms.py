@@ -33,6 +33,7 @@ from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.geometric_matching import PlacedSearch, Site, attributes_of_pairs_agree
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import transform_points
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import (
     independent_rows,
     log10_tail,
@@ -67,14 +68,16 @@ class RandomPlacement:
         key = cls, height, patch_m
         if key in pairs.cache:
             return pairs.cache[key]
-        sites = []
         gates = math.inf if pairs.planar else height.bound, height.floor_m**2
-        for landmarks in (pairs.map_a, pairs.map_b):
+
+        def thinned(landmarks: LandmarkMap) -> Site:
             often = np.argsort(-landmarks.count.astype(np.int64), kind="stable")
             p = np.ascontiguousarray(landmarks.position_m[often, :2])
             rows = often[independent_rows(p, p, patch_m)]
-            sites.append(Site.of(landmarks[np.sort(rows)], *gates))
-        pairs.cache[key] = cls(*sites, pairs.correspondences.size_tolerance or 0.0)
+            return Site.of(landmarks[np.sort(rows)], *gates)
+
+        sizes = pairs.correspondences.size_tolerance or 0.0
+        pairs.cache[key] = cls(thinned(pairs.map_a), thinned(pairs.map_b), sizes)
         return pairs.cache[key]
 
     @cached_property

@@ -42,6 +42,11 @@ SEED = 1
 REGISTRATION = Registration(make_aligner("clique"))
 
 
+def say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
 def traverses() -> list[Path]:
     return sorted(FOLDER.glob("traverse_*.csv"), key=lambda path: int(path.stem.split("_")[1]))
 
@@ -101,12 +106,11 @@ def measure_pairs(maps: list[LandmarkMap]) -> None:
         wrong_accepted += done.verdict.accepted and not good
         right += good and common >= ENOUGH
         accepted += good and common >= ENOUGH and done.verdict.accepted
-        print(
+        say(
             f"{a.name} {b.name}: {common} common, {done.verdict.status}, log10 NFA "
-            f"{done.verdict.log10_false_alarms:.1f}, error {errors[-1]:.3f} m",
-            flush=True,
+            f"{done.verdict.log10_false_alarms:.1f}, error {errors[-1]:.3f} m"
         )
-    print(
+    say(
         f"{len(errors)} pairs: {wrong} wrong ({wrong_accepted} accepted); {accepted} of {right} "
         f"right ones with {ENOUGH} or more common landmarks accepted; median error "
         f"{np.median(errors):.3f} m"
@@ -128,7 +132,7 @@ def measure_mirrored(maps: list[LandmarkMap], n: int) -> None:
         accepted += verdict.accepted
         found.append(verdict.log10_false_alarms)
     least, low = np.nanquantile(found, [0, 0.1])
-    print(f"{n} mirrored: {accepted} accepted; log10 NFA least {least:.1f}, 10 % below {low:.1f}")
+    say(f"{n} mirrored: {accepted} accepted; log10 NFA least {least:.1f}, 10 % below {low:.1f}")
 
 
 def measure_times() -> None:
@@ -140,10 +144,9 @@ def measure_times() -> None:
         used, wall = time.process_time() - started, time.perf_counter() - wall
         error_m = rms_distance_m(done.refined.T_a_b, field.T_a_b, field.map_b.position_m[:, :2])
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(
+        say(
             f"{n} x {n}: {used:.2f} s of processor, {wall:.2f} s, {memory_mb:.0f} MB, "
-            f"{done.verdict.status}, error {error_m:.3f} m",
-            flush=True,
+            f"{done.verdict.status}, error {error_m:.3f} m"
         )
 
 
@@ -155,7 +158,7 @@ def main() -> None:
     if asked.times:
         measure_times()
     if not traverses():
-        print(f"{VARIABLE} names no folder with traverse_N.csv: skipped")
+        say(f"{VARIABLE} names no folder with traverse_N.csv: skipped")
         return
     maps = [clustered(path) for path in traverses()]
     measure_pairs(maps)

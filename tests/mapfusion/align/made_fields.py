@@ -51,7 +51,7 @@ def made_field(rng, n, n_common, density=0.3, noise_m=0.015, planar=False, up_m=
         measured = size_m[own] * (1 + rng.normal(0, 0.03, n))
         maps.append(replace(made, size_m=measured if sizes else None))
     at_b = np.flatnonzero(order_b < n)
-    return Field(*maps, T_a_b, np.column_stack([order_b[at_b], at_b]))
+    return Field(maps[0], maps[1], T_a_b, np.column_stack([order_b[at_b], at_b]))
 
 
 def mirrored(landmarks: LandmarkMap) -> LandmarkMap:

@@ -31,7 +31,8 @@ def sites(field):
 
 
 def best_of(field):
-    return find_placements(*sites(field), TOLERANCE_M, SIZE_TOLERANCE)[0]
+    a, b = sites(field)
+    return find_placements(a, b, TOLERANCE_M, SIZE_TOLERANCE)[0]
 
 
 @pytest.mark.parametrize("planar", [True, False])
