@@ -315,7 +315,7 @@ def fullest_bins(
                 theta = of_a.theta_rad[e] - b_theta
                 theta += 2 * math.pi if theta < 0 else 0.0
                 t = min(int(theta / bins.theta_rad), bins.n_theta - 1)
-                u, v = int(math.floor(x / bins.shift_m)), int(math.floor(y / bins.shift_m))
+                u, v = math.floor(x / bins.shift_m), math.floor(y / bins.shift_m)
                 slot = _slot(t, u, v, mask)
                 if counted == 0:
                     counts[slot] += 1
@@ -391,6 +391,15 @@ def near_pairs(
     return pairs, distances
 
 
+def mutually_nearest(index_a: np.ndarray, index_b: np.ndarray, distance: Float) -> np.ndarray:
+    """Mark the pairs (K,) that are nearest for both of their landmarks; they are one to one."""
+    order = np.lexsort((index_b, index_a, distance))
+    nearest = np.zeros((2, len(order)), np.bool_)
+    for k, index in enumerate((index_a, index_b)):
+        nearest[k, order[np.unique(index[order], return_index=True)[1]]] = True
+    return nearest[0] & nearest[1]
+
+
 class PlacedSearch:
     """Refits motions to the landmarks that they lay on each other.
 
@@ -443,12 +452,7 @@ class PlacedSearch:
             agree = (rise - up_m) ** 2 <= reach2
             share = (np.count_nonzero(agree) + 1) / (len(i) + 1)
             i, j, distance = i[agree], j[agree], distance[agree]
-        order = np.lexsort((j, i, distance))
-        i, j = i[order], j[order]
-        first_i, first_j = np.zeros(len(i), np.bool_), np.zeros(len(i), np.bool_)
-        first_i[np.unique(i, return_index=True)[1]] = True
-        first_j[np.unique(j, return_index=True)[1]] = True
-        kept = first_i & first_j
+        kept = mutually_nearest(i, j, distance)
         return i[kept], j[kept], 0.0 if math.isnan(up_m) else up_m, share
 
     def agreeing(self, rows_b: np.ndarray, moved: Float, gate_m: float, up_m: float) -> np.ndarray:

@@ -13,6 +13,7 @@ from mapfusion.align.geometric_matching import (
     Site,
     attributes_of_pairs_agree,
     find_placements,
+    mutually_nearest,
     segment_lengths,
     segments_of,
     surprise,
@@ -129,6 +130,12 @@ def test_sizes_and_categories_agree_within_their_tolerance():
     b = b._replace(size_m=np.full(5, np.nan), category=np.array([1, 1, -1, 4, 4]))
     agree = attributes_of_pairs_agree(a, b, rows, rows, SIZE_TOLERANCE)
     assert agree.tolist() == [False, True, True, False, True]
+
+
+def test_mutually_nearest_pairs_are_one_to_one():
+    index_a, index_b = np.array([0, 0, 1, 2, 2]), np.array([5, 6, 6, 7, 8])
+    kept = mutually_nearest(index_a, index_b, np.array([0.2, 0.1, 0.3, 0.4, 0.4]))
+    assert kept.tolist() == [False, True, False, True, False]
 
 
 def test_chernoff_bound_of_the_support():

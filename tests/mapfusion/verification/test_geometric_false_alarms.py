@@ -133,3 +133,14 @@ def test_sizes_make_a_crowded_field_certain():
     bare = [replace(each, size_m=None) for each in (field.map_a, field.map_b)]
     sized = registered(field.map_a, field.map_b).verdict.log10_false_alarms
     assert sized < registered(*bare).verdict.log10_false_alarms - 2
+
+
+def test_supporters_of_a_crowded_field_are_one_to_one():
+    """Pairs of rival motions share landmarks with those of the best one; a merge needs none."""
+    field = made_field(np.random.default_rng(9), 150, 60, 3.0, 0.03, planar=True)
+    pairs = match(field.map_a, field.map_b)
+    done = registered(field.map_a, field.map_b)
+    assert done.verdict.accepted
+    used = pairs[done.refined.inlier]
+    assert len(np.unique(pairs.index_a)) < len(pairs)
+    assert len(np.unique(used.index_a)) == len(np.unique(used.index_b)) == len(used)
