@@ -9,7 +9,6 @@ precision, and the effect of the shared variables in single precision.
 """
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -144,7 +143,7 @@ ATTRIBUTE_FIELDS = [
 ]
 LANDMARKS = schema(
     "landmark_map",
-    1,
+    2,
     [
         *(described(field, "in the map frame") for field in point_fields()),
         described(pa.field("count", pa.int32()), "number of observations of the landmark", 1),
@@ -249,8 +248,10 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
         "source_observation": landmarks.source_observation.astype(np.int64),
         **appearance_columns(len(landmarks), landmarks.descriptor, landmarks.label),
     }
-    attributes_held = {"size_m": landmarks.size_m, "category": landmarks.category}
-    columns |= {name: values for name, values in attributes_held.items() if values is not None}
+    n, size_m, category = len(landmarks), landmarks.size_m, landmarks.category
+    columns["size_m"] = np.full(n, np.nan) if size_m is None else size_m
+    none = np.full(n, NO_LABEL, np.int32)
+    columns["category"] = none if category is None else category.astype(np.int32)
     if is_csv(path):
         parts = {
             "joint covariance": landmarks.joint is not None,
@@ -261,6 +262,8 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
             text = f"{path}: CSV cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
             warnings.warn(text, TellingWarning, stacklevel=3)
         absent = {"label"} if landmarks.label is None else set()
+        absent |= {"size_m"} if size_m is None else set()
+        absent |= {"category"} if category is None else set()
         absent |= {"descriptor"} if landmarks.descriptor is None else set()
         absent |= set(HEIGHT) if landmarks.planar else set()
         kept = {name: values for name, values in columns.items() if name not in absent}
@@ -269,16 +272,10 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
     attributes = {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
     attributes |= landmarks.calibration.attributes()
     return {
-        path: table_write(columns, _schema_of(columns), attributes),
+        path: table_write(columns, LANDMARKS, attributes),
         **joint_writes(path, landmarks.joint, landmarks.covariance_m2),
         **viewing_writes(path, landmarks.viewing),
     }
-
-
-def _schema_of(columns: Mapping[str, np.ndarray]) -> pa.Schema:
-    """Return the schema of a map with these columns; attributes that it lacks are left out."""
-    kept = [field for field in LANDMARKS if field.name in columns]
-    return pa.schema(kept, metadata=LANDMARKS.metadata)
 
 
 def read_map(path: Path, alone: bool = False) -> LandmarkMap:
