@@ -54,6 +54,7 @@ from mapfusion.tables import (
     APPEARANCE_FIELDS,
     DESCRIPTOR_LENGTH,
     HEIGHT,
+    NO_LABEL,
     appearance_columns,
     appearance_from,
     csv_bytes,
@@ -148,9 +149,13 @@ def read_joint(map_path: Path, covariance_m2: Float) -> JointCovariance | None:
     return joint
 
 
+ATTRIBUTE_FIELDS = [
+    described(pa.field("size_m", pa.float64()), "size of the landmark, empty for none", np.nan),
+    described(pa.field("category", pa.int32()), "class of the landmark, -1 for none", NO_LABEL),
+]
 LANDMARKS = schema(
     "landmark_map",
-    1,
+    2,
     [
         *(described(field, "in the map frame") for field in point_fields()),
         described(pa.field("count", pa.int32()), "number of observations of the landmark", 1),
@@ -159,6 +164,7 @@ LANDMARKS = schema(
             "row of the log that created the landmark, -1 for none",
             -1,
         ),
+        *ATTRIBUTE_FIELDS,
         *APPEARANCE_FIELDS,
     ],
 )
@@ -175,6 +181,8 @@ class LandmarkMap:
         source_observation: (N,) int64 row in the robot's log of the observation that created it.
         descriptor: (N, 64) float32, or None.
         label: (N,) int32, or None.
+        size_m: (N,) size of each landmark, such as a diameter, NaN for none; or None.
+        category: (N,) int32 class of each landmark, -1 for none; or None.
         planar: z is 0 and carries no information (2 degrees of freedom).
         name: name of the map.
         joint: joint covariance of the landmarks' errors, or None. Its marginals are covariance_m2,
@@ -195,6 +203,8 @@ class LandmarkMap:
     joint: JointCovariance | None = None
     viewing: Viewing | None = None
     calibration: CalibrationError = EXACT
+    size_m: Float | None = None
+    category: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -206,8 +216,9 @@ class LandmarkMap:
         require_finite("covariance_m2", self.covariance_m2)
         if self.descriptor is not None:
             require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
-        if self.label is not None:
-            require_shape("label", self.label, (n,))
+        for name in ("label", "size_m", "category"):
+            if getattr(self, name) is not None:
+                require_shape(name, getattr(self, name), (n,))
         if self.joint is not None and len(self.joint) != n:
             raise ValueError(f"joint: of {len(self.joint)} landmarks, the map has {n}")
         if self.viewing is not None and len(self.viewing) != n:
@@ -280,6 +291,8 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
         if kind == "g2o":
             parts |= {"descriptors": landmarks.descriptor is not None}
             parts |= {"labels": landmarks.label is not None}
+            parts |= {"sizes": landmarks.size_m is not None}
+            parts |= {"categories": landmarks.category is not None}
         if lost := [name for name, there in parts.items() if there]:
             which = kind if kind == "g2o" else kind.upper()
             text = f"{path}: {which} cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
@@ -302,11 +315,15 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
 
 
 def _columns(landmarks: LandmarkMap) -> dict[str, np.ndarray]:
-    """Return positions, covariances, counts and sources as columns by name."""
+    """Return all columns but those of the appearance, by name."""
+    n, size_m, category = len(landmarks), landmarks.size_m, landmarks.category
+    none = np.full(n, NO_LABEL, np.int32)
     return {
         **point_columns(landmarks.position_m, landmarks.covariance_m2),
         "count": landmarks.count.astype(np.int32),
         "source_observation": landmarks.source_observation.astype(np.int64),
+        "size_m": np.full(n, np.nan) if size_m is None else size_m,
+        "category": none if category is None else category.astype(np.int32),
     }
 
 
@@ -317,6 +334,7 @@ def _known_columns(landmarks: LandmarkMap) -> dict[str, np.ndarray]:
         name: each for name, each in given.items() if getattr(landmarks, name) is not None
     }
     absent = set(HEIGHT) if landmarks.planar else set()
+    absent |= {name for name in ("size_m", "category") if getattr(landmarks, name) is None}
     kept = {name: each for name, each in _columns(landmarks).items() if name not in absent}
     return kept | appearance
 
@@ -372,6 +390,11 @@ def _map_from(path: Path, table: pa.Table | None) -> LandmarkMap:
     of_log = "give -1 for none, or a row of the log: 0 and more"
     require_cells(path, table, ["source_observation"], lambda row: row >= -1, of_log)
     require_appearance(path, table)
+    known_size = "a size is positive, or empty for none"
+    require_cells(path, table, ["size_m"], lambda size: ~(size <= 0) & ~np.isinf(size), known_size)
+    known_category = f"categories are {NO_LABEL} for none, or 0 and more"
+    require_cells(path, table, ["category"], lambda each: each >= NO_LABEL, known_category)
+    size_m, category = column(table, "size_m"), column(table, "category")
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
     try:
@@ -384,6 +407,8 @@ def _map_from(path: Path, table: pa.Table | None) -> LandmarkMap:
             planar,
             attributes.get("name", name_in_text(path.stem)),
             calibration=calibration_from(attributes, path),
+            size_m=None if np.isnan(size_m).all() else size_m,
+            category=None if np.all(category == NO_LABEL) else category,
         )
         require_points(position, covariance, planar)
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))

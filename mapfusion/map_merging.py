@@ -43,7 +43,8 @@ from mapfusion.geometry.se2 import motion_sigma
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.plotting import Plan, fused_plan, pair_plan, plot_plans
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.verification.registration import Aligner, Registered, Registration
+from mapfusion.align.aligners import Aligner
+from mapfusion.verification.registration import Registered, Registration
 from mapfusion.verification.rivals import (
     DISTINCT_M,
     SupportedMotion,
@@ -90,6 +91,7 @@ class MapAlignment:
         aligner: name of the method.
         registered: the estimate, its refinement and the verdict.
         registration: settings of refinement and verdict.
+        matching: parameters of the matching.
         verifier: verifier of these maps; None without one.
     """
 
@@ -99,6 +101,7 @@ class MapAlignment:
     aligner: str
     registered: Registered
     registration: Registration
+    matching: MatchParameters
     verifier: PairVerifier | None = None
 
     @property
@@ -148,7 +151,8 @@ class MapAlignment:
     @cached_property
     def mirror_note(self) -> str:
         """Say that the maps look like mirror images of each other; empty if they do not."""
-        if self.accepted or not is_mirrored(self._pairs, self._acceptance, self._refinement):
+        settings = self._acceptance, self._refinement, self.matching
+        if self.accepted or not is_mirrored(self._pairs, *settings):
             return ""
         a, b = self.map_a.name, self.map_b.name
         return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"
@@ -529,7 +533,8 @@ def align_maps(
     *,
     aligner: "str | Method | Aligner | Registration" = "ransac",
     name: str = "",
-    matching: MatchParameters | Correspondences = MatchParameters(),  # noqa: B008  # frozen
+    matching: MatchParameters = MatchParameters(),  # noqa: B008  # frozen
+    correspondences: Correspondences | None = None,
     evidence: PairEvidence | None = None,
     rng: np.random.Generator | int = 0,
 ) -> MapAlignment:
@@ -541,7 +546,8 @@ def align_maps(
         aligner: name of a built-in method, a method, or a `Registration` with settings of the
             refinement and the verdict.
         name: name of the aligner in the result; empty: that of its class.
-        matching: parameters of the matching, or the correspondences if they are known.
+        matching: parameters of the matching.
+        correspondences: correspondences found earlier for these maps; None to match them.
         evidence: evidence found earlier for these maps; None to compute it.
         rng: generator, or its seed.
 
@@ -551,10 +557,11 @@ def align_maps(
     """
     a, b = load_map(map_a, "a"), load_map(map_b, "b")
     registration = _registration(aligner)
-    pairs = matching if isinstance(matching, Correspondences) else match(a, b, matching)
+    pairs = match(a, b, matching) if correspondences is None else correspondences
     ready = registration.on(a, b, pairs, evidence)
     done = ready.register(np.random.default_rng(rng))
-    return MapAlignment(a, b, pairs, name or _name_of(aligner), done, registration, ready.verifier)
+    used = name or _name_of(aligner)
+    return MapAlignment(a, b, pairs, used, done, registration, matching, ready.verifier)
 
 
 def merge_maps(

@@ -214,7 +214,8 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[MapAlignme
                 map_b,
                 aligner=registration,
                 name=entry.name,
-                matching=pairs,
+                matching=settings.align.match,
+                correspondences=pairs,
                 evidence=evidence,
                 rng=generator(settings.seed, "align", entry.name),
             )

@@ -180,7 +180,9 @@ def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
         known |= {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
         keys = {"descriptors": landmarks.descriptor, "labels": landmarks.label}
         there = [name for name, values in keys.items() if values is not None]
-        known["matched by"] = " and ".join(there) or "nothing: neither descriptors nor labels"
+        known["matched by"] = (
+            " and ".join(there) or "geometry alone: neither descriptors nor labels"
+        )
     return _columns_of(path, kind, table, known)
 
 

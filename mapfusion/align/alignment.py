@@ -116,7 +116,7 @@ class Pairs:
         return Pairs(self.map_a, self.map_b, self.correspondences[rows])
 
     @cached_property
-    def cache(self) -> dict[type, Any]:
+    def cache(self) -> dict[Any, Any]:
         """Values that methods keep between calls with the same pairs, by type."""
         return {}
 
@@ -144,6 +144,11 @@ class Pairs:
     def by_name(self) -> bool:
         """True if both maps carry labels, so that landmarks are paired by label."""
         return self.map_a.label is not None and self.map_b.label is not None
+
+    @property
+    def by_geometry(self) -> bool:
+        """True if landmarks were matched by geometry alone."""
+        return self.correspondences.by_geometry
 
     @cached_property
     def p_a(self) -> Float:
@@ -227,10 +232,6 @@ def why_too_few(
     for landmarks in (map_a, map_b):
         if len(landmarks) == 0:
             return f"map {landmarks.name} is empty"
-    if n_pairs == 0 and not shortage:
-        for landmarks in (map_a, map_b):
-            if landmarks.descriptor is None and landmarks.label is None:
-                return f"map {landmarks.name} has neither descriptors nor labels to match by"
     few = f"{n_pairs} correspondences, at least {needed} are needed"
     return f"{few}: {shortage}" if shortage else few
 

@@ -10,6 +10,11 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from mapfusion.align.geometric_matching import (
+    Site,
+    attributes_of_pairs_agree,
+    match_by_geometry,
+)
 from mapfusion.geometry.numerics import (
     WORD,
     Float,
@@ -246,12 +251,15 @@ class Correspondences:
         index_b: rows of map b, shape (N,).
         distance: Euclidean distances of the descriptors, shape (N,); 0 for pairs of labels.
         shortage: why `match` found fewer than three pairs; empty otherwise.
+        size_tolerance: largest relative difference of two sizes, if landmarks were matched by
+            geometry alone; None otherwise.
     """
 
     index_a: np.ndarray
     index_b: np.ndarray
     distance: Float
     shortage: str = ""
+    size_tolerance: float | None = None
 
     def __post_init__(self) -> None:
         n = len(self.index_a)
@@ -267,7 +275,13 @@ class Correspondences:
         return len(self.index_a)
 
     def __getitem__(self, rows: np.ndarray | slice) -> "Correspondences":
-        return Correspondences(self.index_a[rows], self.index_b[rows], self.distance[rows])
+        kept = self.index_a[rows], self.index_b[rows], self.distance[rows]
+        return Correspondences(*kept, size_tolerance=self.size_tolerance)
+
+    @property
+    def by_geometry(self) -> bool:
+        """True if landmarks were matched by geometry alone."""
+        return self.size_tolerance is not None
 
 
 @dataclass(frozen=True)
@@ -312,10 +326,16 @@ class MatchParameters:
             orthogonal. The default keeps almost every mutual nearest neighbour, as in the paper;
             the aligner rejects the false ones.
         height: test of compatible heights.
+        size_tolerance: largest difference of two sizes, as a share of the larger one. Landmarks
+            without a size match any size.
+        tolerance_m: distance in the plane within which common landmarks agree, for maps that are
+            matched by geometry alone; the stated covariances may enlarge it.
     """
 
     max_descriptor_distance: Annotated[float, Range(1e-3, 2, "1")] = 0.6
     height: HeightGate = HeightGate()
+    size_tolerance: Annotated[float, Range(0, 1, "1")] = 0.25
+    tolerance_m: Annotated[float, Range(1e-3, 100, "m")] = 0.1
 
     def __post_init__(self) -> None:
         require_in_range(self)
@@ -324,11 +344,13 @@ class MatchParameters:
 def match(
     map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters = MatchParameters()
 ) -> Correspondences:
-    """Pair the landmarks of two maps: by label if both maps have labels, else by descriptor.
+    """Pair the landmarks of two maps by label, by descriptor, or by geometry alone.
 
-    A pair of descriptors is kept if each is the other's nearest among the landmarks of compatible
-    height (among all landmarks of planar maps), and near enough. Maps with neither labels nor
-    descriptors give no pairs.
+    Maps that both have labels are matched by label, and maps that both have descriptors by
+    descriptor. A pair of descriptors is kept if each is the other's nearest among the landmarks of
+    compatible height (among all landmarks of planar maps), near enough, and if sizes and categories
+    agree. If a map has neither, landmarks are matched by geometry: the pairs are those that the
+    best motions between the maps lay on each other, so that several motions may share a landmark.
     """
     if map_a.label is not None and map_b.label is not None and len(map_a) and len(map_b):
         labels_a, rows_a = _row_of_label(map_a)
@@ -350,20 +372,33 @@ def match(
         name = landmarks.name
         if not len(landmarks):
             return _no_pairs(f"map {name} is empty")
-        if landmarks.descriptor is None and landmarks.label is None:
-            return _no_pairs(f"map {name} has neither descriptors nor labels to match by")
+    height_bound = math.inf if map_a.planar or map_b.planar else parameters.height.bound
+    floor_m2 = parameters.height.floor_m**2
+    if matched_by_geometry(map_a, map_b):
+        gates = height_bound, floor_m2, parameters.tolerance_m, parameters.size_tolerance
+        index_a, index_b = match_by_geometry(map_a, map_b, *gates)
+        shortage = ""
+        if len(index_a) < FEW:
+            shortage = "no motion lays landmarks of the maps on each other; matched by geometry"
+        none = np.zeros(len(index_a))
+        return Correspondences(index_a, index_b, none, shortage, parameters.size_tolerance)
     if map_a.descriptor is None or map_b.descriptor is None:
         described, labelled = (map_b, map_a) if map_a.descriptor is None else (map_a, map_b)
         return _no_pairs(
             f"map {described.name} has descriptors, map {labelled.name} only labels; give both "
-            "maps descriptors, or both labels"
+            "maps descriptors, or both labels, or neither to one to match by geometry"
         )
-    height_bound = math.inf if map_a.planar or map_b.planar else parameters.height.bound
-    floor_m2 = parameters.height.floor_m**2
     rows, nearest_b, distance = _mutually_nearest(map_a, map_b, height_bound, floor_m2)
     kept = distance <= parameters.max_descriptor_distance
+    a, b = (Site.of(each, height_bound, floor_m2) for each in (map_a, map_b))
+    kept &= attributes_of_pairs_agree(a, b, rows, nearest_b, parameters.size_tolerance)
     shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
     return Correspondences(rows[kept], nearest_b[kept], distance[kept], shortage)
+
+
+def matched_by_geometry(map_a: LandmarkMap, map_b: LandmarkMap) -> bool:
+    """Return True if one of two maps has neither descriptors nor labels."""
+    return any(each.descriptor is None and each.label is None for each in (map_a, map_b))
 
 
 def _no_pairs(shortage: str) -> Correspondences:

@@ -21,6 +21,7 @@ from mapfusion.align.alignment import (
 )
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.covariance import alignment_covariance, drift_step
+from mapfusion.align.geometric_matching import mutually_nearest
 from mapfusion.align.mahalanobis_gate import (
     PlanarPairs,
     highest_leverage_pair,
@@ -109,6 +110,11 @@ class Refinement:
             return undetermined(reason, len(pairs), started_s)
         inlier = np.zeros(len(pairs), dtype=bool)
         inlier[rows] = truth > 0.5
+        if pairs.by_geometry:  # several motions offered pairs, which may share a landmark
+            used = pairs[inlier]
+            off = used.p_a[:, :2] - transform_points(T_a_b, used.p_b[:, :2])
+            apart_m = np.hypot(off[:, 0], off[:, 1])
+            inlier[inlier] = mutually_nearest(used.index_a, used.index_b, apart_m)
         reason = why_angle_is_open(pairs[inlier], variance) if np.any(inlier) else ""
         if reason:
             return undetermined(reason, len(pairs), started_s)
@@ -132,7 +138,7 @@ class Refinement:
         if len(used) >= 2:
             # derivative of the solution of the weighted normal equations by each residual
             S = residual_covariances(T_a_b, used.covariance_a, used.covariance_b)
-            W = truth[truth > 0.5, None, None] * np.linalg.inv(S + variance * np.eye(2))
+            W = truth[inlier[rows], None, None] * np.linalg.inv(S + variance * np.eye(2))
             J = motion_jacobian(T_a_b, used.p_b)
             weighted = np.swapaxes(J, 1, 2) @ W
             gain = np.linalg.solve(np.sum(weighted @ J, axis=0), weighted)

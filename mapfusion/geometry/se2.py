@@ -131,3 +131,9 @@ def add_turned(
         xy + cos * sin * (bxx - byy) + (cos * cos - sin * sin) * bxy,
         yy + sin * sin * bxx + 2 * cos * sin * bxy + cos * cos * byy,
     )
+
+
+def rms_distance_m(T_a_b: Float, other: Float, p_b: Float) -> float:
+    """Return the RMS distance between points (n, 2) under two motions (3,)."""
+    apart = transform_points(T_a_b, p_b) - transform_points(other, p_b)
+    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))

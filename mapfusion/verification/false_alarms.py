@@ -14,7 +14,7 @@ An additional gate of twice the widest one admits maps with bent paths.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import moved_point
 from mapfusion.parameters import Range, require_in_range
+
+if TYPE_CHECKING:
+    from mapfusion.verification.geometric_false_alarms import RandomPlacement
 
 # Number of best supporters whose pairs are candidates for the motion that is tested. One of these
 # motions is close to the alignment.
@@ -428,6 +431,12 @@ class Acceptance:
         if pairs.by_name:
             in_plan = pairs.in_plan()
             return ChanceTest(self.false_alarms, gates_m, (in_plan.p_a, in_plan.p_b))
+        if pairs.by_geometry:
+            # a local import, because that module builds on this one
+            from mapfusion.verification.geometric_false_alarms import RandomPlacement
+
+            random_placement = RandomPlacement.of(pairs, self.height, self.patch_m)
+            return ChanceTest(self.false_alarms, gates_m, random_placement)
         # independent pairs of compatible height, best match first
         rows = pairs.of_one_height(self.height)
         rows = rows[np.argsort(pairs.distance[rows], kind="stable")]
@@ -450,32 +459,37 @@ class ChanceTest:
     Attributes:
         false_alarms: largest accepted expected number of chance alignments.
         gates_m: ascending gates, shape (G,).
-        pairs: independent correspondences, or the positions (N, 2) of labelled landmarks.
+        pairs: independent correspondences; the positions (N, 2) of labelled landmarks; or the null
+            hypothesis of maps that are matched by geometry alone.
     """
 
     false_alarms: float
     gates_m: Float
-    pairs: IndependentPairs | tuple[Float, Float]
+    pairs: "IndependentPairs | tuple[Float, Float] | RandomPlacement"
 
     def verify(self, alignment: Alignment) -> Verdict:
         """Test one alignment of the correspondences against chance."""
         if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
             return Verdict(alignment.status, math.nan, alignment.reason)
+        what = "independent correspondences"
         if isinstance(self.pairs, IndependentPairs):
             found = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
-        else:
+        elif isinstance(self.pairs, tuple):
             found = named_false_alarms(*self.pairs, alignment.T_a_b, self.gates_m)
+        else:
+            found = self.pairs.fewest_false_alarms(alignment.T_a_b, self.gates_m)
+            what = "landmarks"
         log10, gate_m, n, k = found
         if log10 <= math.log10(self.false_alarms):
             return Verdict(Status.ACCEPTED, log10)
         if n < MIN_PAIRS:
-            reason = f"{n} independent correspondences are too few to tell from chance"
+            reason = f"{n} {what} are too few to tell from chance"
         elif k < MIN_PAIRS:
-            reason = f"fewer than {MIN_PAIRS} of {n} independent correspondences support it"
+            reason = f"fewer than {MIN_PAIRS} of {n} {what} support it"
         else:
             times = f"{10**log10:.2g}" if log10 < 4 else f"1e{log10:.0f}"
             reason = (
-                f"{k} of {n} independent correspondences agree within {gate_m:g} m; chance alone "
+                f"{k} of {n} {what} agree within {gate_m:g} m; chance alone "
                 f"gives as much {times} times for these maps, {self.false_alarms:g} are allowed"
             )
         return Verdict(Status.REFUSED, log10, reason)

@@ -9,11 +9,18 @@ import scipy
 
 from mapfusion.align.alignment import MIN_PAIRS, Pairs, Undetermined
 from mapfusion.align.clique import Clique
-from mapfusion.align.correspondences import Correspondences, HeightGate, nearest_descriptors
+from mapfusion.align.correspondences import (
+    Correspondences,
+    HeightGate,
+    MatchParameters,
+    match,
+    nearest_descriptors,
+)
+from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.geometry.se2 import transform_points
+from mapfusion.geometry.se2 import rms_distance_m, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
 
@@ -135,9 +142,6 @@ def longest_patch_side_m(p: Float, reach_m: float, least: int) -> float:
     return longest
 
 
-# Motions with a smaller RMS distance of the moved landmarks count as equal: twice the largest error
-# of a correct alignment.
-DISTINCT_M = 1.0
 _LEAST_PAIRS = 6  # no motion among fewer pairs passes the test against chance
 
 
@@ -153,12 +157,6 @@ class SupportedMotion(NamedTuple):
     T_a_b: Float
     log10_false_alarms: float
     inlier: np.ndarray
-
-
-def rms_distance_m(T_a_b: Float, other: Float, p_b: Float) -> float:
-    """Return the RMS distance between points (n, 2) under two motions (3,)."""
-    apart = transform_points(T_a_b, p_b) - transform_points(other, p_b)
-    return float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 
 def distinct_motions(
@@ -187,10 +185,13 @@ def distinct_motions(
     return found
 
 
-def is_mirrored(pairs: Pairs, acceptance: Acceptance, refinement: Refinement) -> bool:
+def is_mirrored(
+    pairs: Pairs, acceptance: Acceptance, refinement: Refinement, matching: MatchParameters
+) -> bool:
     """Return True if the mirror image of map b fits map a beyond chance, and map b does not.
 
-    Maps are mirror images of each other if one of them has y to the right.
+    Maps are mirror images of each other if one of them has y to the right. Pairs by geometry alone
+    belong to a motion, so that the mirror image is matched again.
     """
     flip = np.array([1.0, -1.0, 1.0])
     own, bound = pairs.map_b, math.log10(acceptance.false_alarms)
@@ -204,10 +205,15 @@ def is_mirrored(pairs: Pairs, acceptance: Acceptance, refinement: Refinement) ->
         own.label,
         own.planar,
         own.name,
+        size_m=own.size_m,
+        category=own.category,
     )
 
     def fits(map_b: LandmarkMap) -> bool:
-        given = Pairs(pairs.map_a, map_b, pairs.correspondences)
+        found = pairs.correspondences
+        if pairs.by_geometry and map_b is image:
+            found = match(pairs.map_a, image, matching)
+        given = Pairs(pairs.map_a, map_b, found)
         motions = distinct_motions(given, 1, acceptance, refinement)
         return any(each.log10_false_alarms <= bound for each in motions)
 

@@ -9,6 +9,7 @@ import scipy
 
 from mapfusion.align.alignment import Alignment, Pairs, Status
 from mapfusion.align.covariance import residual_scale, with_common_motion
+from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import (
     least_squares_gain,
@@ -16,7 +17,7 @@ from mapfusion.align.rigid_motion import (
     residual_covariances,
 )
 from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.se2 import compose, transform_points
+from mapfusion.geometry.se2 import compose, rms_distance_m, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.likelihood import COPIED, OWN, TwinShares
@@ -29,13 +30,11 @@ from mapfusion.verification.regions import (
 )
 from mapfusion.verification.rivals import (
     BETWEEN,
-    DISTINCT_M,
     RepeatedLandmarks,
     distinct_motions,
     explained_landmarks,
     longest_patch_side_m,
     repeated_under_others,
-    rms_distance_m,
     self_motions,
 )
 
@@ -319,6 +318,8 @@ class PairVerifier:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
             if rival := self._equal_rival(alignment):
                 status, reason = Status.AMBIGUOUS, f"{rival}; nothing tells which is right: {why}"
+            elif self._pairs.by_geometry:
+                reason = "matched by geometry alone"
             else:
                 reason = f"no evidence to the contrary could be sought: {why}"
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
@@ -376,7 +377,9 @@ class PairVerifier:
         others (sign test).
         """
         maps = self._pairs.map_a, self._pairs.map_b
-        gate_m = max(self._settings.acceptance.gates_m)
+        gates_m = self._settings.acceptance.gates_m
+        # without descriptors many landmarks lie within a wide gate of another one
+        gate_m = min(gates_m) if self._pairs.by_geometry else max(gates_m)
         by_own = explained_landmarks(*maps, alignment.T_a_b, gate_m)
         for T_a_b in self._other_motions(alignment.T_a_b):
             by_rival = explained_landmarks(*maps, T_a_b, gate_m)

@@ -97,6 +97,27 @@ def test_round_trip_landmark_map(tmp_path, optional, planar, n):
         np.testing.assert_equal(getattr(read, name), getattr(written, name))
 
 
+@pytest.mark.parametrize("name", ["map.parquet", "map.csv"])
+def test_attributes_round_trip(tmp_path, name):
+    size_m, category = np.array([0.3, np.nan, 1.5]), np.array([2, -1, 0], np.int32)
+    written = replace(a_map(n=3), size_m=size_m, category=category)
+    write_map(tmp_path / name, written)
+    read = read_map(tmp_path / name)
+    np.testing.assert_array_equal(read.size_m, size_m)
+    np.testing.assert_array_equal(read.category, category)
+    some = read[np.array([2, 0])]
+    np.testing.assert_array_equal(some.size_m, size_m[[2, 0]])
+
+
+@pytest.mark.parametrize(("column", "value"), [("size_m", 0.0), ("category", -2)])
+def test_an_unusable_attribute_is_named(tmp_path, column, value):
+    frame = pd.DataFrame({"x_m": [0.0, 1.0], "y_m": 0.0, "cov_xx_m2": 1.0, "cov_xy_m2": 0.0})
+    frame = frame.assign(cov_yy_m2=1.0, **{column: [1, value]})
+    frame.to_csv(tmp_path / "map.csv", index=False)
+    with pytest.raises(InputError, match=rf"column {column}: is {value:g} in row 1"):
+        read_map(tmp_path / "map.csv")
+
+
 def test_empty_map_round_trips(tmp_path):
     write_map(tmp_path / "map.parquet", a_map(n=0))
     assert len(read_map(tmp_path / "map.parquet")) == 0

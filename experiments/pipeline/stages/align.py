@@ -5,7 +5,7 @@ Each aligner has a stage, so a changed aligner does not affect the stored estima
 
 import functools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,12 @@ from experiments.pipeline.tables import (
 )
 from experiments.plugins.discovery import callable_aligner
 from mapfusion.align.alignment import Alignment, Pairs, Status
-from mapfusion.align.correspondences import Correspondences, MatchParameters, match
+from mapfusion.align.correspondences import (
+    Correspondences,
+    MatchParameters,
+    match,
+    matched_by_geometry,
+)
 from mapfusion.align.refinement import Refinement
 from mapfusion.geometry.numerics import generator
 from mapfusion.landmark_map import LandmarkMap
@@ -290,7 +295,10 @@ def _refinements(
     rivals = read_rows(rivals_path(job.inputs["match"], part), RIVALS)
     refinements = []
     for k, map_a, map_b in pairs_of_maps(job, smoothed, iterations):
-        pairs = Pairs(map_a, map_b, correspondences_of(at_iteration(offered, k)))
+        stored = correspondences_of(at_iteration(offered, k))
+        if matched_by_geometry(map_a, map_b):
+            stored = replace(stored, size_tolerance=MatchParameters().size_tolerance)
+        pairs = Pairs(map_a, map_b, stored)
         evidence = evidence_of(at_iteration(rivals, k), (map_a, map_b), verifier.evidence)
         refinements.append((k, VerifiedRefinement(pairs, verifier.refinement, verifier, evidence)))
     return refinements

@@ -134,7 +134,7 @@ def degenerate_inputs():
             40,
             "",
         ),
-        "no descriptors": (full, bare, 0, "map south has neither descriptors nor labels"),
+        "no descriptors": (full, bare, 0, "0 correspondences"),
         "empty a": (empty, full, 0, "map south is empty"),
         "empty b": (full, empty, 0, "map south is empty"),
         "both empty": (empty, empty, 0, "is empty"),

@@ -202,7 +202,8 @@ def test_the_test_that_left_too_few_pairs_is_named():
     assert "none are labels of both maps" in said
     assert "40 from 0 to 39" in said
     assert "40 from 100 to 139" in said
-    assert "neither descriptors nor labels" in told_apart(a, named[1])
+    said = told_apart(a, replace(named[1], label=label))
+    assert "map " + a.name + " has descriptors, map " + b.name + " only labels" in said
     few = b.descriptor.copy()
     few[1:] = np.nan
     assert "1 mutually nearest descriptors" in told_apart(a, replace(b, descriptor=few))
