@@ -292,16 +292,18 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
     """
     map_a, map_b = _read_map(path_a), _read_map(path_b)
     pairs = match(map_a, map_b, settings.align.match)
-    evidence = settings.align.verifier.on(Pairs(map_a, map_b, pairs)).evidence
+    evidence = None
     for entry in settings.align.aligners:
         registration = _registration(entry, settings.align)
-        given = map_a, map_b, pairs, evidence
-        done = registration.on(*given).register(generator(settings.seed, "align", entry.name))
+        ready = registration.on(map_a, map_b, pairs, evidence)
+        done = ready.register(generator(settings.seed, "align", entry.name))
+        evidence = None if ready.verifier is None else ready.verifier.evidence
         if done.estimated.status not in NOT_RUN:
-            done = registration.on(*given).register(generator(settings.seed, "align", entry.name))
+            ready = registration.on(map_a, map_b, pairs, evidence)
+            done = ready.register(generator(settings.seed, "align", entry.name))
         row = {"aligner": entry.name, "elapsed_s": done.estimated.elapsed_s}
         row |= {"n_inliers": int(done.refined.inlier.sum())} | estimate_row(len(pairs), *done)
-        yield row
+        yield row | {"overlap": done.refined.overlap, "heights": done.refined.heights}
 
 
 def align_note(path_a: Path, path_b: Path, settings: Scenario) -> str:
@@ -362,8 +364,8 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         pairs.append(AlignedPair(a, b, found, offered, false_alarms))
         if done.verdict.accepted and done.verdict.reason:
             notes[a, b] = done.verdict.reason
-        if found.status is Status.AMBIGUOUS and ready.verifier is not None:
-            rivals = ready.verifier.rivals_of(done.refined)
+        if found.status is Status.AMBIGUOUS:
+            rivals = ready.rivals_of(done.refined)
             pairs += [AlignedPair(a, b, rival, offered, false_alarms) for rival in rivals]
     chosen = settings.merge
     fusion = merge_maps(maps, pairs, chosen.parameters, make_fuser(chosen.fuser))

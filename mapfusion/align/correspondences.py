@@ -5,11 +5,12 @@ one map with all landmarks of compatible height in the other map.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from mapfusion.align.frames import height_offset_m, in_local_frame
 from mapfusion.geometry.numerics import (
     WORD,
     Float,
@@ -244,12 +245,19 @@ class Correspondences:
         index_b: rows of map b, shape (N,).
         distance: Euclidean distances of the descriptors, shape (N,); 0 for pairs of labels.
         shortage: why `match` found fewer than three pairs; empty otherwise.
+        height_offset_m: height of map b above map a, which was subtracted before the test of
+            heights.
+        at_any_height: pairs without the test of heights; None if these are the same.
+        set_aside: landmarks that were not matched, in words; empty if all were.
     """
 
     index_a: np.ndarray
     index_b: np.ndarray
     distance: Float
     shortage: str = ""
+    height_offset_m: float = 0.0
+    at_any_height: "Correspondences | None" = None
+    set_aside: str = ""
 
     def __post_init__(self) -> None:
         n = len(self.index_a)
@@ -265,7 +273,8 @@ class Correspondences:
         return len(self.index_a)
 
     def __getitem__(self, rows: np.ndarray | slice) -> "Correspondences":
-        return Correspondences(self.index_a[rows], self.index_b[rows], self.distance[rows])
+        parts = (self.index_a[rows], self.index_b[rows], self.distance[rows])
+        return Correspondences(*parts, height_offset_m=self.height_offset_m)
 
 
 @dataclass(frozen=True)
@@ -320,9 +329,16 @@ class MatchParameters:
 
 
 def match(
-    map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters = MatchParameters()
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    parameters: MatchParameters = MatchParameters(),
+    one_floor: bool = False,
 ) -> Correspondences:
     """Pair the landmarks of two maps: by label if both maps have labels, else by descriptor.
+
+    A constant difference of the heights of both maps is subtracted before heights are compared,
+    unless the maps are known to be of `one_floor`. Landmarks whose standard deviation exceeds the
+    size of their map are not matched, because they have no known place.
 
     A pair of descriptors is kept if each is the other's nearest among the landmarks of compatible
     height (among all landmarks of planar maps), and near enough. Maps with neither labels nor
@@ -343,7 +359,11 @@ def match(
                 f"{len(common) or 'none'} {both} (map {map_a.name}: {a}; map {map_b.name}: {b}); "
                 "where both maps have labels, landmarks are matched by them alone"
             )
-        return Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
+        named = Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
+        if one_floor:
+            return named
+        offset_m = _height_offset(map_a, map_b, named, parameters.height)
+        return _placed(map_a, map_b, replace(named, height_offset_m=offset_m))
     for landmarks in (map_a, map_b):
         name = landmarks.name
         if not len(landmarks):
@@ -358,10 +378,59 @@ def match(
         )
     height_bound = math.inf if map_a.planar or map_b.planar else parameters.height.bound
     floor_m2 = parameters.height.floor_m**2
-    rows, nearest_b, distance = _mutually_nearest(map_a, map_b, height_bound, floor_m2)
+    offset_m, free = 0.0, None
+    if math.isfinite(height_bound) and not one_floor:
+        rows, nearest_b, distance = _mutually_nearest(map_a, map_b, math.inf, 0.0)
+        kept = distance <= parameters.max_descriptor_distance
+        free = Correspondences(rows[kept], nearest_b[kept], distance[kept])
+        offset_m = _height_offset(map_a, map_b, free, parameters.height)
+    lowered = in_local_frame(map_b, np.zeros(2), offset_m)
+    rows, nearest_b, distance = _mutually_nearest(map_a, lowered, height_bound, floor_m2)
     kept = distance <= parameters.max_descriptor_distance
     shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
-    return Correspondences(rows[kept], nearest_b[kept], distance[kept], shortage)
+    parts = (rows[kept], nearest_b[kept], distance[kept])
+    found = Correspondences(*parts, shortage, offset_m, free)
+    return found if one_floor else _placed(map_a, map_b, found)
+
+
+def _height_offset(
+    map_a: LandmarkMap, map_b: LandmarkMap, pairs: Correspondences, gate: HeightGate
+) -> float:
+    """Return the height of map b above map a, 0 if none is significant or a map is planar."""
+    if map_a.planar or map_b.planar:
+        return 0.0
+    a, b = pairs.index_a, pairs.index_b
+    variance = map_a.covariance_m2[a, 2, 2] + map_b.covariance_m2[b, 2, 2] + gate.floor_m**2
+    return height_offset_m(map_b.position_m[b, 2] - map_a.position_m[a, 2], variance, gate.bound)
+
+
+# Diameter of a uniform disc over the median distance from its centre.
+_DIAMETER_OVER_MEDIAN = 2 * math.sqrt(2)
+
+
+def _placed(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Correspondences) -> Correspondences:
+    """Drop the pairs of landmarks whose standard deviation exceeds the size of their map."""
+    kept, told = np.ones(len(pairs), dtype=bool), []
+    for landmarks, index in ((map_a, pairs.index_a), (map_b, pairs.index_b)):
+        plan = landmarks.position_m[:, :2]
+        off_m = np.linalg.norm(plan - np.median(plan, axis=0), axis=1)
+        size_m = _DIAMETER_OVER_MEDIAN * float(np.median(off_m))
+        sigma_m = np.sqrt(np.trace(landmarks.covariance_m2[:, :2, :2], axis1=1, axis2=2) / 2)
+        wide = np.flatnonzero(sigma_m > size_m)
+        # where most landmarks are that uncertain, the covariances or their units are wrong
+        if size_m > 0 and 0 < len(wide) < len(plan) / 2:
+            kept &= ~np.isin(index, wide)
+            number = "landmark" if len(wide) == 1 else "landmarks"
+            told.append(
+                f"{len(wide)} {number} of {landmarks.name} left aside: sigma up to "
+                f"{_short(float(sigma_m[wide].max()))} m in a map of {_short(size_m)} m"
+            )
+    if not told:
+        return pairs
+    parts = (pairs.index_a[kept], pairs.index_b[kept], pairs.distance[kept])
+    return Correspondences(
+        *parts, pairs.shortage, pairs.height_offset_m, pairs.at_any_height, "; ".join(told)
+    )
 
 
 def _no_pairs(shortage: str) -> Correspondences:
