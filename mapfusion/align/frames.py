@@ -104,6 +104,19 @@ class Overlap(NamedTuple):
         _, at_middle = moved_motion(T_a_b, covariance, -p_a, -middle)
         return cls(p_a, middle, float(T_a_b[2]), at_middle)
 
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the moved point, the root of the sum of both variances."""
+        return math.sqrt(self.covariance[0, 0] + self.covariance[1, 1])
+
+    def document(self) -> dict[str, float]:
+        """Return all numbers by name, for files."""
+        found = {"a_x_m": self.p_a[0], "a_y_m": self.p_a[1]}
+        found |= {"b_x_m": self.p_b[0], "b_y_m": self.p_b[1]}
+        axes = ("xx_m2", "xy_m2", "xt_m_rad", "yy_m2", "yt_m_rad", "tt_rad2")
+        upper = self.covariance[np.triu_indices(3)]
+        return found | {f"cov_{name}": x for name, x in zip(axes, upper, strict=True)}
+
     def moved(self, by_a: Float, by_b: Float) -> "Overlap":
         """Return the same motion in frames in which all points are larger by (2,)."""
         return self._replace(p_a=self.p_a + by_a, p_b=self.p_b + by_b)
@@ -173,6 +186,27 @@ class HeightDifference:
     def loses_pairs(self) -> bool:
         """True if most pairs fail the test of heights because of the tilt."""
         return self.is_tilted and self.n_tilted > 2 * self.n_level
+
+    def document(self) -> dict[str, float | bool]:
+        """Return the numbers by name, for files."""
+        return {
+            "offset_m": self.offset_m,
+            "sigma_m": self.sigma_m,
+            "used_offset_m": self.used_offset_m,
+            "tilt_deg": math.degrees(self.tilt_rad),
+            "tilt_sigma_deg": math.degrees(self.tilt_sigma_rad),
+            "is_tilted": self.is_tilted,
+        }
+
+    def offset_note(self, name_a: str, name_b: str) -> str:
+        """Return the offset in words; empty if it is not significant."""
+        if not self.used_offset_m:
+            return ""
+        side = "higher" if self.offset_m > 0 else "lower"
+        return (
+            f"{name_b} is {abs(self.offset_m):.3f} m {side} than {name_a} "
+            f"(sigma {self.sigma_m:.3f} m)"
+        )
 
     def tilt_note(self, name_a: str, name_b: str) -> str:
         """Return the tilt in words; empty if the maps are level."""

@@ -391,7 +391,10 @@ class PairRegistration:
         heights = heights_of(pairs, refined, self._refinement.gate_m)
         moved = moved._replace(refined=replace(moved.refined, heights=heights))
         notes = [pairs.correspondences.set_aside, shared_observations(pairs, refined)]
-        tilt = "" if heights is None else heights.tilt_note(pairs.map_a.name, pairs.map_b.name)
+        tilt, names = "", (pairs.map_a.name, pairs.map_b.name)
+        if heights is not None:
+            tilt = heights.tilt_note(*names)
+            notes.insert(0, heights.offset_note(*names))
         if verdict.accepted and heights is not None and heights.loses_pairs:
             verdict = replace(verdict, status=Status.REFUSED, reason=tilt)
         elif verdict.accepted:

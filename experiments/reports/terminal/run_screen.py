@@ -360,7 +360,7 @@ _MOTIONS |= columns(".3f", tx_m="estim.\ntx, m", ty_m="\nty, m")
 _MOTIONS |= columns(".4f", theta_rad="\ntheta, rad")
 _MOTIONS |= columns(".3f", refined_tx_m="refined\ntx, m", refined_ty_m="\nty, m")
 _MOTIONS |= columns(".4f", refined_theta_rad="\ntheta, rad")
-_MOTIONS |= columns(">", sigma_m="sigma\nm", sigma_rad="\nrad")
+_MOTIONS |= columns(">", sigma_m="sigma\nm", sigma_rad="\nrad", overlap_m="at the\noverlap, m")
 _VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
 _VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
 _VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
@@ -387,8 +387,13 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
         both = zip(bounds, sigma, strict=True)
         return ["–" if math.isnan(x) else f"{bound}{x:{form}}" for bound, x in both]
 
+    overlaps = [math.nan if x is None else x.sigma_m for x in found["overlap"]]
     stated = found.assign(sigma_m=texts(sigma_m, ".3f"), sigma_rad=texts(sigma_rad, ".4f"))
-    note = "sigma: stated for the refined estimate, of distance and angle"
+    stated = stated.assign(overlap_m=texts(overlaps, ".3f"))
+    note = (
+        "sigma: stated for the refined estimate, of distance and angle, at the origin of map b\n"
+        "and at the middle of the landmarks in both maps"
+    )
     if found["lower_bound"].any():
         note += f"\n{_LOWER_BOUND}"
     print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
@@ -416,10 +421,16 @@ def print_fused(
         "like remaining duplicates"
     ]
     sigmas = zip(*motion_sigma(fused.motion_covariance), strict=True)
-    for name, (x_m, y_m, theta_rad), sigma in zip(maps, fused.T_first_map, sigmas, strict=True):
+    for k, (name, T, sigma) in enumerate(zip(maps, fused.T_first_map, sigmas, strict=True)):
+        x_m, y_m, theta_rad = T
         if not math.isnan(x_m):
             bound = "≥ " if lower_bound else ""
             stated = f"sigma {bound}{sigma[0]:.3f} m, {bound}{sigma[1]:.4f} rad"
+            if fused.middle_covariance is not None:
+                middle_m, _ = motion_sigma(fused.middle_covariance[k])
+                stated += f", {bound}{middle_m:.3f} m at its middle"
+            if fused.height_m is not None and fused.height_m[k]:
+                stated += f"; raised by {fused.height_m[k]:.3f} m"
             stated = stated if any(sigma) else "the frame"
             T = f"({x_m:.3f} m, {y_m:.3f} m, {theta_rad:.4f} rad)"
             lines.append(f"  {name}: T_first_map = {T}, {stated}")
