@@ -261,16 +261,30 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
     }
 
 
-def read_map(path: Path, alone: bool = False) -> LandmarkMap:
+def _with_sigma(sigma_m: float) -> pa.Schema:
+    """Return the schema of maps in which missing covariances are those of one sigma."""
+    variances = {"cov_xx_m2", "cov_yy_m2", "cov_zz_m2"}
+    fields = [
+        described(field, "", sigma_m**2 if field.name in variances else 0.0)
+        if field.name in COVARIANCE_FIELDS
+        else field
+        for field in LANDMARKS
+    ]
+    return pa.schema(fields, LANDMARKS.metadata)
+
+
+def read_map(path: Path, alone: bool = False, sigma_m: float | None = None) -> LandmarkMap:
     """Read a map.
 
     The files beside a Parquet map are read, too, unless `alone` is True. Files beside a CSV map are
-    not read, since they belong to the Parquet map of the same name.
+    not read, since they belong to the Parquet map of the same name. `sigma_m` is the standard
+    deviation per axis of the landmarks of a map without columns of covariances.
 
     Raises:
         InputError: a file is missing, damaged or not as documented.
     """
-    table, attributes = read_open_table(path, LANDMARKS)
+    known = LANDMARKS if sigma_m is None else _with_sigma(sigma_m)
+    table, attributes = read_open_table(path, known)
     finite = "give a finite number, or remove the row"
     require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
     counted = "a landmark has at least one observation"

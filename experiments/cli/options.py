@@ -111,6 +111,16 @@ Fresh = Annotated[bool, typer.Option("--fresh", help="Compute again what is stor
 Results = Annotated[Path, typer.Option(help="Folder that results go to.", show_default="results")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="File or folder to write.")]
 OutputFolder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")]
+SigmaM = Annotated[
+    float | None,
+    typer.Option(
+        "--sigma",
+        metavar="METRES",
+        min=1e-6,
+        max=1e3,
+        help="Standard deviation per axis of the landmarks of maps without covariances.",
+    ),
+]
 DocumentFile = Annotated[
     Path | None, typer.Option("--output", "-o", help="File for what --json prints.")
 ]

@@ -111,6 +111,7 @@ def align(
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
+    sigma_m: options.SigmaM = None,
     require_accepted: Annotated[
         bool, typer.Option("--require-accepted", help="Exit code 1 if no estimate is accepted.")
     ] = False,
@@ -134,12 +135,12 @@ def align(
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
     rows = []
-    for row in single.align(map_a, map_b, settings):
+    for row in single.align(map_a, map_b, settings, sigma_m):
         rows.append(row)
         if not as_json:
             print_verdict(row)
     accepted = any(single.final_status(row)[0] is Status.ACCEPTED for row in rows)
-    note = "" if accepted else single.align_note(map_a, map_b, settings)
+    note = "" if accepted else single.align_note(map_a, map_b, settings, sigma_m)
     found = export.alignment_document((map_a, map_b), settings.seed, rows, note)
     export.publish_json("align", found, as_json, output)
     if not as_json:
@@ -159,6 +160,7 @@ def merge(
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
+    sigma_m: options.SigmaM = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Fuse maps that alignments connect: `mapfusion merge A.parquet B.parquet -o F.parquet`.
@@ -176,7 +178,7 @@ def merge(
     options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
-    merged = single.merge(maps, settings)
+    merged = single.merge(maps, settings, sigma_m)
     paths = single.save_fused(output, merged)
     found = export.fusion_document(paths, settings.seed, merged, maps)
     export.publish_json("merge", found, as_json)

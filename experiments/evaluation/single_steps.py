@@ -49,7 +49,7 @@ from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
 from mapfusion.smoother.odometry_calibration import Calibration, calibrate
 from mapfusion.smoother.smooth import SmootherParameters, with_path_errors
 from mapfusion.tables import NO_LABEL
-from mapfusion.verification.registration import Registration
+from mapfusion.verification.registration import Registration, common_unit
 from mapfusion.verification.rivals import is_mirrored
 from sim.rendering.frame_source import FrameSource
 from sim.trajectory import Trajectory, read_trajectory
@@ -276,21 +276,25 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     return Registration(aligner, settings.refinement, settings.verifier)
 
 
-def _read_map(path: Path) -> LandmarkMap:
+def _read_map(path: Path, sigma_m: float | None) -> LandmarkMap:
     """Read a map to be aligned; raise InputError also if its descriptors are no unit vectors."""
-    landmarks = read_map(path)
+    landmarks = read_map(path, sigma_m=sigma_m)
     if why := why_not_unit_vectors(landmarks):
         raise InputError(f"{path}: {why}")
     return landmarks
 
 
-def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, Any]]:
+def align(
+    path_a: Path, path_b: Path, settings: Scenario, sigma_m: float | None = None
+) -> Iterator[dict[str, Any]]:
     """Yield for each aligner a row with its estimate, the refinement and the verdict.
+
+    `sigma_m` is the standard deviation of landmarks of maps without covariances.
 
     Each aligner is called twice with the same random numbers, and the second call is timed. The
     first call compiles kernels and starts processes.
     """
-    map_a, map_b = _read_map(path_a), _read_map(path_b)
+    map_a, map_b = _read_map(path_a, sigma_m), _read_map(path_b, sigma_m)
     pairs = match(map_a, map_b, settings.align.match)
     evidence = None
     for entry in settings.align.aligners:
@@ -306,19 +310,21 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[dict[str, 
         yield row | {"overlap": done.refined.overlap, "heights": done.refined.heights}
 
 
-def align_note(path_a: Path, path_b: Path, settings: Scenario) -> str:
+def align_note(path_a: Path, path_b: Path, settings: Scenario, sigma_m: float | None = None) -> str:
     """Return a cause for which every aligner fails on two maps; empty if none is found."""
-    map_a, map_b = read_map(path_a), read_map(path_b)
+    map_a, map_b = read_map(path_a, sigma_m=sigma_m), read_map(path_b, sigma_m=sigma_m)
     pairs = Pairs(map_a, map_b, match(map_a, map_b, settings.align.match))
-    return _mirror_note(pairs, settings.align)
+    return _cause_note(pairs, settings.align)
 
 
-def _mirror_note(pairs: Pairs, settings: Align) -> str:
-    """Say that two maps look like mirror images of each other; empty if they do not."""
-    if not is_mirrored(pairs, settings.acceptance, settings.refinement):
-        return ""
+def _cause_note(pairs: Pairs, settings: Align) -> str:
+    """Say that two maps are mirror images, or both in another unit; empty if they are not."""
     a, b = pairs.map_a.name, pairs.map_b.name
-    return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"
+    if is_mirrored(pairs, settings.acceptance, settings.refinement):
+        return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"
+    if unit := common_unit(pairs.map_a, pairs.map_b, settings.match, settings.refinement):
+        return f"{a} and {b} fit each other as maps in {unit}: write both in metres"
+    return ""
 
 
 def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
@@ -331,8 +337,10 @@ def final_status(row: Mapping[str, Any]) -> tuple[Status, str]:
     return status, row["reason"] or row["refined_reason"] or row["acceptance_reason"]
 
 
-def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
+def merge(paths: Sequence[Path], settings: Scenario, sigma_m: float | None = None) -> MergeResult:
     """Align all pairs of maps and fuse the maps.
+
+    `sigma_m` is the standard deviation of landmarks of maps without covariances.
 
     The maps of a pair are in the order of their robots' names.
 
@@ -344,7 +352,7 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
     name, entries = settings.merge.aligner, {each.name: each for each in settings.align.aligners}
     if name not in entries:
         raise InputError(f"merge.aligner: {name} is not among {', '.join(entries)}")
-    maps = [_read_map(path) for path in paths]
+    maps = [_read_map(path, sigma_m) for path in paths]
     registration, pairs = _registration(entries[name], settings.align), list[AlignedPair]()
     notes: dict[tuple[int, int], str] = {}
     order = sorted(range(len(maps)), key=lambda k: (name_order(maps[k].name), str(paths[k])))
@@ -358,7 +366,7 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergeResult:
         if found.status in NOT_RUN:  # the reason does not name the aligner
             found = replace(found, reason=f"{name}: {found.status}: {found.reason}")
         elif not found.ok and (
-            note := _mirror_note(Pairs(maps[a], maps[b], offered), settings.align)
+            note := _cause_note(Pairs(maps[a], maps[b], offered), settings.align)
         ):
             found = replace(found, reason=f"{found.reason}; {note}")
         pairs.append(AlignedPair(a, b, found, offered, false_alarms))

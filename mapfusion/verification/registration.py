@@ -20,7 +20,8 @@ from mapfusion.align.alignment import (
     undetermined,
     why_too_few,
 )
-from mapfusion.align.correspondences import Correspondences, HeightGate
+from mapfusion.align.clique import Clique
+from mapfusion.align.correspondences import Correspondences, HeightGate, MatchParameters, match
 from mapfusion.align.covariance import alignment_covariance, estimate_drift_m
 from mapfusion.align.frames import (
     HeightDifference,
@@ -462,6 +463,42 @@ def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
     return (
         f"{n} of {of} pairs are the same observations in {names}: the maps are not independent, "
         "and fused covariances are too small"
+    )
+
+
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}  # in metres
+
+
+def common_unit(
+    map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters, refinement: Refinement
+) -> str:
+    """Return the unit of length in which two maps fit each other; empty if there is none.
+
+    Two maps in millimetres differ by many times the gates of metres. In their unit most of the
+    correspondences agree.
+    """
+    for unit, size_m in _UNITS.items():
+        a, b = (_scaled(each, size_m) for each in (map_a, map_b))
+        pairs = Pairs(a, b, match(a, b, parameters))
+        aligner = MethodAligner(Clique())
+        found = aligner.align_pairs(pairs, np.random.default_rng(0))
+        if not found.ok:
+            continue
+        refined = refinement.refine(pairs, found.T_a_b)
+        extent_m = float(np.ptp(pairs.p_b[:, :2], axis=0).max(initial=0.0))
+        if refined.ok and 2 * np.count_nonzero(refined.inlier) > len(pairs) and extent_m > 1:
+            return unit
+    return ""
+
+
+def _scaled(landmarks: LandmarkMap, size_m: float) -> LandmarkMap:
+    """Return a map in metres whose unit has this size, without joint covariance and viewing."""
+    return replace(
+        landmarks,
+        position_m=landmarks.position_m * size_m,
+        covariance_m2=landmarks.covariance_m2 * size_m**2,
+        joint=None,
+        viewing=None,
     )
 
 

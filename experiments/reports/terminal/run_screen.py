@@ -360,11 +360,11 @@ _MOTIONS |= columns(".3f", tx_m="estim.\ntx, m", ty_m="\nty, m")
 _MOTIONS |= columns(".4f", theta_rad="\ntheta, rad")
 _MOTIONS |= columns(".3f", refined_tx_m="refined\ntx, m", refined_ty_m="\nty, m")
 _MOTIONS |= columns(".4f", refined_theta_rad="\ntheta, rad")
-_MOTIONS |= columns(">", sigma_m="sigma\nm", sigma_rad="\nrad", overlap_m="at the\noverlap, m")
+_MOTIONS |= columns(">", sigma_m="sigma\nm", sigma_rad="\nrad")
 _VERDICTS = columns("", aligner="aligner", verdict="verdict") | columns(">", inliers="inliers")
 _VERDICTS |= columns(".0f", log10_false_alarms="NFA\nlog10")
 _VERDICTS |= columns("+.1f", log10_evidence="evidence\nlog10")
-_VERDICTS |= columns(">", time="time\nms")
+_VERDICTS |= columns(">", overlap_m="sigma\nm", time="time\nms")
 
 
 def print_verdict(row: dict[str, Any]) -> None:
@@ -389,11 +389,7 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
 
     overlaps = [math.nan if x is None else x.sigma_m for x in found["overlap"]]
     stated = found.assign(sigma_m=texts(sigma_m, ".3f"), sigma_rad=texts(sigma_rad, ".4f"))
-    stated = stated.assign(overlap_m=texts(overlaps, ".3f"))
-    note = (
-        "sigma: stated for the refined estimate, of distance and angle, at the origin of map b\n"
-        "and at the middle of the landmarks in both maps"
-    )
+    note = "sigma: stated for the refined estimate, of distance and angle, at the origin of map b"
     if found["lower_bound"].any():
         note += f"\n{_LOWER_BOUND}"
     print_frame(stated, _MOTIONS, "T_a_b, as estimated and refined", note)
@@ -401,11 +397,14 @@ def print_estimates(rows: Sequence[dict[str, Any]]) -> None:
     verdicts = [str(final_status(row)[0]) for row in rows]
     times = (1e3 * found["elapsed_s"]).map(two_digits)
     print_frame(
-        found.assign(inliers=inliers, time=times, verdict=verdicts),
+        found.assign(
+            inliers=inliers, time=times, verdict=verdicts, overlap_m=texts(overlaps, ".3f")
+        ),
         _VERDICTS,
         "Verdicts on the refined estimates",
         "NFA: expected number of alignments with as much support by chance; evidence:\n"
-        "likelihood ratio of both robots' observations; time: of the estimate",
+        "likelihood ratio of both robots' observations; sigma: of the distance, at the\n"
+        "middle of the landmarks in both maps; time: of the estimate",
     )
 
 
@@ -430,7 +429,8 @@ def print_fused(
                 middle_m, _ = motion_sigma(fused.middle_covariance[k])
                 stated += f", {bound}{middle_m:.3f} m at its middle"
             if fused.height_m is not None and fused.height_m[k]:
-                stated += f"; raised by {fused.height_m[k]:.3f} m"
+                way = "raised" if fused.height_m[k] > 0 else "lowered"
+                stated += f"; {way} by {abs(fused.height_m[k]):.3f} m"
             stated = stated if any(sigma) else "the frame"
             T = f"({x_m:.3f} m, {y_m:.3f} m, {theta_rad:.4f} rad)"
             lines.append(f"  {name}: T_first_map = {T}, {stated}")
