@@ -237,14 +237,14 @@ def _fit_heights(by: Float, up_m: Float, variance_m2: Float) -> _PlaneFit:
     for k in range(_ROUNDS):
         weighted = by.T * (weight / variance_m2)
         normal = weighted @ by
-        value = np.linalg.solve(normal, weighted @ up_m)
+        value = np.asarray(np.linalg.solve(normal, weighted @ up_m), np.float64)
         off = np.abs(up_m - by @ value) / np.sqrt(variance_m2)
         scale2 = max(1.0, (float(np.median(off)) / _MEDIAN_OVER_SIGMA) ** 2)
         if k < _ROUNDS // 2:
             weight = 1 / np.maximum(off, math.sqrt(scale2) / 10)
         else:
             weight = (_DOF + 1) / (_DOF + off**2 / scale2)
-    return _PlaneFit(value, scale2 * np.linalg.inv(normal))
+    return _PlaneFit(value, scale2 * np.asarray(np.linalg.inv(normal), np.float64))
 
 
 def height_difference(
@@ -310,4 +310,5 @@ def level_heights(n_maps: int, robots: np.ndarray, offset_m: Float, sigma_m: Flo
     by = np.zeros((len(robots), n_maps))
     each = np.arange(len(robots))
     by[each, robots[:, 0]], by[each, robots[:, 1]] = -1.0, 1.0
-    return np.linalg.lstsq(by / sigma_m[:, None], offset_m / sigma_m, rcond=None)[0]
+    solved = np.linalg.lstsq(by / sigma_m[:, None], offset_m / sigma_m, rcond=None)[0]
+    return np.asarray(solved, np.float64)

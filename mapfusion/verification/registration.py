@@ -62,10 +62,15 @@ class VerifiedRefinement:
         verifier: Verifier | None,
         evidence: PairEvidence | None = None,
     ) -> None:
-        self.pairs, self._refinement, self.gate_m = pairs, refinement, refinement.gate_m
+        self.pairs, self._refinement = pairs, refinement
         self.verifier: PairVerifier | None = verifier and verifier.on(pairs, evidence)
         self._refined: dict[tuple, Alignment] = {}
         self._verdicts: dict[tuple, Verdict] = {}
+
+    @property
+    def gate_m(self) -> float:
+        """Largest distance in the plane of a pair under the estimate."""
+        return self._refinement.gate_m
 
     def verify(self, estimated: Alignment) -> tuple[Alignment, Verdict]:
         """Return the refined alignment of an estimate, and the verdict on it."""

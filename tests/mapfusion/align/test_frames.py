@@ -254,13 +254,12 @@ def test_shared_observations_are_named() -> None:
 
 def test_two_maps_in_millimetres_are_named() -> None:
     a, b = two_maps()
-    large = [
+    large_a, large_b = (
         replace(m, position_m=1000 * m.position_m, covariance_m2=1e6 * m.covariance_m2)
         for m in (a, b)
-    ]
-    settings_of_match = MatchParameters()
-    assert common_unit(*large, settings_of_match, Refinement()) == "millimetres"
-    assert common_unit(a, b, settings_of_match, Refinement()) == ""
+    )
+    assert common_unit(large_a, large_b, MatchParameters(), Refinement()) == "millimetres"
+    assert common_unit(a, b, MatchParameters(), Refinement()) == ""
 
 
 def test_a_map_without_covariances_needs_a_stated_sigma(tmp_path) -> None:
