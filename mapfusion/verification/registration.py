@@ -357,6 +357,7 @@ class PairRegistration:
 
     def __init__(self, method: Method | Aligner, refinement: VerifiedRefinement) -> None:
         self._aligner, self._refinement = as_aligner(method), refinement
+        self._described: dict[int, tuple[Alignment, Alignment, Verdict, str]] = {}
 
     @property
     def verifier(self) -> PairVerifier | None:
@@ -390,25 +391,30 @@ class PairRegistration:
 
     def _in_given_frames(self, local: Registered) -> Registered:
         """Return a result in the given frames, with overlap and heights, and what these tell."""
-        pairs, refined, verdict = self._refinement.pairs, local.refined, local.verdict
-        moved = Registered(self._moved(local.estimated), self._moved(refined), verdict)
+        estimated, refined = self._moved(local.estimated), local.refined
         if not refined.inlier.any() or not np.isfinite(refined.T_a_b).all():
-            return moved
+            return Registered(estimated, self._moved(refined), local.verdict)
+        if id(refined) not in self._described:  # equal estimates share one refined alignment
+            self._described[id(refined)] = (refined, *self._with_heights(refined, local.verdict))
+        _, moved, verdict, tilt = self._described[id(refined)]
+        return Registered(estimated, moved, verdict).with_note(tilt)
+
+    def _with_heights(self, refined: Alignment, verdict: Verdict) -> tuple[Alignment, Verdict, str]:
+        """Return an alignment in the given frames, its verdict, and a note for a rejection."""
+        pairs = self._refinement.pairs
         heights = heights_of(pairs, refined, self._refinement.gate_m)
-        moved = moved._replace(refined=replace(moved.refined, heights=heights))
+        moved = replace(self._moved(refined), heights=heights)
         notes = [pairs.correspondences.set_aside, shared_observations(pairs, refined)]
         tilt, names = "", (pairs.map_a.name, pairs.map_b.name)
         if heights is not None:
             tilt = heights.tilt_note(*names)
             notes.insert(0, heights.offset_note(*names))
-        if verdict.accepted and heights is not None and heights.loses_pairs:
-            verdict = replace(verdict, status=Status.REFUSED, reason=tilt)
-        elif verdict.accepted:
-            reason = "; ".join(filter(None, (verdict.reason, tilt, *notes)))
-            verdict = replace(verdict, reason=reason)
-        else:
-            return moved.with_note(tilt)
-        return moved._replace(verdict=verdict)
+        if not verdict.accepted:
+            return moved, verdict, tilt
+        if heights is not None and heights.loses_pairs:
+            return moved, replace(verdict, status=Status.REFUSED, reason=tilt), ""
+        reason = "; ".join(filter(None, (verdict.reason, tilt, *notes)))
+        return moved, replace(verdict, reason=reason), ""
 
     def _moved(self, local: Alignment) -> Alignment:
         """Return an alignment in the given frames."""
