@@ -461,7 +461,8 @@ def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
     e = residuals(alignment.T_a_b, used.p_a, used.p_b)
     S = residual_covariances(alignment.T_a_b, used.covariance_a, used.covariance_b)
     square = np.vecdot(e, np.linalg.solve(S + 1e-18 * np.eye(2), e[..., None])[..., 0])
-    copied = square <= chi_square_bound(_COPY_CHANCE, 2)
+    coincide = square <= chi_square_bound(_COPY_CHANCE, 2)
+    copied = coincide.copy()
     a, b = pairs.map_a.descriptor, pairs.map_b.descriptor
     if a is not None and b is not None:
         copied |= np.all(a[used.index_a] == b[used.index_b], axis=1)
@@ -469,7 +470,7 @@ def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
     if n < MIN_PAIRS:
         return ""
     names = f"{pairs.map_a.name} and {pairs.map_b.name}"
-    if n == of == len(pairs.map_a) == len(pairs.map_b):
+    if coincide.all() and of == len(pairs.map_a) == len(pairs.map_b):
         return f"{names} are the same map: a fusion adds nothing, and its covariances are too small"
     return (
         f"{n} of {of} pairs are the same observations in {names}: the maps are not independent, "
