@@ -249,15 +249,18 @@ class LandmarkMap:
         )
 
     @classmethod
-    def from_pandas(cls, table: "pd.DataFrame", name: str = "map") -> "LandmarkMap":
+    def from_pandas(
+        cls, table: "pd.DataFrame", name: str = "map", sigma_m: float | None = None
+    ) -> "LandmarkMap":
         """Return the map of a table with the columns of a map's file.
+
+        `sigma_m` is the standard deviation per axis of landmarks without columns of covariances.
 
         Raises:
             InputError: the table is not as documented.
         """
-        return replace(
-            _map_from(Path(name), pa.Table.from_pandas(table, preserve_index=False)), name=name
-        )
+        content = pa.Table.from_pandas(table, preserve_index=False)
+        return replace(_map_from(Path(name), content, sigma_m), name=name)
 
 
 MAP_ENDINGS = (".parquet", ".csv", ".ply", ".g2o")  # of the files that `write_map` writes
@@ -363,26 +366,40 @@ def coloured_ply(landmarks: LandmarkMap, rgb: np.ndarray | None = None) -> str:
     return ply_text(xyz | columns, landmarks.name, landmarks.planar)
 
 
-def read_map(path: str | Path, alone: bool = False) -> LandmarkMap:
+def _with_sigma(sigma_m: float) -> pa.Schema:
+    """Return the schema of maps in which missing covariances are those of one sigma."""
+    variances = {"cov_xx_m2", "cov_yy_m2", "cov_zz_m2"}
+    fields = [
+        described(field, "", sigma_m**2 if field.name in variances else 0.0)
+        if field.name in COVARIANCE_FIELDS
+        else field
+        for field in LANDMARKS
+    ]
+    return pa.schema(fields, LANDMARKS.metadata)
+
+
+def read_map(path: str | Path, alone: bool = False, sigma_m: float | None = None) -> LandmarkMap:
     """Read a map.
 
     The files beside a Parquet map are read, too, unless `alone` is True. Files beside a map of
-    another kind are not read, since they belong to the Parquet map of the same name.
+    another kind are not read, since they belong to the Parquet map of the same name. `sigma_m` is
+    the standard deviation per axis of the landmarks of a map without columns of covariances.
 
     Raises:
         InputError: a file is missing, damaged or not as documented.
     """
     path = Path(path)
-    found = _map_from(path, None)
+    found = _map_from(path, None, sigma_m)
     if alone or is_alone(path):
         return found
     viewing = read_viewing(path, len(found))
     return replace(found, joint=read_joint(path, found.covariance_m2), viewing=viewing)
 
 
-def _map_from(path: Path, table: pa.Table | None) -> LandmarkMap:
+def _map_from(path: Path, table: pa.Table | None, sigma_m: float | None) -> LandmarkMap:
     """Return the map of a table, or of a file if the table is None; raises InputError."""
-    table, attributes = read_open_table(path, LANDMARKS, table)
+    known = LANDMARKS if sigma_m is None else _with_sigma(sigma_m)
+    table, attributes = read_open_table(path, known, table)
     finite = "give a finite number, or remove the row"
     require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
     counted = "a landmark has at least one observation"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mapfusion.align.aligners import make_aligner
+from mapfusion.align.aligners import Aligner, make_aligner
 from mapfusion.align.alignment import NOT_RUN, Alignment, Method, Pairs, Status
 from mapfusion.align.correspondences import (
     Correspondences,
@@ -43,8 +43,12 @@ from mapfusion.geometry.se2 import motion_sigma
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.plotting import Plan, fused_plan, pair_plan, plot_plans
 from mapfusion.verification.false_alarms import Acceptance
-from mapfusion.align.aligners import Aligner
-from mapfusion.verification.registration import Registered, Registration
+from mapfusion.verification.registration import (
+    PairRegistration,
+    Registered,
+    Registration,
+    common_unit,
+)
 from mapfusion.verification.rivals import (
     DISTINCT_M,
     SupportedMotion,
@@ -52,7 +56,7 @@ from mapfusion.verification.rivals import (
     is_mirrored,
     rms_distance_m,
 )
-from mapfusion.verification.verdict import PairEvidence, PairVerifier
+from mapfusion.verification.verdict import PairEvidence
 
 if TYPE_CHECKING:  # results are printed and written without data frames and figures
     import pandas as pd
@@ -92,7 +96,7 @@ class MapAlignment:
         registered: the estimate, its refinement and the verdict.
         registration: settings of refinement and verdict.
         matching: parameters of the matching.
-        verifier: verifier of these maps; None without one.
+        ready: registration prepared for these maps.
     """
 
     map_a: LandmarkMap
@@ -102,7 +106,7 @@ class MapAlignment:
     registered: Registered
     registration: Registration
     matching: MatchParameters
-    verifier: PairVerifier | None = None
+    ready: PairRegistration
 
     @property
     def status(self) -> Status:
@@ -144,37 +148,38 @@ class MapAlignment:
         found = self.registered.applied
         if found.status in NOT_RUN:  # the reason does not name the aligner
             return replace(found, reason=f"{self.aligner}: {found.status}: {found.reason}")
-        if not found.ok and self.mirror_note:
-            return replace(found, reason=f"{found.reason}; {self.mirror_note}")
+        if not found.ok and self.cause:
+            return replace(found, reason=f"{found.reason}; {self.cause}")
         return found
 
     @cached_property
-    def mirror_note(self) -> str:
-        """Say that the maps look like mirror images of each other; empty if they do not."""
-        settings = self._acceptance, self._refinement, self.matching
-        if self.accepted or not is_mirrored(self._pairs, *settings):
+    def cause(self) -> str:
+        """Say that the maps are mirror images, or in another unit; empty if they are not."""
+        if self.accepted:
             return ""
-        a, b = self.map_a.name, self.map_b.name
-        return f"{a} and {b} look like mirror images of each other: check the sign of y and theta"
+        a, b, refinement = self.map_a.name, self.map_b.name, self._refinement
+        if is_mirrored(self.ready.pairs, self._acceptance, refinement, self.matching):
+            image = "look like mirror images of each other: check the sign of y and theta"
+            return f"{a} and {b} {image}"
+        if unit := common_unit(self.map_a, self.map_b, self.matching, refinement):
+            return f"{a} and {b} fit each other as maps in {unit}: write both in metres"
+        return ""
 
     @property
     def hint(self) -> str:
         """Property of the maps that may explain a refusal; empty if none is found."""
         if self.accepted or self.status in NOT_RUN:
             return ""
-        return self._pairs.note(int(np.count_nonzero(self.inlier))) or self.mirror_note
+        return self.ready.pairs.note(int(np.count_nonzero(self.inlier))) or self.cause
 
     @cached_property
     def other_motions(self) -> list[SupportedMotion]:
         """Other motions that many correspondences support, the best supported first."""
-        p_b, T = self.map_b.position_m[:, :2], self.T_a_b
-        found = distinct_motions(self._pairs, _MOST_RIVALS + 1, self._acceptance, self._refinement)
+        pairs, p_b, T = self.ready.pairs, self.map_b.position_m[:, :2], self.T_a_b
+        local = distinct_motions(pairs, _MOST_RIVALS + 1, self._acceptance, self._refinement)
+        found = [each._replace(T_a_b=pairs.given_motion(each.T_a_b)[0]) for each in local]
         rivals = [each for each in found if not rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M]
         return sorted(rivals, key=lambda each: -np.count_nonzero(each.inlier))[:_MOST_RIVALS]
-
-    @cached_property
-    def _pairs(self) -> Pairs:
-        return Pairs(self.map_a, self.map_b, self.correspondences)
 
     @property
     def _acceptance(self) -> Acceptance:
@@ -206,7 +211,8 @@ class MapAlignment:
         """
         import pandas as pd
 
-        off = residuals(self.T_a_b, self._pairs.p_a, self._pairs.p_b)
+        given = Pairs(self.map_a, self.map_b, self.correspondences)
+        off = residuals(self.T_a_b, given.p_a, given.p_b)
         return pd.DataFrame(
             {
                 "landmark_a": self.correspondences.index_a,
@@ -304,7 +310,9 @@ def advice(found: Sequence[MapAlignment]) -> str:
         )
     refined = best.registered.refined
     text = f"Use T_a_b = {motion_text(best.T_a_b)} of {best.aligner}"
-    text += f", {sigma_text(refined.covariance, refined.lower_bound)}. It is accepted"
+    at_overlap = refined.covariance if refined.overlap is None else refined.overlap.covariance
+    text += f", {sigma_text(at_overlap, refined.lower_bound)} where the maps overlap. It is "
+    text += "accepted"
     text += f": {np.count_nonzero(best.inlier)} of {len(best.inlier)} correspondences support it, "
     text += f"chance gives as much once in {_times(-_log10_chance(best))} pairs of maps"
     if several:
@@ -418,7 +426,7 @@ class MergedMaps:
             return f"No two maps were merged. {self.maps[a].name} and {self.maps[b].name}: {why}"
         fused, names = self.fused, [self.maps[k].name for k in self.fused.members]
         several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
-        largest = max(fused.motion_covariance[fused.members], key=lambda S: S[0, 0] + S[1, 1])
+        largest = max(fused.stated_covariance[fused.members], key=lambda S: S[0, 0] + S[1, 1])
         text = (
             f"Merged {len(names)} of {len(self.maps)} maps ({', '.join(names)}): "
             f"{len(fused.landmarks)} landmarks in the frame of {names[0]}, {several} of several "
@@ -500,8 +508,10 @@ def numbered_path(path: Path, k: int) -> Path:
     return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
 
 
-def load_map(given: "MapLike", name: str = "map") -> LandmarkMap:
+def load_map(given: "MapLike", name: str = "map", sigma_m: float | None = None) -> LandmarkMap:
     """Return a map given as such, by path or as a table, which is then named `name`.
+
+    `sigma_m` is the standard deviation per axis of landmarks without columns of covariances.
 
     Raises:
         InputError: a file or a table is not as documented, or descriptors are no unit vectors.
@@ -509,9 +519,9 @@ def load_map(given: "MapLike", name: str = "map") -> LandmarkMap:
     if isinstance(given, LandmarkMap):
         landmarks, place = given, given.name
     elif isinstance(given, str | os.PathLike):
-        landmarks, place = read_map(Path(given)), os.fspath(given)
+        landmarks, place = read_map(Path(given), sigma_m=sigma_m), os.fspath(given)
     else:
-        landmarks, place = LandmarkMap.from_pandas(given, name), name
+        landmarks, place = LandmarkMap.from_pandas(given, name, sigma_m), name
     if why := why_not_unit_vectors(landmarks):
         raise InputError(f"{place}: {why}")
     return landmarks
@@ -536,6 +546,7 @@ def align_maps(
     matching: MatchParameters = MatchParameters(),  # noqa: B008  # frozen
     correspondences: Correspondences | None = None,
     evidence: PairEvidence | None = None,
+    sigma_m: float | None = None,
     rng: np.random.Generator | int = 0,
 ) -> MapAlignment:
     """Align two maps: match their landmarks, estimate T_a_b, refine and verify it.
@@ -549,19 +560,20 @@ def align_maps(
         matching: parameters of the matching.
         correspondences: correspondences found earlier for these maps; None to match them.
         evidence: evidence found earlier for these maps; None to compute it.
+        sigma_m: standard deviation per axis of landmarks without covariances.
         rng: generator, or its seed.
 
     Raises:
         InputError: a map cannot be read.
         ValueError: the aligner is unknown.
     """
-    a, b = load_map(map_a, "a"), load_map(map_b, "b")
+    a, b = load_map(map_a, "a", sigma_m), load_map(map_b, "b", sigma_m)
     registration = _registration(aligner)
     pairs = match(a, b, matching) if correspondences is None else correspondences
     ready = registration.on(a, b, pairs, evidence)
     done = ready.register(np.random.default_rng(rng))
     used = name or _name_of(aligner)
-    return MapAlignment(a, b, pairs, used, done, registration, matching, ready.verifier)
+    return MapAlignment(a, b, pairs, used, done, registration, matching, ready)
 
 
 def merge_maps(
@@ -572,6 +584,7 @@ def merge_maps(
     matching: MatchParameters = MatchParameters(),  # noqa: B008  # frozen
     fuser: str | Fuser = USUAL,
     parameters: MergeParameters = MergeParameters(),  # noqa: B008  # frozen
+    sigma_m: float | None = None,
     rng: "int | Callable[[LandmarkMap, LandmarkMap], np.random.Generator]" = 0,
 ) -> MergedMaps:
     """Align all pairs of maps, and fuse the maps that accepted alignments connect.
@@ -585,6 +598,7 @@ def merge_maps(
         matching: parameters of the matching.
         fuser: name of a fuser, or a fuser.
         parameters: parameters of the merge.
+        sigma_m: standard deviation per axis of landmarks without covariances.
         rng: seed of the generator of each pair, or a function that returns this generator.
 
     Raises:
@@ -593,7 +607,7 @@ def merge_maps(
     """
     if len(maps) < 2:
         raise InputError("merge: give two maps or more")
-    loaded = tuple(load_map(each, f"map {k}") for k, each in enumerate(maps, start=1))
+    loaded = tuple(load_map(each, f"map {k}", sigma_m) for k, each in enumerate(maps, start=1))
     places = [os.fspath(each) if isinstance(each, str | os.PathLike) else "" for each in maps]
     order = sorted(range(len(maps)), key=lambda k: (name_order(loaded[k].name), places[k]))
     alignments, pairs = dict[tuple[int, int], MapAlignment](), list[AlignedPair]()
@@ -609,8 +623,8 @@ def merge_maps(
         alignments[a, b] = found
         offered, chance = found.correspondences, found.registered.verdict.log10_false_alarms
         pairs.append(AlignedPair(a, b, found.alignment, offered, chance))
-        if found.status is Status.AMBIGUOUS and found.verifier is not None:
-            rivals = found.verifier.rivals_of(found.registered.refined)
+        if found.status is Status.AMBIGUOUS:
+            rivals = found.ready.rivals_of(found.registered.refined)
             pairs += [AlignedPair(a, b, rival, offered, chance) for rival in rivals]
     by = make_fuser(fuser) if isinstance(fuser, str) else fuser
     fusion = merge(loaded, pairs, parameters, by)

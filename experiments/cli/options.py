@@ -158,6 +158,16 @@ MapFile = Annotated[
     typer.Option("--output", "-o", help="Map to write: .parquet (keeps all), .csv, .ply or .g2o."),
 ]
 OutputFolder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder to write.")]
+SigmaM = Annotated[
+    float | None,
+    typer.Option(
+        "--sigma",
+        metavar="METRES",
+        min=1e-6,
+        max=1e3,
+        help="Standard deviation per axis of the landmarks of maps without covariances.",
+    ),
+]
 DocumentFile = Annotated[
     Path | None, typer.Option("--output", "-o", help="File for what --json prints.")
 ]

@@ -112,6 +112,7 @@ def align(
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
+    sigma_m: options.SigmaM = None,
     require_accepted: Annotated[
         bool, typer.Option("--require-accepted", help="Exit code 1 if no estimate is accepted.")
     ] = False,
@@ -137,7 +138,7 @@ def align(
     settings = settings_of(scenario, overrides, seed)
     found, n_aligners = [], len(settings.align.aligners)
     with progress(quiet=as_json) as show:
-        for each in single.align(map_a, map_b, settings):
+        for each in single.align(map_a, map_b, settings, sigma_m):
             found.append(each)
             show("align", len(found), n_aligners)
     document = export.alignment_document((map_a, map_b), settings.seed, found)
@@ -161,6 +162,7 @@ def merge(
     scenario: options.SettingsOf = None,
     overrides: options.Overrides,
     seed: options.Seed = None,
+    sigma_m: options.SigmaM = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Fuse maps that alignments connect: `mapfusion merge A.parquet B.parquet -o F.parquet`.
@@ -180,7 +182,7 @@ def merge(
     options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
-    merged = single.merge(maps, settings)
+    merged = single.merge(maps, settings, sigma_m)
     paths = single.save_fused(output, merged)
     found = export.fusion_document(paths, settings.seed, merged, maps)
     export.publish_json("merge", found, as_json)

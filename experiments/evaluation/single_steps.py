@@ -21,7 +21,7 @@ from experiments.pipeline.store import Store, link_or_copy, retry_damaged
 from experiments.pipeline.tasks import OnProgress
 from experiments.plugins.discovery import callable_aligner
 from experiments.scenario.settings import Align, AlignerEntry, AnyScenario, Recording, Scenario
-from mapfusion.align.alignment import NOT_RUN, Pairs
+from mapfusion.align.alignment import NOT_RUN
 from mapfusion.align.correspondences import match
 from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.attitude import read_attitude
@@ -194,8 +194,12 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
     return Registration(aligner, settings.refinement, settings.verifier)
 
 
-def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[MapAlignment]:
+def align(
+    path_a: Path, path_b: Path, settings: Scenario, sigma_m: float | None = None
+) -> Iterator[MapAlignment]:
     """Yield for each aligner the alignment of two maps.
+
+    `sigma_m` is the standard deviation of landmarks of maps without covariances.
 
     Each aligner is called twice with the same random numbers, and the second call is timed. The
     first call compiles kernels and starts processes.
@@ -203,9 +207,9 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[MapAlignme
     Raises:
         InputError: a map cannot be read.
     """
-    map_a, map_b = load_map(path_a), load_map(path_b)
+    map_a, map_b = load_map(path_a, sigma_m=sigma_m), load_map(path_b, sigma_m=sigma_m)
     pairs = match(map_a, map_b, settings.align.match)
-    evidence = settings.align.verifier.on(Pairs(map_a, map_b, pairs)).evidence
+    evidence = None
     for entry in settings.align.aligners:
         registration = _registration(entry, settings.align)
         for _ in range(2):
@@ -219,6 +223,8 @@ def align(path_a: Path, path_b: Path, settings: Scenario) -> Iterator[MapAlignme
                 evidence=evidence,
                 rng=generator(settings.seed, "align", entry.name),
             )
+            verifier = found.ready.verifier
+            evidence = None if verifier is None else verifier.evidence
             if found.registered.estimated.status in NOT_RUN:
                 break
         yield found
@@ -228,11 +234,15 @@ def alignment_row(found: MapAlignment) -> dict[str, Any]:
     """Return an alignment as a row: estimate, refinement, verdict, time and inliers."""
     row = {"aligner": found.aligner, "elapsed_s": found.registered.estimated.elapsed_s}
     row |= {"n_inliers": int(found.inlier.sum())}
-    return row | estimate_row(len(found.correspondences), *found.registered)
+    row |= estimate_row(len(found.correspondences), *found.registered)
+    refined = found.registered.refined
+    return row | {"overlap": refined.overlap, "heights": refined.heights}
 
 
-def merge(paths: Sequence[Path], settings: Scenario) -> MergedMaps:
+def merge(paths: Sequence[Path], settings: Scenario, sigma_m: float | None = None) -> MergedMaps:
     """Align all pairs of maps and fuse the maps.
+
+    `sigma_m` is the standard deviation of landmarks of maps without covariances.
 
     Raises:
         InputError: there are fewer than two maps, a map cannot be read, or the aligner is unknown.
@@ -247,6 +257,7 @@ def merge(paths: Sequence[Path], settings: Scenario) -> MergedMaps:
         matching=settings.align.match,
         fuser=settings.merge.fuser,
         parameters=settings.merge.parameters,
+        sigma_m=sigma_m,
         rng=lambda a, b: generator(settings.seed, "align", name, a.name, b.name),
     )
 

@@ -130,6 +130,8 @@ def alignment_document(
         refined = {name: row[f"refined_{name}"] for name in MOTION}
         refined |= _covariance([row[name] for name in COVARIANCE])
         refined |= {name: row[name] for name in ("drift_sigma_m", "lower_bound")}
+        for name in ("overlap", "heights"):
+            refined[name] = None if row[name] is None else row[name].document()
         answer = {"aligner": row["aligner"], "status": status, "reason": reason or None}
         answer |= {"estimated": _motion([row[name] for name in MOTION]) if estimated else None}
         answer |= {"estimated_status": row["status"], "estimated_reason": row["reason"] or None}
@@ -138,7 +140,7 @@ def alignment_document(
         numbers += ("n_confirmed", "n_contradicted", "elapsed_s")
         aligners.append(answer | {name: row[name] for name in numbers})
     any_accepted = any(found.accepted for found in alignments)
-    note = "" if any_accepted else alignments[0].mirror_note
+    note = "" if any_accepted else alignments[0].cause
     head = {"map_a": maps[0], "map_b": maps[1], "seed": seed, "note": note or None}
     head |= {"advice": advice(alignments)}
     return {**head, "aligners": aligners}
@@ -192,6 +194,12 @@ def fusion_document(
             covariance = _covariance(S[np.triu_indices(3)]) if motion else None
             reason = None if motion else next(reasons)
             source = {"map": name, "T_first_map": motion, "covariance": covariance}
+            k = len(sources)
+            if fused.middle_covariance is not None and motion:
+                of_middle = fused.middle_covariance[k][np.triu_indices(3)]
+                source["covariance_at_middle"] = _covariance(of_middle)
+            if fused.height_m is not None and motion:
+                source["height_m"] = fused.height_m[k]
             sources.append(source | {"reason": reason})
         several = int(((fused.parents >= 0).sum(axis=1) > 1).sum())
         found = {"n_landmarks": len(fused.landmarks), "n_fused_of_several": several}

@@ -375,6 +375,10 @@ def print_alignments(alignments: Sequence[MapAlignment]) -> None:
     """Print the alignments of two maps by all methods in one table, and what to use."""
     found = pd.DataFrame(map(alignment_row, alignments))
     sigma_m, sigma_rad = motion_sigma(covariances_of(found))
+    at_overlap = [
+        at if overlap is None else overlap.sigma_m
+        for at, overlap in zip(sigma_m, found["overlap"], strict=True)
+    ]
     bounds = ["≥ " if each else "" for each in found["lower_bound"]]
 
     def texts(sigma: Iterable[float], form: str) -> list[str]:
@@ -383,13 +387,14 @@ def print_alignments(alignments: Sequence[MapAlignment]) -> None:
 
     shown = found.assign(
         verdict=[str(each.status).replace("_", " ") for each in alignments],
-        sigma_m=texts(sigma_m, ".3f"),
+        sigma_m=texts(at_overlap, ".3f"),
         sigma_rad=texts(sigma_rad, ".4f"),
         inliers=found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str),
         time=(1e3 * found["elapsed_s"]).map(two_digits),
     )
-    note = "T_a_b: refined; pairs: supporting correspondences; NFA: number of alignments\n"
-    note += "with as much support by chance; time: of the estimate; more with --json"
+    note = "T_a_b: refined; sigma: where the maps overlap; pairs: supporting correspondences;\n"
+    note += "NFA: number of alignments with as much support by chance; time: of the estimate;\n"
+    note += "more with --json"
     if found["lower_bound"].any() and np.isfinite(sigma_m).any():
         note += f"\n{_LOWER_BOUND}"
     print_frame(shown, _ALIGNMENTS, "", note)
@@ -414,11 +419,18 @@ def print_merged(merged: MergedMaps, maps: Sequence[Path], paths: Sequence[Path]
             f"{fused.duplicate_share:.1%} look like remaining duplicates"
         )
         is_bound = merged.is_lower_bound(fused)
-        motions = zip(maps, fused.T_first_map, fused.motion_covariance, strict=True)
-        for name, T, covariance in motions:
-            if not math.isnan(T[0]):
-                stated = sigma_text(covariance, is_bound) if covariance.any() else "the frame"
-                lines.append(f"  {name}: T_first_map = {motion_text(T)}, {stated}")
+        motions = zip(maps, fused.T_first_map, fused.stated_covariance, strict=True)
+        for k, (name, T, covariance) in enumerate(motions):
+            if math.isnan(T[0]):
+                continue
+            stated = "the frame"
+            if k != fused.members[0]:
+                stated = f"{sigma_text(covariance, is_bound)} at its middle"
+                height_m = 0.0 if fused.height_m is None else fused.height_m[k]
+                if height_m:
+                    way = "raised" if height_m > 0 else "lowered"
+                    stated += f"; {way} by {abs(height_m):.3f} m"
+            lines.append(f"  {name}: T_first_map = {motion_text(T)}, {stated}")
         lines += [f"  {_LOWER_BOUND}"] if is_bound else []
     if not paths and len(maps) > 2:  # of two maps the last sentence tells all
         lines += [

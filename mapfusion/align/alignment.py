@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from mapfusion.align.correspondences import FEW, Correspondences, HeightGate, scale_note
+from mapfusion.align.frames import HeightDifference, Overlap, moved_motion
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
@@ -50,6 +51,8 @@ class Alignment:
             landmarks' covariances (both maps together); NaN if degenerate.
         lower_bound: True if the covariance is a lower bound, because a map does not state the
             errors that its landmarks share.
+        overlap: the same motion about the middle of its supporters; None if unknown.
+        heights: heights of map b against those of map a; None if unknown, or without heights.
     """
 
     T_a_b: Float
@@ -60,6 +63,8 @@ class Alignment:
     reason: str = ""
     drift_sigma_m: float = float("nan")
     lower_bound: bool = True
+    overlap: Overlap | None = None
+    heights: HeightDifference | None = None
 
     @property
     def ok(self) -> bool:
@@ -93,6 +98,13 @@ MIN_PAIRS = 3  # two pairs determine a motion; a third is needed to contradict i
 class Pairs:
     """N pairs of corresponding landmarks with their positions and covariances.
 
+    Attributes:
+        map_a: map in frame a.
+        map_b: map in frame b.
+        correspondences: rows of both maps.
+        origins: origins (2,) of the maps' local frames in the frames of the given maps; None if the
+            maps are in their own frames.
+
     Raises:
         ValueError: an index lies outside its map.
     """
@@ -100,6 +112,7 @@ class Pairs:
     map_a: LandmarkMap
     map_b: LandmarkMap
     correspondences: Correspondences
+    origins: tuple[Float, Float] | None = None
 
     def __post_init__(self) -> None:
         for name, index, landmarks in (
@@ -113,7 +126,17 @@ class Pairs:
         return len(self.correspondences)
 
     def __getitem__(self, rows: np.ndarray) -> "Pairs":
-        return Pairs(self.map_a, self.map_b, self.correspondences[rows])
+        return Pairs(self.map_a, self.map_b, self.correspondences[rows], self.origins)
+
+    def given_motion(self, T_a_b: Float, covariance: Float | None = None) -> tuple[Float, Float]:
+        """Return a motion of the local frames and its covariance in the frames of the given maps.
+
+        Without origins and without a covariance both are unchanged and zero.
+        """
+        known = np.zeros((3, 3)) if covariance is None else covariance
+        if self.origins is None or not any(origin.any() for origin in self.origins):
+            return T_a_b, known
+        return moved_motion(T_a_b, known, *self.origins)
 
     @cached_property
     def cache(self) -> dict[Any, Any]:

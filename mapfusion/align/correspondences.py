@@ -5,11 +5,12 @@ one map with all landmarks of compatible height in the other map.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from mapfusion.align.frames import height_offset_m, in_local_frame, origin_of
 from mapfusion.align.geometric_matching import (
     Site,
     attributes_of_pairs_agree,
@@ -253,6 +254,10 @@ class Correspondences:
         shortage: why `match` found fewer than three pairs; empty otherwise.
         size_tolerance: largest relative difference of two sizes, if landmarks were matched by
             geometry alone; None otherwise.
+        height_offset_m: height of map b above map a, which was subtracted before the test of
+            heights.
+        at_any_height: pairs without the test of heights; None if these are the same.
+        set_aside: landmarks that were not matched, in words; empty if all were.
     """
 
     index_a: np.ndarray
@@ -260,6 +265,9 @@ class Correspondences:
     distance: Float
     shortage: str = ""
     size_tolerance: float | None = None
+    height_offset_m: float = 0.0
+    at_any_height: "Correspondences | None" = None
+    set_aside: str = ""
 
     def __post_init__(self) -> None:
         n = len(self.index_a)
@@ -276,7 +284,8 @@ class Correspondences:
 
     def __getitem__(self, rows: np.ndarray | slice) -> "Correspondences":
         kept = self.index_a[rows], self.index_b[rows], self.distance[rows]
-        return Correspondences(*kept, size_tolerance=self.size_tolerance)
+        tolerance, offset_m = self.size_tolerance, self.height_offset_m
+        return Correspondences(*kept, size_tolerance=tolerance, height_offset_m=offset_m)
 
     @property
     def by_geometry(self) -> bool:
@@ -342,7 +351,10 @@ class MatchParameters:
 
 
 def match(
-    map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters = MatchParameters()
+    map_a: LandmarkMap,
+    map_b: LandmarkMap,
+    parameters: MatchParameters = MatchParameters(),
+    one_floor: bool = False,
 ) -> Correspondences:
     """Pair the landmarks of two maps by label, by descriptor, or by geometry alone.
 
@@ -351,6 +363,10 @@ def match(
     compatible height (among all landmarks of planar maps), near enough, and if sizes and categories
     agree. If a map has neither, landmarks are matched by geometry: the pairs are those that the
     best motions between the maps lay on each other, so that several motions may share a landmark.
+
+    A constant difference of the heights of both maps is subtracted before heights are compared,
+    unless the maps are known to be of `one_floor`. Landmarks whose standard deviation exceeds the
+    size of their map are not matched, because they have no known place.
     """
     if map_a.label is not None and map_b.label is not None and len(map_a) and len(map_b):
         labels_a, rows_a = _row_of_label(map_a)
@@ -367,7 +383,11 @@ def match(
                 f"{len(common) or 'none'} {both} (map {map_a.name}: {a}; map {map_b.name}: {b}); "
                 "where both maps have labels, landmarks are matched by them alone"
             )
-        return Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
+        named = Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
+        if one_floor:
+            return named
+        offset_m = _height_offset(map_a, map_b, named, parameters.height)
+        return _placed(map_a, map_b, replace(named, height_offset_m=offset_m))
     for landmarks in (map_a, map_b):
         name = landmarks.name
         if not len(landmarks):
@@ -376,24 +396,82 @@ def match(
     floor_m2 = parameters.height.floor_m**2
     if matched_by_geometry(map_a, map_b):
         gates = height_bound, floor_m2, parameters.tolerance_m, parameters.size_tolerance
-        index_a, index_b = match_by_geometry(map_a, map_b, *gates)
+        a, b = (in_local_frame(each, origin_of(each)) for each in (map_a, map_b))
+        index_a, index_b = match_by_geometry(a, b, *gates)
         shortage = ""
         if len(index_a) < FEW:
             shortage = "no motion lays landmarks of the maps on each other; matched by geometry"
         none = np.zeros(len(index_a))
-        return Correspondences(index_a, index_b, none, shortage, parameters.size_tolerance)
+        laid = Correspondences(index_a, index_b, none, shortage, parameters.size_tolerance)
+        if one_floor:
+            return laid
+        offset_m = _height_offset(map_a, map_b, laid, parameters.height)
+        return replace(laid, height_offset_m=offset_m)
     if map_a.descriptor is None or map_b.descriptor is None:
         described, labelled = (map_b, map_a) if map_a.descriptor is None else (map_a, map_b)
         return _no_pairs(
             f"map {described.name} has descriptors, map {labelled.name} only labels; give both "
             "maps descriptors, or both labels, or neither to one to match by geometry"
         )
-    rows, nearest_b, distance = _mutually_nearest(map_a, map_b, height_bound, floor_m2)
+    offset_m, free = 0.0, None
+    if math.isfinite(height_bound) and not one_floor:
+        rows, nearest_b, distance = _mutually_nearest(map_a, map_b, math.inf, 0.0)
+        kept = distance <= parameters.max_descriptor_distance
+        free = Correspondences(rows[kept], nearest_b[kept], distance[kept])
+        offset_m = _height_offset(map_a, map_b, free, parameters.height)
+    lowered = in_local_frame(map_b, np.zeros(2), offset_m)
+    rows, nearest_b, distance = _mutually_nearest(map_a, lowered, height_bound, floor_m2)
     kept = distance <= parameters.max_descriptor_distance
     a, b = (Site.of(each, height_bound, floor_m2) for each in (map_a, map_b))
     kept &= attributes_of_pairs_agree(a, b, rows, nearest_b, parameters.size_tolerance)
     shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
-    return Correspondences(rows[kept], nearest_b[kept], distance[kept], shortage)
+    parts = (rows[kept], nearest_b[kept], distance[kept])
+    heights = {"height_offset_m": offset_m, "at_any_height": free}
+    found = Correspondences(*parts, shortage, **heights)
+    return found if one_floor else _placed(map_a, map_b, found)
+
+
+def _height_offset(
+    map_a: LandmarkMap, map_b: LandmarkMap, pairs: Correspondences, gate: HeightGate
+) -> float:
+    """Return the height of map b above map a, 0 if none is significant or a map is planar."""
+    if map_a.planar or map_b.planar:
+        return 0.0
+    a, b = pairs.index_a, pairs.index_b
+    variance = map_a.covariance_m2[a, 2, 2] + map_b.covariance_m2[b, 2, 2] + gate.floor_m**2
+    return height_offset_m(map_b.position_m[b, 2] - map_a.position_m[a, 2], variance, gate.bound)
+
+
+# Diameter of a uniform disc over the median distance from its centre.
+_DIAMETER_OVER_MEDIAN = 2 * math.sqrt(2)
+
+
+def _placed(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Correspondences) -> Correspondences:
+    """Drop the pairs of landmarks whose standard deviation exceeds the size of their map."""
+    kept, told = np.ones(len(pairs), dtype=bool), []
+    for landmarks, index in ((map_a, pairs.index_a), (map_b, pairs.index_b)):
+        plan = landmarks.position_m[:, :2]
+        off_m = np.linalg.norm(plan - np.median(plan, axis=0), axis=1)
+        size_m = _DIAMETER_OVER_MEDIAN * float(np.median(off_m))
+        sigma_m = np.sqrt(np.trace(landmarks.covariance_m2[:, :2, :2], axis1=1, axis2=2) / 2)
+        wide = np.flatnonzero(sigma_m > size_m)
+        # where most landmarks are that uncertain, the covariances or their units are wrong
+        if size_m > 0 and 0 < len(wide) < len(plan) / 2:
+            kept &= ~np.isin(index, wide)
+            number = "landmark" if len(wide) == 1 else "landmarks"
+            told.append(
+                f"{len(wide)} {number} of {landmarks.name} left aside: sigma up to "
+                f"{_short(float(sigma_m[wide].max()))} m in a map of {_short(size_m)} m"
+            )
+    if not told:
+        return pairs
+    return replace(
+        pairs,
+        index_a=pairs.index_a[kept],
+        index_b=pairs.index_b[kept],
+        distance=pairs.distance[kept],
+        set_aside="; ".join(told),
+    )
 
 
 def matched_by_geometry(map_a: LandmarkMap, map_b: LandmarkMap) -> bool:

@@ -68,6 +68,9 @@ class FusedMap:
             fused covariances; empty if none.
         paths: path of each member in the fused frame, shape (T_k, 3); empty if the fuser does not
             estimate paths.
+        middle_covariance: covariances of the poses at the middle of each map, shape (M, 3, 3); None
+            if they were not computed (`merge` does).
+        height_m: height of each map's origin in the fused frame, shape (M,); None as above.
     """
 
     landmarks: LandmarkMap
@@ -79,6 +82,13 @@ class FusedMap:
     left_out: tuple[tuple[str, str], ...]
     fallback: str = ""
     paths: tuple[Float, ...] = ()
+    middle_covariance: Float | None = None
+    height_m: Float | None = None
+
+    @property
+    def stated_covariance(self) -> Float:
+        """Covariances (M, 3, 3) at the middles of the maps, or at their origins if unknown."""
+        return self.motion_covariance if self.middle_covariance is None else self.middle_covariance
 
     @property
     def members(self) -> np.ndarray:

@@ -7,9 +7,17 @@ import numpy as np
 
 from mapfusion.align.alignment import Status
 from mapfusion.align.covariance import with_common_motion
+from mapfusion.align.frames import (
+    Overlap,
+    in_local_frame,
+    level_heights,
+    moved_motion,
+    origin_of,
+)
 from mapfusion.fusion.fusers import (
     AlignedPair,
     Component,
+    FusedMap,
     Fuser,
     Fusion,
     MergeParameters,
@@ -18,7 +26,7 @@ from mapfusion.fusion.fusers import (
 )
 from mapfusion.fusion.pose_graph import AlignmentEdges
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters, team_graph
-from mapfusion.geometry.numerics import require_shape
+from mapfusion.geometry.numerics import Float, require_shape
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.smooth import AssociatedLog
 
@@ -63,6 +71,9 @@ def merge(
 ) -> Fusion:
     """Fuse the maps that accepted alignments connect.
 
+    Maps far from their origins are fused in local frames, and the height offsets of alignments are
+    subtracted (`align.frames`). The result is in the frame of the first map.
+
     The order of maps and pairs affects only the frames, and the choice between equally good
     results.
 
@@ -77,7 +88,61 @@ def merge(
     Raises:
         ValueError: the pairs do not fit the maps, or there are fewer than two maps.
     """
-    return connect(maps, pairs, parameters.team).fused_by(fuser or make_fuser(), parameters)
+    _require_valid_pairs(maps, pairs)
+    origins, height = [origin_of(each) for each in maps], _heights(len(maps), pairs)
+    local = [in_local_frame(*each) for each in zip(maps, origins, height.tolist(), strict=True)]
+    pairs = [_in_local_frames(pair, origins) for pair in pairs]
+    fusion = connect(local, pairs, parameters.team).fused_by(fuser or make_fuser(), parameters)
+    fused = (_in_given_frames(each, local, origins, height) for each in fusion.fused)
+    return replace(fusion, fused=tuple(fused))
+
+
+def _heights(n_maps: int, pairs: Sequence[AlignedPair]) -> Float:
+    """Return the height (n_maps,) that is subtracted from each map; 0 without a known offset."""
+    known = [p for p in pairs if p.alignment.ok and p.alignment.heights is not None]
+    offset = [p.alignment.heights.used_offset_m for p in known]  # type: ignore[union-attr]
+    if not np.any(offset):
+        return np.zeros(n_maps)
+    sigma = np.array([p.alignment.heights.sigma_m for p in known])  # type: ignore[union-attr]
+    return level_heights(n_maps, np.array([(p.a, p.b) for p in known]), np.array(offset), sigma)
+
+
+def _in_local_frames(pair: AlignedPair, origins: Sequence[Float]) -> AlignedPair:
+    """Return an alignment between local frames of its maps."""
+    a, b, found = origins[pair.a], origins[pair.b], pair.alignment
+    if not (a.any() or b.any()) or not np.isfinite(found.T_a_b).all():
+        return pair
+    if found.overlap is not None:  # more precise than the covariance at a far origin
+        T_a_b, covariance = found.overlap.motion(a, b)
+    else:
+        T_a_b, covariance = moved_motion(found.T_a_b, found.covariance, -a, -b)
+    return replace(pair, alignment=replace(found, T_a_b=T_a_b, covariance=covariance))
+
+
+def _in_given_frames(
+    fused: FusedMap, local: Sequence[LandmarkMap], origins: Sequence[Float], height_m: Float
+) -> FusedMap:
+    """Return a fused map in the given frame of its first map, with covariances at the middles."""
+    first = fused.members[0]
+    T, covariance = fused.T_first_map.copy(), fused.motion_covariance.copy()
+    at_middle = covariance.copy()
+    for k in fused.members:
+        if len(local[k]):
+            at_middle[k] = Overlap.of(T[k], covariance[k], local[k].position_m).covariance
+        if origins[first].any() or origins[k].any():
+            T[k], covariance[k] = moved_motion(T[k], covariance[k], origins[first], origins[k])
+    T[first] = 0.0
+    heights = np.where(np.isnan(T[:, 0]), np.nan, height_m[first] - height_m)
+    paths = tuple(path + np.append(origins[first], 0.0) for path in fused.paths)
+    return replace(
+        fused,
+        landmarks=in_local_frame(fused.landmarks, -origins[first], -float(height_m[first])),
+        T_first_map=T,
+        motion_covariance=covariance,
+        paths=paths,
+        middle_covariance=at_middle,
+        height_m=heights,
+    )
 
 
 def connect(

@@ -7,6 +7,7 @@ import numpy as np
 
 from mapfusion.align.aligners import Aligner, MethodAligner, alignment_of_fit, as_aligner
 from mapfusion.align.alignment import (
+    MIN_PAIRS,
     NOT_RUN,
     Alignment,
     Method,
@@ -14,9 +15,19 @@ from mapfusion.align.alignment import (
     Status,
     supported,
 )
-from mapfusion.align.correspondences import Correspondences
+from mapfusion.align.clique import Clique
+from mapfusion.align.correspondences import Correspondences, HeightGate, MatchParameters, match
+from mapfusion.align.frames import (
+    HeightDifference,
+    Overlap,
+    height_difference,
+    in_local_frame,
+    moved_motion,
+    origin_of,
+)
 from mapfusion.align.refinement import Refinement
-from mapfusion.geometry.numerics import Float
+from mapfusion.align.rigid_motion import residual_covariances, residuals
+from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Verdict
 from mapfusion.verification.verdict import PairEvidence, PairVerifier, Verifier
@@ -45,6 +56,11 @@ class VerifiedRefinement:
         self.verifier: PairVerifier | None = verifier and verifier.on(pairs, evidence)
         self._refined: dict[tuple, Alignment] = {}
         self._verdicts: dict[tuple, Verdict] = {}
+
+    @property
+    def gate_m(self) -> float:
+        """Largest distance in the plane of a pair under the estimate."""
+        return self._refinement.gate_m
 
     def verify(self, estimated: Alignment) -> tuple[Alignment, Verdict]:
         """Return the refined alignment of an estimate, and the verdict on it."""
@@ -113,6 +129,9 @@ class Registered(NamedTuple):
 class Registration:
     """Registration of two maps: estimate, refine, verify.
 
+    Maps far from their origins are registered in local frames, with map b lowered by the height
+    offset of the correspondences. Results are in the frames of the given maps.
+
     Attributes:
         method: estimates the motion.
         refinement: least squares after the estimate.
@@ -141,12 +160,18 @@ class Registration:
             map_a: map in frame a.
             map_b: map in frame b.
             correspondences: correspondences of the two maps.
-            evidence: evidence found earlier for these maps; None to compute it when needed.
+            evidence: evidence of an earlier registration of these maps
+                (`PairRegistration.verifier.evidence`); None to compute it when needed.
 
         Raises:
             ValueError: an index of the correspondences lies outside its map.
         """
-        pairs = Pairs(map_a, map_b, correspondences)
+        origins = origin_of(map_a), origin_of(map_b)
+        local = (
+            in_local_frame(map_a, origins[0]),
+            in_local_frame(map_b, origins[1], correspondences.height_offset_m),
+        )
+        pairs = Pairs(*local, correspondences, origins)
         return PairRegistration(
             self.method, VerifiedRefinement(pairs, self.refinement, self.verifier, evidence)
         )
@@ -174,6 +199,12 @@ class PairRegistration:
 
     def __init__(self, method: Method | Aligner, refinement: VerifiedRefinement) -> None:
         self._aligner, self._refinement = as_aligner(method), refinement
+        self._described: dict[int, tuple[Alignment, Alignment, Verdict, str]] = {}
+
+    @property
+    def pairs(self) -> Pairs:
+        """Correspondences in the local frames of the maps."""
+        return self._refinement.pairs
 
     @property
     def verifier(self) -> PairVerifier | None:
@@ -188,10 +219,146 @@ class PairRegistration:
         else:
             estimated = self._aligner.align(pairs.map_a, pairs.map_b, pairs.correspondences, rng)
         registered = Registered(estimated, *self._refinement.verify(estimated))
+        if pairs.origins is not None:
+            registered = self._in_given_frames(registered)
         if registered.verdict.accepted:
             return registered
         n_support = int(np.count_nonzero(registered.refined.inlier))
         return registered.with_note(pairs.note(n_support))
+
+    def rivals_of(self, refined: Alignment) -> list[Alignment]:
+        """Return the other motions that the maps support; see `PairVerifier.rivals_of`."""
+        if self.verifier is None:
+            return []
+        if (origins := self._refinement.pairs.origins) is None:
+            return self.verifier.rivals_of(refined)
+        back = moved_motion(refined.T_a_b, refined.covariance, *(-origin for origin in origins))
+        local = replace(refined, T_a_b=back[0], covariance=back[1])
+        return [self._moved(each) for each in self.verifier.rivals_of(local)]
+
+    def _in_given_frames(self, local: Registered) -> Registered:
+        """Return a result in the given frames, with overlap and heights, and what these tell."""
+        estimated, refined = self._moved(local.estimated), local.refined
+        if not refined.inlier.any() or not np.isfinite(refined.T_a_b).all():
+            return Registered(estimated, self._moved(refined), local.verdict)
+        if id(refined) not in self._described:  # equal estimates share one refined alignment
+            self._described[id(refined)] = (refined, *self._with_heights(refined, local.verdict))
+        _, moved, verdict, tilt = self._described[id(refined)]
+        return Registered(estimated, moved, verdict).with_note(tilt)
+
+    def _with_heights(self, refined: Alignment, verdict: Verdict) -> tuple[Alignment, Verdict, str]:
+        """Return an alignment in the given frames, its verdict, and a note for a rejection."""
+        pairs = self._refinement.pairs
+        heights = heights_of(pairs, refined, self._refinement.gate_m)
+        moved = replace(self._moved(refined), heights=heights)
+        notes = [pairs.correspondences.set_aside, shared_observations(pairs, refined)]
+        tilt, names = "", (pairs.map_a.name, pairs.map_b.name)
+        if heights is not None:
+            tilt = heights.tilt_note(*names)
+            notes.insert(0, heights.offset_note(*names))
+        if not verdict.accepted:
+            return moved, verdict, tilt
+        if heights is not None and heights.loses_pairs:
+            return moved, replace(verdict, status=Status.REFUSED, reason=tilt), ""
+        reason = "; ".join(filter(None, (verdict.reason, tilt, *notes)))
+        return moved, replace(verdict, reason=reason), ""
+
+    def _moved(self, local: Alignment) -> Alignment:
+        """Return an alignment in the given frames."""
+        pairs = self._refinement.pairs
+        assert pairs.origins is not None
+        if not np.isfinite(local.T_a_b).all():
+            return local
+        overlap, p_b = None, pairs.p_b[local.inlier]
+        if len(p_b):
+            overlap = Overlap.of(local.T_a_b, local.covariance, p_b).moved(*pairs.origins)
+        T_a_b, covariance = pairs.given_motion(local.T_a_b, local.covariance)
+        return replace(local, T_a_b=T_a_b, covariance=covariance, overlap=overlap)
+
+
+def heights_of(pairs: Pairs, alignment: Alignment, gate_m: float) -> HeightDifference | None:
+    """Compare the heights of two maps at the pairs within `gate_m` of an alignment in plan.
+
+    The pairs include those that fail the test of heights. Returns None for planar maps.
+    """
+    if pairs.planar:
+        return None
+    offered = pairs.correspondences.at_any_height
+    free = pairs if offered is None else Pairs(pairs.map_a, pairs.map_b, offered)
+    near = np.linalg.norm(residuals(alignment.T_a_b, free.p_a, free.p_b), axis=1) <= gate_m
+    supports = np.isin(free.index_a, pairs.index_a[alignment.inlier])
+    gate = HeightGate()
+    variance = free.covariance_a[:, 2, 2] + free.covariance_b[:, 2, 2] + gate.floor_m**2
+    removed_m = pairs.correspondences.height_offset_m
+    parts = (free.p_a[near], free.p_b[near], variance[near], gate.bound, supports[near])
+    return height_difference(*parts, removed_m)
+
+
+# Probability that independent observations of a landmark agree as closely as copies do.
+_COPY_CHANCE = 1e-6
+
+
+def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
+    """Say that supporting pairs are copies of the same observations; empty if fewer than three are.
+
+    Independent observations have neither equal descriptors nor residuals far below their standard
+    deviation.
+    """
+    used = pairs[alignment.inlier]
+    e = residuals(alignment.T_a_b, used.p_a, used.p_b)
+    S = residual_covariances(alignment.T_a_b, used.covariance_a, used.covariance_b)
+    square = np.vecdot(e, np.linalg.solve(S + 1e-18 * np.eye(2), e[..., None])[..., 0])
+    coincide = square <= chi_square_bound(_COPY_CHANCE, 2)
+    copied = coincide.copy()
+    a, b = pairs.map_a.descriptor, pairs.map_b.descriptor
+    if a is not None and b is not None:
+        copied |= np.all(a[used.index_a] == b[used.index_b], axis=1)
+    n, of = int(np.count_nonzero(copied)), len(used)
+    if n < MIN_PAIRS:
+        return ""
+    names = f"{pairs.map_a.name} and {pairs.map_b.name}"
+    if coincide.all() and of == len(pairs.map_a) == len(pairs.map_b):
+        return f"{names} are the same map: a fusion adds nothing, and its covariances are too small"
+    return (
+        f"{n} of {of} pairs are the same observations in {names}: the maps are not independent, "
+        "and fused covariances are too small"
+    )
+
+
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}  # in metres
+
+
+def common_unit(
+    map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters, refinement: Refinement
+) -> str:
+    """Return the unit of length in which two maps fit each other; empty if there is none.
+
+    Two maps in millimetres differ by many times the gates of metres. In their unit most of the
+    correspondences agree.
+    """
+    for unit, size_m in _UNITS.items():
+        a, b = (_scaled(each, size_m) for each in (map_a, map_b))
+        pairs = Pairs(a, b, match(a, b, parameters))
+        aligner = MethodAligner(Clique())
+        found = aligner.align_pairs(pairs, np.random.default_rng(0))
+        if not found.ok:
+            continue
+        refined = refinement.refine(pairs, found.T_a_b)
+        extent_m = float(np.ptp(pairs.p_b[:, :2], axis=0).max(initial=0.0))
+        if refined.ok and 2 * np.count_nonzero(refined.inlier) > len(pairs) and extent_m > 1:
+            return unit
+    return ""
+
+
+def _scaled(landmarks: LandmarkMap, size_m: float) -> LandmarkMap:
+    """Return a map in metres whose unit has this size, without joint covariance and viewing."""
+    return replace(
+        landmarks,
+        position_m=landmarks.position_m * size_m,
+        covariance_m2=landmarks.covariance_m2 * size_m**2,
+        joint=None,
+        viewing=None,
+    )
 
 
 def supported_by(

@@ -387,8 +387,8 @@ class PairVerifier:
             if scipy.special.bdtrc(own - 1, own + its, 0.5) > _EQUAL:  # P(X >= own)
                 of, of_rival = (int(np.count_nonzero(m)) for m in (by_own, by_rival))
                 return (
-                    f"{_motion_text(alignment.T_a_b)} explains {of} landmarks of map "
-                    f"{maps[1].name}, {_motion_text(T_a_b)} explains {of_rival}"
+                    f"{self._motion_text(alignment.T_a_b)} explains {of} landmarks of map "
+                    f"{maps[1].name}, {self._motion_text(T_a_b)} explains {of_rival}"
                 )
         return ""
 
@@ -458,14 +458,14 @@ class PairVerifier:
         settings, extent_m = self._settings.evidence, self._extent_m(alignment)
         ratio = regions.log10_evidence(evidence.shares)
         if rival is not None and rival.log10_evidence > ratio - math.log10(settings.most_against):
-            return f"{{told}}; so do {_named(rival)}"
+            return f"{{told}}; so do {self._named(rival)}"
         if self._is_one_place(alignment, extent_m):
             what = f"the maps show little else than this place of {extent_m:.2g} m"
             return f"{what}; what lies around it tells whether it is another's like"
         if math.log10(settings.least_ratio) <= log10_ratio_passed:
             return ""
         if rival is not None:
-            return f"{{told}}, too few beside {_named(rival)}"
+            return f"{{told}}, too few beside {self._named(rival)}"
         if evidence.repeats(self._bound):
             return "{told}, too few for maps that hold things twice"
         # No structure repeats and no other motion fits. One contradicting region is then a reason
@@ -524,13 +524,11 @@ class PairVerifier:
         found = f"sigma {sigma_m:.2g} m, {sigma_rad:.2g} rad"
         return f"{found}; {settings.max_sigma_m:g} m, {settings.max_sigma_rad:g} rad are allowed"
 
+    def _motion_text(self, T_a_b: Float) -> str:
+        (x_m, y_m, theta_rad), _ = self._pairs.given_motion(T_a_b)
+        return f"T_a_b = ({x_m:.2f} m, {y_m:.2f} m, {theta_rad:.2f} rad)"
 
-def _motion_text(T_a_b: Float) -> str:
-    x_m, y_m, theta_rad = T_a_b
-    return f"T_a_b = ({x_m:.2f} m, {y_m:.2f} m, {theta_rad:.2f} rad)"
-
-
-def _named(rival: RivalMotion) -> str:
-    """Return a rival motion in words, with its transform."""
-    T = _motion_text(rival.T_a_b)
-    return f"{rival.n_confirmed} of {rival.n_regions} under {T} with {rival.n_support} pairs"
+    def _named(self, rival: RivalMotion) -> str:
+        """Return a rival motion in words, with its transform."""
+        T = self._motion_text(rival.T_a_b)
+        return f"{rival.n_confirmed} of {rival.n_regions} under {T} with {rival.n_support} pairs"

@@ -81,7 +81,7 @@ def run_match(settings: MatchSettings, job: Job) -> None:
     made, rivals = [], []
     verifier = Verifier(settings.acceptance, settings.evidence, settings.refinement)
     for k, map_a, map_b in pairs_of_maps(job, settings.smoothed, settings.iterations):
-        pairs = match(map_a, map_b, settings.match)
+        pairs = match(map_a, map_b, settings.match, one_floor=True)
         names = {"robot_a": map_a.name, "robot_b": map_b.name, "iteration": k}
         viewed_maps = None
         if not why_not_sought(map_a, map_b):

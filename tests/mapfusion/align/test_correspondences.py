@@ -94,7 +94,8 @@ def test_heights_decide_unless_planar():
     a, b, _ = two_maps(np.random.default_rng(2))
     lifted = replace(b, position_m=b.position_m + np.array([0, 0, 10.0]))
     parameters = MatchParameters(max_descriptor_distance=0.5)
-    assert len(match(a, lifted, parameters)) == 0
+    assert len(match(a, lifted, parameters, one_floor=True)) == 0
+    assert len(match(a, lifted, parameters)) == len(a)
     flat = [replace(m, planar=True) for m in (a, lifted)]
     assert len(match(*flat, parameters)) == len(a)
 
@@ -166,8 +167,8 @@ def unlike_maps(rng, n=40):
     return landmarks(p, descriptor=descriptor), landmarks(moved, descriptor=descriptor)
 
 
-def told_apart(a, b, **parameters):
-    found = match(a, b, MatchParameters(**parameters))
+def told_apart(a, b, one_floor=False, **parameters):
+    found = match(a, b, MatchParameters(**parameters), one_floor)
     assert len(found) < 3
     return found.shortage
 
@@ -178,7 +179,7 @@ def test_the_test_that_left_too_few_pairs_is_named():
     label = np.arange(40, dtype=np.int32)
     assert match(a, b).shortage == ""
     lifted = replace(b, position_m=b.position_m + np.array([0, 0, 1.0]))
-    said = told_apart(a, lifted)
+    said = told_apart(a, lifted, one_floor=True)
     assert "40 mutually nearest descriptors, 0 within 0.23 m of height" in said
     assert "median difference 1.00 m" in said
     assert "times" not in said

@@ -67,6 +67,7 @@ class WholeAnswers:
 @dataclass
 class CountedRefinement:
     calls: list = field(default_factory=list)
+    gate_m: float = Refinement().gate_m
 
     def refine(self, pairs, T_a_b):
         self.calls.append(np.array(T_a_b))
