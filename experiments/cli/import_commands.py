@@ -76,12 +76,22 @@ def _log_command(format_name: str) -> Callable[..., None]:
 
     def command(folder: Folder, output: options.Output, overrides: options.ImportOverrides) -> None:
         from experiments.cli.options import require_folder
-        from experiments.reports.terminal.layout import print_paths
+        from experiments.reports.terminal.layout import print_lines, print_paths
         from experiments.scenario.loading import made_settings
+        from mapfusion.fastslam.filter import FastSlamParameters
+        from mapfusion.fastslam.mapping import association_for
+        from mapfusion.robot_log import read_log
 
         require_folder(output, [folder])
         settings = made_settings(format_name, settings_class(format_name), overrides)
-        print_paths(output, import_recording(format_name, folder, output, settings))
+        paths = import_recording(format_name, folder, output, settings)
+        for path in paths:
+            log = read_log(path)
+            stated = FastSlamParameters().association
+            chosen = f"associated by {association_for(log, stated)}"
+            counts = f"{len(log)} frames, {len(log.observations)} observations"
+            print_lines([f"{log.robot}: {counts}, {chosen} (slam.filter.association)"])
+        print_paths(output, paths)
 
     return command
 
