@@ -3,6 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -53,9 +54,10 @@ CalibrationOverrides = Annotated[
     list[str] | None,
     typer.Option(
         "--calibration",
-        metavar="KEY=VALUE",
-        help="Replaces what is taken to be left open of camera and mount (standard deviations): "
-        "heading_rad=0.001, scale=0.002; 0 of both: it is known exactly.",
+        metavar="FILE|KEY=VALUE",
+        help="A calibration file (rosbag, images; Kalibr's or OpenCV's layout), or a standard "
+        "deviation of what is left open of camera and mount: heading_rad=0.001, scale=0.002; 0 of "
+        "both: it is known exactly.",
     ),
 ]
 LevelOf = Annotated[
@@ -123,9 +125,16 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         if len(folders) > 1 and (odometry not in (None, "images") or truth is not None):
             raise InputError("--odometry and --truth: are files of one recording; import one")
         named = {name: value for name, value in chosen.items() if value is not None}
+        for file in [each for each in calibration or () if "=" not in each]:
+            if "calibration" not in {each.name for each in fields(settings_class(format_name))}:
+                raise InputError(f"--calibration {file}: {format_name} has files of its own")
+            if not Path(file).is_file():
+                raise InputError(f"--calibration {file}: no such file")
+            named["calibration"] = str(Path(file).resolve())
+        calibration = [each for each in calibration or () if "=" in each]
         settings = made_settings(format_name, settings_class(format_name), overrides, named)
         front_end = None if scenario is None else vision_of(scenario)
-        given = (front_end, tuple(vision or ()), tuple(calibration or ()), level)
+        given = (front_end, tuple(vision or ()), tuple(calibration), level)
         sources = [
             Source(format_name, folder, settings, odometry, truth, *given) for folder in folders
         ]

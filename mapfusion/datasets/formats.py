@@ -102,6 +102,7 @@ IMPORTERS = {
             "right": "Topic of the right camera's pictures.",
             "odom": "Topic of the robot's odometry; without it visual odometry is used.",
             "imu": "Topic of an IMU: its accelerations level the camera and each frame.",
+            "repeated": "Pictures that repeat a time: refuse them, or keep the first.",
         },
     ),
 }
