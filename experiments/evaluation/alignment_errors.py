@@ -86,6 +86,8 @@ def error_rows(map_pair: MapPair, verifier: Verifier, radius_m: float) -> pd.Dat
         "recall": n_hits / (is_true.sum() or np.nan),
         "alignment_nees": alignment_nees(T_refined, covariance, T_true),
     }
+    if map_pair.a.path.fitted or map_pair.b.path.fitted:
+        errors["alignment_nees"] = np.full(len(rows), np.nan)  # of another error than that of T
     # one DataFrame of all columns: adding columns one by one is slow in pandas
     return pd.DataFrame({name: [each[name] for each in rows] for name in row} | errors)
 
@@ -132,7 +134,8 @@ def run_evaluation(settings: EvaluationSettings, job: Job) -> None:
         map_pairs = join_map_pairs([load(each) for each in folders], *aligned)
         errors = pd.concat([error_rows(pair, settings.verifier, radius_m) for pair in map_pairs])
         tables.write(job.output / f"{name}.parquet", name, errors)
-    fusion = fusion_rows(map_pairs, settings.merge, radius_m)
+    is_known = all(robot.surveyed for robot in (map_pairs[0].a, map_pairs[0].b))
+    fusion = fusion_rows(map_pairs, settings.merge, radius_m) if is_known else []
     tables.write(job.output / "fusion.parquet", "fusion", fusion)
 
 
