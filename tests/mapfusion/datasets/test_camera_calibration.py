@@ -3,10 +3,12 @@
 from math import atan, hypot
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from experiments.scenario.yaml_files import read_calibration
 from mapfusion.datasets.camera_calibration import (
     R_ROBOT_OPTICAL,
     Lens,
@@ -232,3 +234,17 @@ def test_a_damaged_opencv_file_is_one_line(change, words: str) -> None:
     change(document)
     with pytest.raises(InputError, match=words):
         read_stereo_calibration(Path("pair.yaml"), document)
+
+
+def test_files_that_opencv_writes_are_read(tmp_path: Path) -> None:
+    path, expected = tmp_path / "pair.yaml", head("rational")
+    written = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in opencv(expected).items():
+        is_matrix = isinstance(value, dict)
+        shaped = np.reshape(value["data"], (value["rows"], value["cols"])) if is_matrix else value
+        written.write(name, shaped)
+    written.release()
+    assert "!!opencv-matrix" in path.read_text()
+    found, _ = read_stereo_calibration(path, read_calibration(path))
+    assert (found.left, found.right) == (expected.left, expected.right)
+    np.testing.assert_allclose(found.T_left_right, expected.T_left_right, atol=1e-12)
