@@ -122,7 +122,7 @@ def test_the_log_chooses_an_association_that_it_allows(
     assert association_for(log, Association(stated)) is Association(expected)
     settings = replace(SETTINGS, association=Association(stated))
     if "some" in has and stated == "label":
-        with pytest.raises(InputError, match="1 of .* observations have no label"):
+        with pytest.raises(InputError, match=r"1 of .* observations have no label"):
             build_map(log, settings, np.random.default_rng(0))
     else:
         allowed = replace(settings, association=Association(expected))
