@@ -413,24 +413,46 @@ def read_true_poses(folder: Path) -> Float | None:
         return None
     table, _ = read_open_table(path, TRUTH_POSES)
     _require_numbered(path, table)
-    return columns(table, POSE_FIELDS)
+    return _require_true(path, columns(table, POSE_FIELDS))
+
+
+def read_true_points(folder: Path) -> Float | None:
+    """Read the true points (N, 3) of a log's observations; None if there are none.
+
+    Raises:
+        InputError: the table is damaged or not as documented.
+    """
+    path = table_path(folder, TRUTH_TABLES[1])
+    if not path.is_file():
+        return None
+    table, _ = read_open_table(path, TRUTH_POINTS)
+    return _require_true(path, columns(table, POSITION_FIELDS))
+
+
+def _require_true(path: Path, values: Float) -> Float:
+    """Return rows of the truth (N, 3); raise InputError for a row that is known in part."""
+    known = ~np.isnan(values)
+    half = known.any(1) & ~known.all(1)
+    large = (np.abs(values) > LARGEST_POSITION_M).any(1)  # infinity is
+    for wrong, what in ((half, "known in part"), (large, "infinite or above 1e7 m")):
+        if wrong.any():
+            raise InputError(f"{path}: the truth is {what} in row {np.flatnonzero(wrong)[0]}")
+    return values
 
 
 def read_truth(folder: Path) -> RobotTruth:
-    """Read the truth beside a log; raises InputError. For evaluation only."""
-    paths = [table_path(folder, name) for name in TRUTH_TABLES]
-    poses, _ = read_open_table(paths[0], TRUTH_POSES)
-    points, _ = read_open_table(paths[1], TRUTH_POINTS)
-    _require_numbered(paths[0], poses)
-    truth = RobotTruth(columns(poses, POSE_FIELDS), columns(points, POSITION_FIELDS))
-    for path, values in zip(paths, (truth.T_world_robot, truth.point_world_m), strict=True):
-        known = ~np.isnan(values)
-        half = known.any(1) & ~known.all(1)
-        large = (np.abs(values) > LARGEST_POSITION_M).any(1)  # infinity is
-        for wrong, what in ((half, "known in part"), (large, "infinite or above 1e7 m")):
-            if wrong.any():
-                raise InputError(f"{path}: the truth is {what} in row {np.flatnonzero(wrong)[0]}")
-    return truth
+    """Read poses and points of the truth beside a log. For evaluation only.
+
+    Raises:
+        InputError: a table is missing, damaged or not as documented.
+    """
+    poses, points = read_true_poses(folder), read_true_points(folder)
+    for name, values in zip(TRUTH_TABLES, (poses, points), strict=True):
+        if values is None:
+            raise InputError(f"{table_path(folder, name)}: no such file (expected the truth)")
+    assert poses is not None
+    assert points is not None
+    return RobotTruth(poses, points)
 
 
 def first_frames(log: RobotLog, n_frames: int) -> RobotLog:

@@ -3,6 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -53,9 +54,10 @@ CalibrationOverrides = Annotated[
     list[str] | None,
     typer.Option(
         "--calibration",
-        metavar="KEY=VALUE",
-        help="Replaces what is taken to be left open of camera and mount (standard deviations): "
-        "heading_rad=0.001, scale=0.002; 0 of both: it is known exactly.",
+        metavar="FILE|KEY=VALUE",
+        help="A calibration file (rosbag, images; Kalibr's or OpenCV's layout), or a standard "
+        "deviation of what is left open of camera and mount: heading_rad=0.001, scale=0.002; 0 of "
+        "both: it is known exactly.",
     ),
 ]
 LevelOf = Annotated[
@@ -76,12 +78,22 @@ def _log_command(format_name: str) -> Callable[..., None]:
 
     def command(folder: Folder, output: options.Output, overrides: options.ImportOverrides) -> None:
         from experiments.cli.options import require_folder
-        from experiments.reports.layout import print_paths
+        from experiments.reports.layout import print_lines, print_paths
         from experiments.scenario.loading import made_settings
+        from mapfusion.fastslam.filter import FastSlamParameters
+        from mapfusion.fastslam.mapping import association_for
+        from mapfusion.robot_log import read_log
 
         require_folder(output, [folder])
         settings = made_settings(format_name, settings_class(format_name), overrides)
-        print_paths(output, import_recording(format_name, folder, output, settings))
+        paths = import_recording(format_name, folder, output, settings)
+        for path in paths:
+            log = read_log(path)
+            stated = FastSlamParameters().association
+            chosen = f"associated by {association_for(log, stated)}"
+            counts = f"{len(log)} frames, {len(log.observations)} observations"
+            print_lines([f"{log.robot}: {counts}, {chosen} (slam.filter.association)"])
+        print_paths(output, paths)
 
     return command
 
@@ -113,9 +125,16 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
         if len(folders) > 1 and (odometry not in (None, "images") or truth is not None):
             raise InputError("--odometry and --truth: are files of one recording; import one")
         named = {name: value for name, value in chosen.items() if value is not None}
+        for file in [each for each in calibration or () if "=" not in each]:
+            if "calibration" not in {each.name for each in fields(settings_class(format_name))}:
+                raise InputError(f"--calibration {file}: {format_name} has files of its own")
+            if not Path(file).is_file():
+                raise InputError(f"--calibration {file}: no such file")
+            named["calibration"] = str(Path(file).resolve())
+        calibration = [each for each in calibration or () if "=" in each]
         settings = made_settings(format_name, settings_class(format_name), overrides, named)
         front_end = None if scenario is None else vision_of(scenario)
-        given = (front_end, tuple(vision or ()), tuple(calibration or ()), level)
+        given = (front_end, tuple(vision or ()), tuple(calibration), level)
         sources = [
             Source(format_name, folder, settings, odometry, truth, *given) for folder in folders
         ]

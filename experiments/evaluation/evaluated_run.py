@@ -27,6 +27,7 @@ from experiments.evaluation.truth import (
     EvaluatedRobot,
     MapPair,
     common_landmarks,
+    is_surveyed,
     join_map_pairs,
     load_robot,
 )
@@ -45,7 +46,7 @@ from experiments.pipeline.store import StageFolder, Store, require_undamaged
 from experiments.pipeline.tasks import OnProgress, Task, run_tasks, task_names, tasks_of, unfinished
 from experiments.pipeline.workers import workers
 from experiments.plugins.discovery import callable_aligner
-from experiments.scenario.settings import AnyScenario, Recording
+from experiments.scenario.settings import AnyScenario, Recording, has_truth
 from mapfusion.align.aligners import Aligner
 from mapfusion.datasets.log_consistency import Finding, truth_finding
 from mapfusion.datasets.relative_motion import composed_spans, observed_spans, odometry_motions
@@ -137,8 +138,8 @@ class EvaluatedRun:
     Attributes:
         pipeline: stages up to the estimates and fused maps.
         settings: settings of the evaluation.
-        evaluations: stages that compare each pair's estimates with the truth, in the order of the
-            pipeline's pairs; none without truth.
+        evaluations: stages that compare a pair's estimates with the truth, in the order of the
+            pipeline's pairs; none for pairs with a robot without truth.
         store: store of the stages.
         no_truth: reason why nothing can be evaluated; empty if the truth is known.
     """
@@ -158,7 +159,13 @@ class EvaluatedRun:
         settings = EvaluationSettings(scenario.align.verifier, merge, radius_m)
         no_truth = scenario.why_no_truth()
         kind, evaluations = EVALUATION_STAGE, []
-        for pair in () if no_truth else pipeline.pairs:
+        unknown = {
+            robot.name
+            for robot in pipeline.robots
+            if isinstance(scenario, Recording) and not has_truth(store.path(robot.log))
+        }
+        judged = [pair for pair in pipeline.pairs if not unknown & {pair.a.name, pair.b.name}]
+        for pair in judged:
             before = {"align": pair.filtered.estimates, "align_smoothed": pair.smoothed.estimates}
             before |= {"log_a": pair.a.log, "slam_a": pair.a.slam}
             before |= {"log_b": pair.b.log, "slam_b": pair.b.slam}
@@ -346,6 +353,10 @@ def finding_rows(run: EvaluatedRun) -> list[dict[str, Any]]:
         named = found[["check", "iteration", "finding"]].assign(robot=robot.name)
         rows += named.to_dict("records")
         poses = read_true_poses(folders.log) if recorded else None
+        if recorded and not is_surveyed(folders.log):
+            text = "true points are unknown: landmarks are identified by the true poses, and their "
+            row = {"robot": robot.name, "check": "truth", "iteration": -1}
+            rows.append(row | {"finding": f"{text}errors are not judged"})
         if poses is not None and len(poses) == len(log):
             sound = not (found["check"] == "odometry").any()
             motion = run.scenario.slam.filter.motion.scaled(noise_factor(folders.slam))

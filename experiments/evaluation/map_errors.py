@@ -122,6 +122,8 @@ def error_rows(map_pair: MapPair, verifier: Verifier, radius_m: float) -> pd.Dat
         "recall": n_hits / (is_true.sum() or np.nan),
         "alignment_nees": alignment_nees(T_refined, covariance, T_true),
     }
+    if map_pair.a.path.fitted or map_pair.b.path.fitted:
+        errors["alignment_nees"] = np.full(len(rows), np.nan)  # of another error than that of T
     # one DataFrame of all columns: adding columns one by one is slow in pandas
     return pd.DataFrame({name: [each[name] for each in rows] for name in row} | errors)
 
@@ -168,7 +170,8 @@ def run_evaluation(settings: EvaluationSettings, job: Job) -> None:
         map_pairs = join_map_pairs([load(each) for each in folders], *aligned)
         errors = pd.concat([error_rows(pair, settings.verifier, radius_m) for pair in map_pairs])
         tables.write(job.output / f"{name}.parquet", name, errors)
-    fusion = fusion_rows(map_pairs, settings.merge, radius_m)
+    is_known = all(robot.surveyed for robot in (map_pairs[0].a, map_pairs[0].b))
+    fusion = fusion_rows(map_pairs, settings.merge, radius_m) if is_known else []
     tables.write(job.output / "fusion.parquet", "fusion", fusion)
 
 
@@ -231,7 +234,7 @@ class SmoothedRobot:
         row = {"robot": robot.name, "path_rmse_m": path_m, "filter_path_rmse_m": filter_m}
         row |= {"filter_over_smoother": filter_m / path_m if path_m > 0 else np.nan} | self.ending
         row["not_smoothed"] = self.given_at(last)[1]
-        of_filter = fit_to_truth(robot.maps[last], robot.points_world_m[last])
+        of_filter = _fit_to_survey([robot], robot.maps[last], robot.points_world_m[last])
         row |= {
             "filter_landmark_rmse_m": of_filter.rmse_m,
             "filter_gross_share": of_filter.gross_share,
@@ -239,7 +242,7 @@ class SmoothedRobot:
         if last not in self.maps:
             return row | {"n_landmarks": 0}
         landmarks = self.maps[last]
-        fit = fit_to_truth(landmarks, self.points_world_m[last])
+        fit = _fit_to_survey([robot], landmarks, self.points_world_m[last])
         row |= {"landmark_rmse_m": fit.rmse_m, "gross_share": fit.gross_share}
         row |= {"n_landmarks": len(landmarks)}
         consistency = relative_consistency(landmarks, fit)
@@ -278,6 +281,14 @@ def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
         for k, path in each.paths.items()
     ]
     return pd.concat(rows, ignore_index=True) if rows else pd.DataFrame()
+
+
+def _fit_to_survey(
+    robots: Sequence[EvaluatedRobot], landmarks: LandmarkMap, point_m: Float
+) -> FittedMap:
+    """Fit true points (N, 3) to a map of some robots; none unless all robots are surveyed."""
+    surveyed = all(robot.surveyed for robot in robots)
+    return fit_to_truth(landmarks, point_m if surveyed else np.full_like(point_m, np.nan))
 
 
 def path_rmse_m(path: Float, truth: Float) -> float:
@@ -369,9 +380,9 @@ class EvaluatedFusion:
     def fit(self) -> FittedMap:
         """Fit of the true points to the fused map."""
         frame = self.given[self.fusion.members[0]].robot
-        return fit_to_truth(
-            self.fusion.landmarks, frame.in_map_frame(self.team().truth_of(self.fusion))
-        )
+        members = [self.given[k].robot for k in self.fusion.members]
+        points = frame.in_map_frame(self.team().truth_of(self.fusion))
+        return _fit_to_survey(members, self.fusion.landmarks, points)
 
     @cached_property
     def consistency(self) -> tuple[Consistency, Consistency]:
@@ -386,7 +397,8 @@ class EvaluatedFusion:
             T_true = se2.between(T_world_first, self.given[k].robot.path.T_world_map)
             T, covariance = self.fusion.T_first_map[k], self.fusion.motion_covariance[k]
             error_m, error_rad = motion_errors(T, T_true)
-            nees = alignment_nees(T, covariance, T_true)
+            fitted = any(self.given[each].robot.path.fitted for each in (first, k))
+            nees = np.nan if fitted else alignment_nees(T, covariance, T_true)
             errors.append([error_m, abs(error_rad), *se2.motion_sigma(covariance), nees / 3])
         medians = np.median(errors, axis=0) if errors else np.full(len(_MOTION_FIGURES), np.nan)
         landmarks, fit = self.fusion.landmarks, self.fit
@@ -486,7 +498,7 @@ def coverage_rows(fusions: Sequence[EvaluatedFusion]) -> list[dict[str, Any]]:
     for kind, by_robot in maps.items():
         found = []
         for robot, landmarks, points in by_robot.values():
-            fit = fit_to_truth(landmarks, robot.in_map_frame(points))
+            fit = _fit_to_survey([robot], landmarks, robot.in_map_frame(points))
             found.append(consistencies(landmarks, fit))
         rows += _coverage_of(found, at_end[0], {"map": kind, "fuser": ""})
     for fusion in at_end:

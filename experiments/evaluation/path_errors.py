@@ -256,7 +256,10 @@ def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.Da
     if edges.empty:
         return edges
     used = (errors["aligner"] == aligner) & (errors["repetition"] == 0)
-    rows = edges.merge(criteria.at_the_end(errors[used])[[*_PAIR, *_OWN_ALIGNMENT]], "left", _PAIR)
+    of_judged = criteria.at_the_end(errors[used])[[*_PAIR, *_OWN_ALIGNMENT]]
+    rows = edges.merge(of_judged, "inner", _PAIR)
+    if rows.empty:
+        return rows
     index = {robot.name: k for k, robot in enumerate(team.robots)}
     a, b = rows[_PAIR].map(index.get).to_numpy().T
     # errors of T_a_b in the fused maps; NaN for robots in different maps

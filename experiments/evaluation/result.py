@@ -201,6 +201,8 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
         "landmark_nees": landmark_nees,
     }
     makers |= dict.fromkeys(with_truth, list) if run.no_truth else with_truth
+    if not all(robot.surveyed for robot in team.robots):
+        makers |= dict.fromkeys(("map_fits", "landmark_nees"), list)  # errors of landmarks
     return makers | {
         "frame_times": frame_times,
         "findings": lambda: finding_rows(run),

@@ -118,7 +118,7 @@ def slam(
         raise InputError(f"{log}: frames.parquet holds no frame")
     n_frames, rng = len(robot_log), generator(settings.seed, "slam", robot_log.robot)
     known, stated = read_odometry_covariance(log, n_frames), settings.slam.filter
-    checked = checked_log(robot_log, known, stated.motion, settings.slam.noise)
+    checked = checked_log(robot_log, known, stated, settings.slam.noise)
     used_log, covariance = checked.log, checked.odometry_covariance
     kept, min_count, last = [n_frames - 1], settings.slam.min_count, None
     attitude, parameters = read_attitude(log, n_frames), replace(stated, motion=checked.motion)

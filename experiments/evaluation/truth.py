@@ -28,17 +28,53 @@ from mapfusion.fusion.fusers import AlignedPair
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import TRUTH_TABLES, RobotLog, RobotTruth, read_log, read_truth
+from mapfusion.robot_log import (
+    TRUTH_TABLES,
+    RobotLog,
+    RobotTruth,
+    read_log,
+    read_true_points,
+    read_true_poses,
+)
 from mapfusion.tables import table_path
 
 _MAP_PAIR = ["robot_a", "robot_b", "iteration"]
 
 
 def truth_or_unknown(folder: Path, log: RobotLog) -> RobotTruth:
-    """Return the truth in the folder of a log; NaN if the folder has none."""
-    if all(table_path(folder, name).is_file() for name in TRUTH_TABLES):
-        return read_truth(folder)
-    return RobotTruth(np.full((len(log), 3), np.nan), np.full((len(log.observations), 3), np.nan))
+    """Return the truth in the folder of a log; NaN where it is unknown.
+
+    If only poses are known, the true poses place the observations in the world. The median of a
+    landmark's placed observations identifies the landmark. It is no independent measurement of
+    the landmark, so errors of landmarks are not judged by it (see `EvaluatedRobot.surveyed`).
+
+    Raises:
+        InputError: a table is damaged, or its number of rows differs from that of the log.
+    """
+    poses, points = read_true_poses(folder), read_true_points(folder)
+    for name, true, logged in zip(
+        TRUTH_TABLES, (poses, points), (log, log.observations), strict=True
+    ):
+        if true is not None and len(true) != len(logged):
+            counts = f"{len(true)} rows, the log has {len(logged)} of them"
+            raise InputError(f"{table_path(folder, name)}: {counts}")
+    if points is None and poses is not None:
+        T_world_robot, points = poses[log.iteration], log.observations.position_m.copy()
+        R = se2.rotation(T_world_robot[:, 2])
+        points[:, :2] = np.einsum("nij,nj->ni", R, points[:, :2]) + T_world_robot[:, :2]
+        points[np.isnan(points).any(axis=1)] = np.nan
+    unknown = (np.full((n, 3), np.nan) for n in (len(log), len(log.observations)))
+    true_poses, true_points = (
+        nothing if true is None else true
+        for true, nothing in zip((poses, points), unknown, strict=True)
+    )
+    return RobotTruth(true_poses, true_points)
+
+
+def is_surveyed(folder: Path) -> bool:
+    """Return True unless the true points of a log are placed by its true poses."""
+    poses, points = (table_path(folder, name).is_file() for name in TRUTH_TABLES)
+    return points or not poses
 
 
 def landmark_truth(
@@ -115,10 +151,13 @@ class PathTruth:
     Attributes:
         T_map_robot: true poses, shape (T, 3), in the frame of the robot's map.
         T_world_map: origin of this frame, shape (3,): the first known pose of the robot.
+        fitted: True if the origin is that of the last map fitted to the true points, for robots
+            whose poses are unknown. Errors against it exclude the error of this fit.
     """
 
     T_map_robot: Float
     T_world_map: Float
+    fitted: bool = False
 
     @classmethod
     def of(cls, truth: RobotTruth) -> "PathTruth":
@@ -127,16 +166,32 @@ class PathTruth:
         start = truth.T_world_robot[int(np.argmax(known))]
         return cls(se2.between(start, truth.T_world_robot), start)
 
+    def or_fitted(
+        self, maps: Mapping[int, LandmarkMap], points_world_m: Mapping[int, Float]
+    ) -> "PathTruth":
+        """Return the path with the origin of the last map if the poses are unknown."""
+        if np.isfinite(self.T_world_map).all() or not maps:
+            return self
+        last = max(maps)
+        T_world_map, _, _ = _fit_to_points(maps[last].position_m, points_world_m[last])
+        return PathTruth(self.T_map_robot, T_world_map, fitted=True)
+
 
 def fit_rmse_m(position_m: Float, point_world_m: Float) -> tuple[int, float]:
     """Return the number of landmarks with a known true point, and their RMSE after a rigid fit."""
+    _, n, rmse_m = _fit_to_points(position_m, point_world_m)
+    return n, rmse_m
+
+
+def _fit_to_points(position_m: Float, point_world_m: Float) -> tuple[Float, int, float]:
+    """Return the rigid motion (3,) of landmarks to known true points, their number and the RMSE."""
     known = np.isfinite(point_world_m).all(axis=1)
     points, target = position_m[known], point_world_m[known]
     if len(points) < 2:
-        return len(points), np.nan
+        return np.full(3, np.nan), len(points), np.nan
     T_world_map = np.array(fit_rigid(target, points, np.arange(len(points))))
     residual = se2.transform_points(T_world_map, points) - target
-    return len(points), float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+    return T_world_map, len(points), float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
 
 
 def degrees_of_freedom(landmarks: LandmarkMap) -> int:
@@ -164,12 +219,15 @@ class EvaluatedRobot:
         maps: maps by iteration.
         points_world_m: true points of the landmarks of each map, shape (N, 3).
         path: true path.
+        surveyed: False if true poses placed the true points: they identify landmarks, and errors
+            of landmarks are unknown.
     """
 
     name: str
     maps: Mapping[int, LandmarkMap]
     points_world_m: dict[int, Float]
     path: PathTruth
+    surveyed: bool = True
 
     def at(self, iteration: int) -> tuple[LandmarkMap, Float]:
         """Return map and true points at an iteration; the last ones if the log ended earlier."""
@@ -270,14 +328,10 @@ def load_robot(folders: RobotFolders, viewing: bool = True) -> EvaluatedRobot:
     """
     log = read_log(folders.log)
     truth = truth_or_unknown(folders.log, log)
-    poses, points = (truth.T_world_robot, log), (truth.point_world_m, log.observations)
-    for file, (true, logged) in (("truth_poses", poses), ("truth_points", points)):
-        if len(true) != len(logged):
-            counts = f"{len(true)} rows, the log has {len(logged)} of them"
-            raise InputError(f"{folders.log / file}.parquet: {counts}")
     maps = stored_maps(folders, viewing=viewing)
     points = landmark_truth(truth, maps.associations.at, maps)
-    return EvaluatedRobot(log.robot, maps, points, PathTruth.of(truth))
+    path = PathTruth.of(truth).or_fitted(maps, points)
+    return EvaluatedRobot(log.robot, maps, points, path, is_surveyed(folders.log))
 
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT)
@@ -294,4 +348,6 @@ def load_robot_smoothed(folders: RobotFolders) -> EvaluatedRobot:
         return associations.at(iteration, n)
 
     truth = truth_or_unknown(folders.log, read_log(folders.log))
-    return replace(robot, maps=maps, points_world_m=landmark_truth(truth, owners_at, maps))
+    points = landmark_truth(truth, owners_at, maps)
+    path = PathTruth.of(truth).or_fitted(maps, points)
+    return replace(robot, maps=maps, points_world_m=points, path=path)

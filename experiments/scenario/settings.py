@@ -369,11 +369,13 @@ class Scenario(Section):
         return self.model_dump(mode="json")
 
     def why_no_truth(self) -> str:
-        """Return a text about the first log without truth; empty if all robots have truth.
-
-        Robots are evaluated together, because alignments concern the maps of two robots.
-        """
+        """Return a reason why nothing can be judged; empty if the truth of any robot is known."""
         return ""
+
+
+def has_truth(log: Path) -> bool:
+    """Return True if true poses or true points are beside a log."""
+    return any(table_path(log, name).is_file() for name in TRUTH_TABLES)
 
 
 class Recording(Scenario):
@@ -386,12 +388,12 @@ class Recording(Scenario):
     logs: Annotated[list[str], Field(min_length=1, max_length=MAX_NAMED), AfterValidator(different)]
 
     def why_no_truth(self) -> str:
-        """Return a text about the first log without truth; empty if all logs have truth."""
-        for log in map(Path, self.logs):
-            lacking = [name for name in TRUTH_TABLES if not table_path(log, name).is_file()]
-            if lacking and log.is_dir():
-                return f"no truth is known: {log} has no {lacking[0]}.parquet or .csv"
-        return ""
+        """Return a text about the first log; empty if any log has true poses or points."""
+        logs = [log for log in map(Path, self.logs) if log.is_dir()]
+        if any(map(has_truth, logs)) or not logs:
+            return ""
+        lacking = " or ".join(f"{name}.parquet" for name in TRUTH_TABLES)
+        return f"no truth is known: {logs[0]} has no {lacking} (or .csv)"
 
 
 class SimulatedScenario(Scenario):

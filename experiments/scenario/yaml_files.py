@@ -21,6 +21,7 @@ _MOST_WRITTEN = 20_000
 _MOST_DEPTH = 50  # nested levels; a scenario needs 8
 _TOO_DEEP = "nested too deeply, or holds itself"
 _OPENCV_HEADER = "%YAML:1.0"  # OpenCV's files begin so; it is not a valid YAML directive
+_OPENCV_TAG = "!!opencv-matrix"  # its matrices are mappings
 _LARGEST_INTEGER = 2**63  # the limit of tables and of most JSON readers
 
 
@@ -60,7 +61,8 @@ def read_mapping(
         raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
     if len(data) > _MOST_BYTES:
         raise InputError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, none is")
-    value = parse_value(text.removeprefix(_OPENCV_HEADER), str(path))
+    plain = text.removeprefix(_OPENCV_HEADER).replace(_OPENCV_TAG, "")
+    value = parse_value(plain, str(path))
     if not isinstance(value, dict):
         found = "nothing" if value is None else f"a {type(value).__name__}"
         raise InputError(f"{path}: holds {found}, expected a mapping of {keys}")

@@ -20,16 +20,19 @@ import numpy as np
 
 from mapfusion.camera import MAX_IMAGE_SIDE_PX, StereoCamera
 from mapfusion.errors import InputError, OutOfRangeError
+from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float
 
 Distortion = Literal["none", "radial-tangential", "equidistant"]
-# Numbers of coefficients: k1 k2 p1 p2 and optionally k3 (Brown 1966), or four of the odd powers of
-# the angle (Kannala, Brandt 2006).
+# Numbers of coefficients: k1 k2 p1 p2 and optionally k3 (Brown 1966) and k4 k5 k6, the denominator
+# of the rational model (Claus, Fitzgibbon 2005, as in OpenCV); or four of the odd powers of the
+# angle (Kannala, Brandt 2006).
 _COEFFICIENTS: dict[Distortion, tuple[int, ...]] = {
     "none": (0,),
-    "radial-tangential": (4, 5),
+    "radial-tangential": (4, 5, 8),
     "equidistant": (4,),
 }
+_LONGEST_RATIONAL = 8  # OpenCV writes up to 14 coefficients; the others are usually zero
 _LARGEST_FOCAL_PX = 1e5
 _ROTATION_TOLERANCE = 1e-4  # calibrations are printed with at least six digits
 # Optical axes in the robot frame: x ahead, y left, z up.
@@ -196,6 +199,101 @@ def parse_transform(where: str, key: str, holder: Mapping[str, Any]) -> Float:
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     return T
+
+
+def read_stereo_calibration(
+    path: Path, document: Mapping[str, Any], size_px: tuple[int, int] | None = None
+) -> tuple[StereoCalibration, Float | None]:
+    """Read the calibration of a stereo pair in the layout of Kalibr or of OpenCV.
+
+    Kalibr's layout has `cam0` (left) and `cam1`, with `T_cn_cnm1` of `cam1`, or `T_cam_imu` or its
+    inverse `T_imu_cam` of both cameras. OpenCV's layout has the camera matrices `K1`, `K2` (or
+    `M1`, `M2`), the distortions `D1`, `D2`, and `R`, `T` from the left camera into the right one.
+
+    Args:
+        path: file of the document, for messages.
+        document: contents of the file.
+        size_px: width and height of the pictures, for documents without them.
+
+    Returns:
+        Calibration, and the mount `T_BS` (4, 4) of the left camera; None if the file has none.
+
+    Raises:
+        InputError: a value is missing or wrong; the message names file and key.
+    """
+    if "cam0" not in document and any(key in document for key in ("K1", "M1")):
+        return _opencv_calibration(path, document, size_px), None
+    cameras = [parse_section(path, document, name) for name in ("cam0", "cam1")]
+    named = [f"{path}: {name}" for name in ("cam0", "cam1")]
+    bodies = [key for key in ("T_cam_imu", "T_imu_cam") if all(key in each for each in cameras)]
+    if "T_cn_cnm1" in cameras[1] or not bodies:
+        T_right_left = parse_transform(named[1], "T_cn_cnm1", cameras[1])
+        T_left_right = se3.inverse(T_right_left)
+    else:
+        pairs = zip(named, cameras, strict=True)
+        left, right = (parse_transform(where, bodies[0], each) for where, each in pairs)
+        if bodies[0] == "T_cam_imu":
+            left, right = se3.inverse(left), se3.inverse(right)
+        T_left_right = se3.between(left, right)
+    lenses = [parse_lens(where, each) for where, each in zip(named, cameras, strict=True)]
+    try:
+        calibration = StereoCalibration(lenses[0], lenses[1], T_left_right)
+    except InputError as error:
+        raise InputError(f"{named[1]}: {error}") from error
+    mount = parse_transform(named[0], "T_BS", cameras[0]) if "T_BS" in cameras[0] else None
+    return calibration, mount
+
+
+_OPENCV_SIZES = (("image_width", "image_height"), ("width", "height"))
+
+
+def _opencv_calibration(
+    path: Path, document: Mapping[str, Any], size_px: tuple[int, int] | None
+) -> StereoCalibration:
+    """Return the calibration of a file in OpenCV's layout; see `read_stereo_calibration`."""
+    sizes = [
+        (int(document[wide]), int(document[high]))
+        for wide, high in _OPENCV_SIZES
+        if all(isinstance(document.get(each), int) for each in (wide, high))
+    ]
+    size_px = sizes[0] if sizes else size_px
+    if size_px is None:
+        raise InputError(f"{path}: image_width and image_height: are missing")
+    lenses = []
+    for n in (1, 2):
+        name = next((key for key in (f"K{n}", f"M{n}") if key in document), f"K{n}")
+        K = _opencv_matrix(path, document, name, 9).reshape(3, 3)
+        D = _opencv_matrix(path, document, f"D{n}", None)
+        while len(D) > _LONGEST_RATIONAL and not D[-1]:
+            D = D[:-1]
+        distortion: Distortion = "radial-tangential" if D.any() else "none"
+        own = tuple(D.tolist()) if D.any() else ()
+        try:
+            lenses.append(Lens(size_px, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own))
+        except InputError as error:
+            raise InputError(f"{path}: {name} and D{n}: {error}") from error
+    R = _opencv_matrix(path, document, "R", 9).reshape(3, 3)
+    T_right_left = se3.pose(R, _opencv_matrix(path, document, "T", 3))
+    try:
+        require_rigid("R and T", T_right_left)
+        return StereoCalibration(lenses[0], lenses[1], se3.inverse(T_right_left))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _opencv_matrix(path: Path, document: Mapping[str, Any], key: str, n: int | None) -> Float:
+    """Return the n numbers of a matrix of OpenCV (any number for None), row by row."""
+    value = document.get(key)
+    value = value.get("data") if isinstance(value, Mapping) else value
+    try:
+        found = np.array(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        found = np.full(1, np.nan)
+    if not np.isfinite(found).all() or n not in (None, len(found)):
+        wanted = "numbers" if n is None else f"{n} numbers"
+        what = "is missing" if value is None else f"is {_short(value)}"
+        raise InputError(f"{path}: {key}: {what}, expected a matrix of {wanted}")
+    return found
 
 
 def _short(value: Any) -> str:

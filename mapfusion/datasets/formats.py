@@ -51,6 +51,18 @@ IMPORTERS = {
         "UTIAS MRCLAM recordings",
         "MRCLAM_Dataset7",
     ),
+    "points": Importer(
+        "mapfusion.datasets.point_logs:import_points",
+        "PointsSettings",
+        "Odometry and points over time, in CSV or Parquet",
+        "survey --param sigma_m=0.05",
+    ),
+    "ranges": Importer(
+        "mapfusion.datasets.point_logs:import_ranges",
+        "RangesSettings",
+        "Odometry, ranges and bearings over time, in CSV or Parquet",
+        "park --param range_sigma_m=0.3 --param bearing_sigma_rad=0.03",
+    ),
     "euroc": Importer(
         "mapfusion.datasets.euroc:read_euroc",
         "EurocSettings",
@@ -90,6 +102,7 @@ IMPORTERS = {
             "right": "Topic of the right camera's pictures.",
             "odom": "Topic of the robot's odometry; without it visual odometry is used.",
             "imu": "Topic of an IMU: its accelerations level the camera and each frame.",
+            "repeated": "Pictures that repeat a time: refuse them, or keep the first.",
         },
     ),
 }

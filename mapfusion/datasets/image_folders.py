@@ -5,11 +5,11 @@
   time in seconds for each picture of either folder, in the order of their names.
 - A list in place of the folders: a CSV file with one pair a line: time in seconds, left file, right
   file. File names are relative to the list.
-- The calibration is a YAML file in Kalibr's format: `cam0` (left) and `cam1` (right) with
-  `camera_model: pinhole`, `intrinsics`, `distortion_model` (`radtan`, `equidistant`, `none`),
-  `distortion_coeffs`, `resolution`, and `T_cn_cnm1` of `cam1`, which maps points of the left
-  camera into the frame of the right camera. The optional `T_BS` of `cam0` maps points of the left
-  camera into the robot frame.
+- The calibration is a YAML file in OpenCV's layout (see `read_stereo_calibration`) or in Kalibr's:
+  `cam0` (left) and `cam1` (right) with `camera_model: pinhole`, `intrinsics`, `distortion_model`
+  (`radtan`, `equidistant`, `none`), `distortion_coeffs`, `resolution`, and `T_cn_cnm1` of `cam1`,
+  which maps points of the left camera into the frame of the right camera, or `T_cam_imu` of both.
+  The optional `T_BS` of `cam0` maps points of the left camera into the robot frame.
 """
 
 import re
@@ -19,12 +19,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.datasets.camera_calibration import (
-    StereoCalibration,
-    parse_lens,
-    parse_section,
-    parse_transform,
-)
+from mapfusion.datasets.camera_calibration import read_stereo_calibration
 from mapfusion.datasets.levelling import MountSettings, level_mount, robot_in_body
 from mapfusion.datasets.stereo_recording import (
     MAX_OFFSET_NS,
@@ -46,7 +41,6 @@ from mapfusion.datasets.text_files import (
     require_increasing,
 )
 from mapfusion.errors import InputError
-from mapfusion.geometry import se3
 from mapfusion.parameters import Range, require_in_range
 
 _KINDS = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
@@ -92,20 +86,9 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
         raise InputError(f"{folder}: no such folder (a recording of images)")
     calibration_file = folder / settings.calibration
     document = read_yaml(calibration_file)
-    cam0, cam1 = (parse_section(calibration_file, document, name) for name in ("cam0", "cam1"))
-    T_right_left = parse_transform(f"{calibration_file}: cam1", "T_cn_cnm1", cam1)
-    try:
-        lenses = (
-            parse_lens(f"{calibration_file}: cam0", cam0),
-            parse_lens(f"{calibration_file}: cam1", cam1),
-        )
-        calibration = StereoCalibration(*lenses, se3.inverse(T_right_left))
-    except InputError as error:
-        known = str(error).startswith(str(calibration_file))
-        raise InputError(f"{'' if known else f'{calibration_file}: cam1: '}{error}") from error
+    calibration, T_body_left = read_stereo_calibration(calibration_file, document)
     T_robot_left = level_mount(float(calibration.T_left_right[0, 3]), 0.0, _HEIGHT_M)
-    if "T_BS" in cam0:
-        T_body_left = parse_transform(f"{calibration_file}: cam0", "T_BS", cam0)
+    if T_body_left is not None:
         T_robot_left = robot_in_body(T_body_left)[1]
 
     pair_list = folder / settings.list

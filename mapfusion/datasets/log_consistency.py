@@ -61,7 +61,7 @@ class Finding(NamedTuple):
     """Contradiction within a log.
 
     Attributes:
-        kind: "odometry", "truth", "jump", "noise" or "gate".
+        kind: "odometry", "truth", "jump", "noise", "association" or "gate".
         frame: frame of a jump, else -1.
         text: one line without the robot's name.
     """

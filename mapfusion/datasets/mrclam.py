@@ -21,10 +21,17 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.camera import CalibrationError
+from mapfusion.datasets.point_logs import (
+    MAX_FRAMES,
+    Measurements,
+    dead_reckoning,
+    interpolate_poses,
+    log_on_clock,
+    points_of_ranges,
+)
 from mapfusion.datasets.text_files import parse_numbers, read_rows, require_columns
 from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.se2 import between, compose, rotation, wrap
 from mapfusion.robot_log import (
     TRUTH_FILES,
     Observations,
@@ -37,7 +44,6 @@ from mapfusion.robot_log import (
 _LAST_ROBOT_SUBJECT = 5
 _CAMERA = "MRCLAM"  # all robots share one camera model, calibration and print of barcodes
 _MAY_BE_ZERO = ("range_sigma_ratio", "range_scale_sigma")
-_MAX_FRAMES = 1_000_000  # eleven days at one frame a second
 
 
 @dataclass(frozen=True)
@@ -122,8 +128,8 @@ def import_mrclam(
     first_s = min(odometry[0, 0] for _, odometry, _, _ in recordings)
     last_s = max(odometry[-1, 0] for _, odometry, _, _ in recordings)
     duration_s = last_s - first_s
-    if not duration_s / settings.frame_s < _MAX_FRAMES:
-        limit = f"more than {_MAX_FRAMES} frames of {settings.frame_s:g} s"
+    if not duration_s / settings.frame_s < MAX_FRAMES:
+        limit = f"more than {MAX_FRAMES} frames of {settings.frame_s:g} s"
         raise InputError(
             f"{folder}: odometry over {duration_s:g} s is {limit}; are its times seconds?"
         )
@@ -144,7 +150,7 @@ def import_mrclam(
             (path / outdated).unlink(missing_ok=True)
         if truth is not None:
             gap_s = settings.longest_truth_gap_s
-            write_truth_poses(path, _interpolate_truth(clock_s, truth, gap_s))
+            write_truth_poses(path, interpolate_poses(clock_s, truth, gap_s))
         if landmarks is not None:
             assert log.observations.label is not None
             points = np.array([landmarks[int(subject)] for subject in log.observations.label])
@@ -160,83 +166,18 @@ def _make_log(
 
     A frame holds the measurements since the frame before, moved into its robot frame by odometry.
     """
-    # Keep the last measurement of each subject in each frame.
-    frame = np.searchsorted(clock_s, measurements[:, 0])
-    pairs = np.stack([frame, measurements[:, 1]], -1)[::-1]
-    kept = np.zeros(len(frame), dtype=bool)
-    kept[len(frame) - 1 - np.unique(pairs, axis=0, return_index=True)[1]] = True
-    kept &= frame < len(clock_s)
-    measurements, frame = measurements[kept], frame[kept]
     time_s, subject, range_m, bearing_rad = measurements.T
-
-    # Convert range and bearing to a position; the covariance is of first order in the noise.
-    direction = rotation(bearing_rad)
-    position = np.zeros((len(range_m), 3))
-    position[:, :2] = range_m[:, None] * direction[:, :, 0]
-    along_and_across = np.zeros((len(range_m), 2, 2))
-    along_and_across[:, 0, 0] = settings.range_sigma(range_m) ** 2
-    along_and_across[:, 1, 1] = (range_m * settings.bearing_sigma_rad) ** 2
-    covariance = np.zeros((len(range_m), 3, 3))
-    covariance[:, :2, :2] = direction @ along_and_across @ np.swapaxes(direction, 1, 2)
-
-    # Move each measurement from the robot frame at its own time to that of its log frame.
-    T_start_frame = _dead_reckoning(odometry, clock_s)
-    T_frame_measured = between(T_start_frame[frame], _dead_reckoning(odometry, time_s))
-    R = rotation(T_frame_measured[:, 2])
-    position[:, :2] = np.einsum("nij,nj->ni", R, position[:, :2]) + T_frame_measured[:, :2]
-    covariance[:, :2, :2] = R @ covariance[:, :2, :2] @ np.swapaxes(R, 1, 2)
-
-    increments = np.zeros((len(clock_s), 3))
-    increments[1:] = between(T_start_frame[:-1], T_start_frame[1:])
-    return RobotLog(
-        robot=robot,
-        planar=True,
-        time_s=clock_s - clock_s[0],
-        odometry=increments,
-        iteration=frame,
-        observations=Observations(position, covariance, label=subject.astype(np.int32)),
-        calibration=CalibrationError(scale=settings.range_scale_sigma, camera=_CAMERA),
+    sigma_m = settings.range_sigma(range_m)
+    points = points_of_ranges(range_m, bearing_rad, sigma_m, settings.bearing_sigma_rad)
+    observations = Observations(*points, label=subject.astype(np.int32))
+    calibration = CalibrationError(scale=settings.range_scale_sigma, camera=_CAMERA)
+    return log_on_clock(
+        robot,
+        clock_s,
+        lambda wanted_s: dead_reckoning(odometry, wanted_s),
+        Measurements(time_s, observations, planar=True),
+        calibration=calibration,
     )
-
-
-def _dead_reckoning(odometry: Float, time_s: Float) -> Float:
-    """Return dead-reckoned poses, shape (N, 3), at times of shape (N,).
-
-    Each velocity holds until the next one, so the robot moves along arcs. It stands still before
-    the first velocity.
-    """
-    duration = np.diff(odometry[:, 0])
-    steps = _arc(odometry[:-1, 1], odometry[:-1, 2], duration)
-    nodes = np.zeros((len(odometry), 3))
-    # A chain of poses is a sum once each step is turned by the heading before it.
-    nodes[1:, 2] = np.cumsum(steps[:, 2])
-    turned = np.einsum("nij,nj->ni", rotation(nodes[:-1, 2]), steps[:, :2])
-    nodes[1:, :2] = np.cumsum(turned, axis=0)
-    row = np.searchsorted(odometry[:, 0], time_s, side="right") - 1
-    begun = row >= 0
-    row = np.maximum(row, 0)
-    since_s = np.where(begun, time_s - odometry[row, 0], 0.0)
-    return compose(nodes[row], _arc(odometry[row, 1], odometry[row, 2], since_s))
-
-
-def _arc(speed_m_s: Float, turn_rad_s: Float, duration_s: Float) -> Float:
-    """Return motions, shape (N, 3), at constant velocities."""
-    angle = turn_rad_s * duration_s
-    # sinc is exact through zero: chord = length sin(a/2) / (a/2), along half the angle.
-    chord = speed_m_s * duration_s * np.sinc(angle / (2 * np.pi))
-    return np.stack([chord * np.cos(angle / 2), chord * np.sin(angle / 2), angle], -1)
-
-
-def _interpolate_truth(clock_s: Float, truth: Float, longest_gap_s: float) -> Float:
-    """Return true poses, shape (T, 3), at the clock times; NaN in longer gaps and outside."""
-    row = np.clip(np.searchsorted(truth[:, 0], clock_s, side="right") - 1, 0, len(truth) - 2)
-    before, after = truth[row], truth[row + 1]
-    gap_s = after[:, 0] - before[:, 0]
-    share = (clock_s - before[:, 0]) / np.where(gap_s > 0, gap_s, 1.0)
-    pose = before[:, 1:] + share[:, None] * (after[:, 1:] - before[:, 1:])
-    pose[:, 2] = wrap(before[:, 3] + share * wrap(after[:, 3] - before[:, 3]))
-    known = (share >= 0) & (share <= 1) & (gap_s <= longest_gap_s)
-    return np.where(known[:, None], pose, np.nan)
 
 
 def _read_barcodes(path: Path) -> dict[int, int]:

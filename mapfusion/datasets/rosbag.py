@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ from mapfusion.datasets.camera_calibration import (
     Distortion,
     Lens,
     StereoCalibration,
+    read_stereo_calibration,
 )
 from mapfusion.datasets.export import OnFrame, StereoDrive
 from mapfusion.datasets.imu import ImuData
@@ -132,7 +133,14 @@ _ENCODINGS: dict[str, tuple[type, int, int | None]] = {
     "bayer_bggr8": (np.uint8, 1, cv2.COLOR_BayerRG2GRAY),
     "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGR2GRAY),
     "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGB2GRAY),
+    "bayer_rggb16": (np.uint16, 1, cv2.COLOR_BayerBG2GRAY),
+    "bayer_bggr16": (np.uint16, 1, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg16": (np.uint16, 1, cv2.COLOR_BayerGR2GRAY),
+    "bayer_grbg16": (np.uint16, 1, cv2.COLOR_BayerGB2GRAY),
+    "yuv422": (np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": (np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2),
 }
+_MOSAIC = "bayer_"  # beginning of the encodings with one colour a pixel
 _DISTORTIONS: dict[str, Distortion] = {
     "plumb_bob": "radial-tangential",
     "rational_polynomial": "radial-tangential",
@@ -150,10 +158,17 @@ def decode_image(message: Any) -> np.ndarray:
         InputError: the encoding is not supported, or bytes are missing.
     """
     if not hasattr(message, "encoding"):
-        image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_ANYDEPTH)
+        # The format begins with the encoding before compression: "bayer_rggb8; jpeg compressed".
+        stated = str(message.format).partition(";")[0].strip()
+        is_mosaic = stated.startswith(_MOSAIC) and stated in _ENCODINGS
+        flags = cv2.IMREAD_UNCHANGED if is_mosaic else cv2.IMREAD_ANYDEPTH
+        image = cv2.imdecode(np.asarray(message.data, np.uint8), flags)
         if image is None:
             raise InputError("compressed picture: cannot be decoded")
-        return image
+        if image.ndim > 2:  # the colours were interpolated before compression
+            return cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
+        conversion = _ENCODINGS[stated][2] if is_mosaic else None
+        return image if conversion is None else cv2.cvtColor(image, conversion)
     if message.encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
         raise InputError(f"encoding {message.encoding!r}: is not read; known: {known}")
@@ -188,7 +203,13 @@ def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibrat
         return StereoCalibration(_rectified_lens(left), _rectified_lens(right), apart)
     turned = [se3.pose(_matrix(info, "R", (3, 3)), np.zeros(3)) for info in (left, right)]
     T_left_right = se3.inverse(turned[0]) @ apart @ turned[1]
-    return StereoCalibration(_raw_lens(left), _raw_lens(right), T_left_right)
+    lenses = []
+    for side, info in (("left", left), ("right", right)):
+        try:
+            lenses.append(_raw_lens(info))
+        except InputError as error:
+            raise InputError(f"camera_info of the {side} camera: {error}") from error
+    return StereoCalibration(lenses[0], lenses[1], T_left_right)
 
 
 def pose_of_message(message: Any) -> Float:
@@ -250,7 +271,7 @@ def _raw_lens(info: Any) -> Lens:
     K, model = _matrix(info, "K", (3, 3)), str(info.distortion_model)
     if model not in _DISTORTIONS:
         known = ", ".join(name for name in _DISTORTIONS if name)
-        raise InputError(f"camera_info: distortion_model {model!r} is unknown; known: {known}")
+        raise InputError(f"distortion_model {model!r} is unknown; known: {known}")
     coefficients = _matrix(info, "D", (-1,))
     if model == "rational_polynomial" and not coefficients[5:].any():
         coefficients = coefficients[:5]
@@ -271,8 +292,12 @@ class RosbagSettings:
         imu: accelerations, which level each frame and whose mean over the recording points up; if
             empty, the mount of the static transforms is used.
         truth: true poses of the robot; if empty, they are unknown.
-        left_info: calibration of the left camera; by default `camera_info` beside its pictures.
+        left_info: calibration of the left camera; by default `camera_info` beside its pictures, or
+            one level up for compressed pictures.
         right_info: calibration of the right camera.
+        calibration: calibration file in the layout of Kalibr or OpenCV in place of the messages.
+        repeated: `first` keeps the first of several pictures with the same time; `refuse` raises
+            an error.
         rectified: True if the pictures are rectified; by default if the names of both topics
             contain `rect`.
         base: robot frame (x ahead, z up) in `/tf_static`.
@@ -286,6 +311,8 @@ class RosbagSettings:
     truth: str = ""
     left_info: str = ""
     right_info: str = ""
+    calibration: str = ""
+    repeated: Literal["refuse", "first"] = "refuse"
     rectified: bool | None = None
     base: str = "base_link"
     mount: MountSettings = field(default_factory=MountSettings)
@@ -312,7 +339,7 @@ class _BagPicture:
         raise InputError(f"{self.bag.path}: {self.topic}: the picture of {self.stamp_ns} is gone")
 
 
-def read_rosbag(path: Path, settings: RosbagSettings, _: ReadYaml) -> StereoRecording:
+def read_rosbag(path: Path, settings: RosbagSettings, read_yaml: ReadYaml) -> StereoRecording:
     """Read a bag; pictures are loaded later.
 
     Raises:
@@ -329,22 +356,33 @@ def read_rosbag(path: Path, settings: RosbagSettings, _: ReadYaml) -> StereoReco
         bag.require("--imu", settings.imu, "Imu")
 
     # Calibration of the pair.
-    info_topics = (settings.left_info, settings.right_info)
-    infos = []
-    for option, topic, own in zip(("left_info", "right_info"), topics, info_topics, strict=True):
-        info_topic = own or f"{topic.rsplit('/', 1)[0]}/camera_info"
-        bag.require(option, info_topic, "CameraInfo")
-        infos.append(bag.first(info_topic))
-    rectified = settings.rectified
-    if rectified is None:
-        rectified = all("rect" in topic for topic in topics)
-    try:
-        pair = stereo_calibration(infos[0], infos[1], rectified)
-    except (InputError, ValueError) as error:
-        raise InputError(f"{path}: {error}") from error
+    calibrated_by = f"{path}: camera_info of {settings.left} and {settings.right}"
+    if settings.calibration:
+        calibrated_by = settings.calibration
+        file = Path(settings.calibration)
+        size_px = decode_image(bag.first(settings.left)).shape[1::-1]
+        pair, _ = read_stereo_calibration(file, read_yaml(file), size_px)
+    else:
+        infos = [
+            bag.first(_info_topic(bag, option, topic, own))
+            for option, topic, own in (
+                ("left_info", settings.left, settings.left_info),
+                ("right_info", settings.right, settings.right_info),
+            )
+        ]
+        rectified = settings.rectified
+        if rectified is None:
+            rectified = all("rect" in topic for topic in topics)
+        try:
+            pair = stereo_calibration(infos[0], infos[1], rectified)
+        except (InputError, ValueError) as error:
+            raise InputError(f"{path}: {error}") from error
 
-    left, right = (_read_pictures(bag, topic) for topic in topics)
+    (left, twice_left), (right, twice_right) = (
+        _read_pictures(bag, topic, settings.repeated) for topic in topics
+    )
     time_ns, pictures, dropped = pair_shots(path, left, right)
+    dropped = (*twice_left, *twice_right, *dropped)
     T_robot_left, inertial = _read_mount(bag, settings, pair)
     T_robot_left = settings.mount.applied(T_robot_left)
     odometry, truth = (
@@ -360,25 +398,58 @@ def read_rosbag(path: Path, settings: RosbagSettings, _: ReadYaml) -> StereoReco
         odometry,
         dropped,
         inertial,
-        f"{path}: camera_info of {settings.left} and {settings.right}",
+        calibrated_by,
     )
 
 
-def _read_pictures(bag: Bag, topic: str) -> list[Shot]:
-    """Return the pictures of a topic; their times must increase."""
-    shots, last_ns = list[Shot](), None
+def _info_topic(bag: Bag, option: str, topic: str, own: str) -> str:
+    """Return the topic of a camera's CameraInfo.
+
+    The topic `own` if it is given, else `camera_info` beside the pictures. Compressed pictures are
+    a level below (`image/compressed`), so the level above is tried, too.
+    """
+    spaces = [topic.rsplit("/", n)[0] for n in (1, 2)]
+    tried = [f"{space}/camera_info" for space in spaces]
+    if not bag.topics[topic].endswith("/CompressedImage"):
+        tried = tried[:1]
+    there = [each for each in tried if each in bag.topics]
+    if not own and not there:
+        others = [name for name, kind in bag.topics.items() if kind.endswith("/CameraInfo")]
+        found = f"topics of this type: {', '.join(sorted(others)) or 'none'}"
+        remedy = f"give one by --param {option}=TOPIC, or a file by --calibration FILE"
+        lacking = f"no such topic {tried[0]} (CameraInfo of {topic})"
+        raise InputError(f"{bag.path}: {lacking}; {found}; {remedy}")
+    chosen = own or there[0]
+    bag.require(option, chosen, "CameraInfo")
+    return chosen
+
+
+def _read_pictures(
+    bag: Bag, topic: str, repeated: Literal["refuse", "first"]
+) -> tuple[list[Shot], list[str]]:
+    """Return the pictures of a topic, and a line about those that repeat a time.
+
+    Times must increase.
+    """
+    shots, last_ns, n_repeated = list[Shot](), None, 0
     for recorded_ns, message in bag.messages(topic):
         own_ns = stamp_ns(message)
+        if own_ns == last_ns and repeated == "first":
+            n_repeated += 1
+            continue
         if last_ns is not None and own_ns <= last_ns:
-            back = f"{(last_ns - own_ns) / 1e9:g} s"
-            found = f"the picture recorded at {recorded_ns} ns runs back by {back}"
-            raise InputError(f"{bag.path}: {topic}: {found}; times must increase")
+            back = f"runs back by {(last_ns - own_ns) / 1e9:g} s; times must increase"
+            if own_ns == last_ns:
+                back = "repeats the time before; --repeated first keeps the first of each time"
+            found = f"the picture recorded at {recorded_ns} ns {back}"
+            raise InputError(f"{bag.path}: {topic}: {found}")
         last_ns = own_ns
         load = _BagPicture(bag, topic, recorded_ns, own_ns)
         shots.append(Shot(own_ns, f"{topic} at {own_ns} ns", load))
     if not shots:
         raise InputError(f"{bag.path}: topic {topic} holds no message")
-    return shots
+    twice = f"{n_repeated} pictures of {topic} that repeat the time of the picture before"
+    return shots, [twice] if n_repeated else []
 
 
 def _read_poses(bag: Bag, topic: str) -> TimedPoses:

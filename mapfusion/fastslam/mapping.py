@@ -11,7 +11,7 @@ from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, FastSlamParameters, StepResult
 from mapfusion.geometry.numerics import Float, require_shape
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import RobotLog
+from mapfusion.robot_log import Observations, RobotLog
 from mapfusion.tables import NO_LABEL
 from mapfusion.viewing import viewing_of_log
 
@@ -40,6 +40,32 @@ class Frame:
     landmarks: LandmarkMap | None = None
     path: Float | None = None
     associations: np.ndarray | None = None
+
+
+def association_for(log: RobotLog, stated: Association) -> Association:
+    """Return the criterion that associates the observations of a log.
+
+    If no observation has what the stated criterion needs, it is the label if every observation has
+    one, else the descriptor if every observation has one, else the gate.
+    """
+    seen = log.observations
+    if not len(seen) or not _lacking(seen, stated).all():
+        return stated
+    if not _lacking(seen, Association.LABEL).any():
+        return Association.LABEL
+    if not _lacking(seen, Association.DESCRIPTOR).any():
+        return Association.DESCRIPTOR
+    return Association.GATE
+
+
+def _lacking(seen: Observations, association: Association) -> np.ndarray:
+    """Return, shape (N,), True for observations without the label or descriptor that is needed."""
+    lacking = np.full(len(seen), association is not Association.GATE)
+    if association is Association.LABEL and seen.label is not None:
+        lacking[:] = seen.label == NO_LABEL
+    elif association is Association.DESCRIPTOR and seen.descriptor is not None:
+        lacking[:] = np.isnan(seen.descriptor).any(1)
+    return lacking
 
 
 def run_log(
@@ -71,21 +97,16 @@ def run_log(
         One `Frame` for each frame of the log.
 
     Raises:
-        InputError: `parameters.planar` contradicts the log, or observations have no labels or
-            descriptors although `parameters.association` needs them.
+        InputError: `parameters.planar` contradicts the log, or some observations have no label or
+            descriptor although the association needs them (see `association_for`).
         ValueError: `odometry_covariance` has another length than the log.
     """
     # Reject unusable input before the first step: filtering a long log may take hours.
-    seen, association = log.observations, parameters.association
-    lacking = np.zeros(len(seen), dtype=bool)
-    if association is Association.LABEL:
-        lacking[:] = True if seen.label is None else seen.label == NO_LABEL
-    elif association is Association.DESCRIPTOR:
-        lacking[:] = True if seen.descriptor is None else np.isnan(seen.descriptor).any(1)
-    if n := np.count_nonzero(lacking):
+    seen, association = log.observations, association_for(log, parameters.association)
+    if n := np.count_nonzero(_lacking(seen, association)):
         raise InputError(
             f"log {log.robot}: {n} of {len(seen)} observations have no {association.value}, which "
-            f"the setting association={association.value} needs; choose another association"
+            f"association={association.value} needs; choose another association"
         )
     if odometry_covariance is not None:
         require_shape("odometry_covariance", odometry_covariance, (len(log), 3, 3))
@@ -95,7 +116,7 @@ def run_log(
             f"planar: is {parameters.planar}, but the log of {log.robot} holds {kind}; leave it out"
         )
     wanted = frozenset(snapshots)
-    slam = FastSlam(replace(parameters, planar=log.planar), rng)
+    slam = FastSlam(replace(parameters, planar=log.planar, association=association), rng)
     starts = log.frame_starts()
     for iteration, odometry in enumerate(log.odometry):
         frame, sigma = log.observations[starts[iteration] : starts[iteration + 1]], None

@@ -16,7 +16,7 @@ from mapfusion.datasets.log_consistency import Finding, Jump, check_log, gate_fi
 from mapfusion.datasets.odometry_noise import NoiseSource
 from mapfusion.datasets.relative_motion import MIN_MOTIONS
 from mapfusion.fastslam.filter import FastSlamParameters, StepResult
-from mapfusion.fastslam.mapping import run_log
+from mapfusion.fastslam.mapping import association_for, run_log
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import (
     POSE_FIELDS,
@@ -94,7 +94,7 @@ def run(settings: SlamSettings, job: Job) -> None:
     """Run the filter over a log and write maps, poses, associations and particle clouds."""
     recorded = read_log(job.inputs["log"])
     known = read_odometry_covariance(job.inputs["log"], len(recorded))
-    checked = checked_log(recorded, known, settings.filter.motion, settings.noise)
+    checked = checked_log(recorded, known, settings.filter, settings.noise)
     log, parameters = checked.log, replace(settings.filter, motion=checked.motion)
     last = len(log) - 1
     steps = list[dict[str, float]]()
@@ -163,18 +163,23 @@ class CheckedLog(NamedTuple):
 
 
 def checked_log(
-    log: RobotLog, odometry_covariance: Float | None, stated: MotionNoise, source: NoiseSource
+    log: RobotLog,
+    odometry_covariance: Float | None,
+    stated: FastSlamParameters,
+    source: NoiseSource,
 ) -> CheckedLog:
     """Check a log, remove the jumps of its odometry, and choose the motion noise.
+
+    The findings also name an association that differs from the stated one.
 
     Args:
         log: recorded log.
         odometry_covariance: covariance of visual odometry, shape (T, 3, 3), whose noise is not
             estimated; else None.
-        stated: stated motion noise.
+        stated: stated settings of the filter.
         source: source of the motion noise.
     """
-    found, factor = check_log(log, stated), 1.0
+    found, factor = check_log(log, stated.motion), 1.0
     findings, noise = found.findings, found.noise
     if odometry_covariance is not None or any(each.kind == "odometry" for each in findings):
         pass  # the noise is that of the observations, or the odometry has another mistake
@@ -189,7 +194,11 @@ def checked_log(
         used = "the filter uses the noise of slam.filter.motion"
         findings = (*findings, Finding("noise", -1, f"{unknown}; {used}"))
     used_log, covariance = without_jumps(log, found.jumps, odometry_covariance)
-    motion = stated.scaled(factor)
+    used = association_for(log, stated.association)
+    if used is not stated.association:
+        text = f"observations have no {stated.association}: they are associated by {used}"
+        findings = (*findings, Finding("association", -1, f"{text} (slam.filter.association)"))
+    motion = stated.motion.scaled(factor)
     return CheckedLog(used_log, covariance, factor, motion, findings, found.jumps)
 
 

@@ -37,3 +37,15 @@ def test_settings_reach_the_importer(tmp_path: Path, capsys: pytest.CaptureFixtu
     log = read_log(logs / "robot1")
     assert log.observations.covariance_m2[0, 0, 0] == pytest.approx(0.3**2)
     assert not (logs / "robot1" / "truth_poses.parquet").exists()
+
+
+@pytest.mark.parametrize(
+    ("format_name", "words"),
+    [("rosbag", ["--calibration pair.yaml: no such file"]), ("kitti", ["has files of its own"])],
+)
+def test_a_calibration_file_is_for_formats_that_take_one(
+    format_name: str, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("--calibration", "pair.yaml")
+    reply = command(capsys, "import", format_name, tmp_path, "-o", tmp_path / "logs", *given)
+    assert_refused(reply, *words)

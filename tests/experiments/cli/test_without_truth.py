@@ -84,6 +84,105 @@ def test_what_needs_the_truth_is_refused_before_any_work(
     assert not (tmp_path / "new").exists()
 
 
+POSES, POINTS = "truth_poses.parquet", "truth_points.parquet"
+
+
+def partly_known(
+    tiny: Simulation, tiny_results: Path, scenario: Path, folder: Path, names: dict[str, list[str]]
+) -> Path:
+    """Copy the recorded scenario with some tables of the truth, by robot."""
+    run = EvaluatedRun.of(tiny, Store.of(tiny_results))
+    for robot in run.pipeline.robots:
+        shutil.copytree(scenario.parent / robot.name, folder / robot.name)
+        for name in names.get(robot.name, []):
+            shutil.copy(run.store.path(robot.log) / name, folder / robot.name / name)
+    return Path(shutil.copy(scenario, folder / "recorded.yaml"))
+
+
+ERRORS = ["translation_error_m", "rotation_error_rad", "refined_translation_error_m"]
+
+
+def test_true_poses_alone_judge_paths_and_alignments(
+    tiny: Simulation,
+    tiny_results: Path,
+    scenario: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    known = {"R1": [POSES], "R2": [POSES]}
+    own = partly_known(tiny, tiny_results, scenario, tmp_path, known)
+    results = tmp_path / "results"
+    expected = ("--set", "expect={path_rmse_m: {max: 1}}")
+    reply = command(capsys, "run", own, *expected, "--jobs", 1, "--results", results)
+    assert reply.code == 0
+    assert "true points are unknown" in reply.err
+    found = estimated_tables(results / "recorded-3")
+    whole = estimated_tables(tiny_results / "tiny-3")
+    # Errors of estimates follow from the poses alone, so they are those of the whole truth.
+    of_methods = found["errors"]["aligner"] != "oracle"
+    np.testing.assert_array_equal(
+        found["errors"].loc[of_methods, ERRORS], whole["errors"].loc[of_methods, ERRORS]
+    )
+    np.testing.assert_array_equal(found["robots"]["path_error_m"], whole["robots"]["path_error_m"])
+    # The poses place the observations, so common landmarks are known up to their noise.
+    ours, theirs = (each["errors"]["n_common"].to_numpy() for each in (found, whole))
+    assert np.mean(np.abs(ours - theirs)) < 0.3 * np.mean(theirs)
+    assert found["map_fits"].empty
+    assert found["landmark_nees"].empty
+    assert found["fusion"].empty
+    assert found["fusers"]["landmark_rmse_m"].isna().all()
+    assert command(capsys, "check", own, *expected, "--results", results).code == 0
+
+
+def test_true_points_alone_judge_maps_and_alignments(
+    tiny: Simulation,
+    tiny_results: Path,
+    scenario: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    known = {"R1": [POINTS], "R2": [POINTS]}
+    own = partly_known(tiny, tiny_results, scenario, tmp_path, known)
+    results = tmp_path / "results"
+    assert command(capsys, "run", own, "--jobs", 1, "--results", results).code == 0
+    found = estimated_tables(results / "recorded-3")
+    whole = estimated_tables(tiny_results / "tiny-3")
+    assert found["robots"]["path_error_m"].isna().all()
+    # A rigid fit of the maps to the points does not depend on the poses.
+    np.testing.assert_allclose(found["map_fits"]["rmse_m"], whole["map_fits"]["rmse_m"])
+    np.testing.assert_array_equal(found["errors"]["n_true"], whole["errors"]["n_true"])
+    # The origins of the maps are fitted: the motions differ by the errors of the maps.
+    apart = found["errors"]["translation_error_m"] - whole["errors"]["translation_error_m"]
+    assert found["errors"]["translation_error_m"].notna().any()
+    assert float(apart.abs().median()) < 0.2
+    assert found["errors"]["alignment_nees"].isna().all()
+
+
+def test_pairs_of_robots_with_truth_are_judged(
+    tiny: Simulation,
+    tiny_results: Path,
+    scenario: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    known = {"R1": [POSES, POINTS]}
+    own = partly_known(tiny, tiny_results, scenario, tmp_path, known)
+    results = tmp_path / "results"
+    assert command(capsys, "run", own, "--jobs", 1, "--results", results).code == 0
+    found = estimated_tables(results / "recorded-3")
+    whole = estimated_tables(tiny_results / "tiny-3")
+    assert found["errors"].empty
+    of_first = found["robots"]["robot"] == "R1"
+    assert found["robots"].loc[~of_first, "path_error_m"].isna().all()
+    np.testing.assert_array_equal(
+        found["robots"].loc[of_first, "path_error_m"],
+        whole["robots"].loc[of_first, "path_error_m"],
+    )
+    fits = found["map_fits"].set_index("map")["rmse_m"]
+    assert fits["R1"] == whole["map_fits"].set_index("map")["rmse_m"]["R1"]
+    assert np.isnan(fits["R2"])
+
+
 def test_results_that_cannot_be_written_are_told_before_any_work(
     scenario: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

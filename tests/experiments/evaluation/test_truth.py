@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,13 +9,22 @@ from experiments.evaluation.truth import (
     PathTruth,
     common_landmarks,
     fit_rmse_m,
+    is_surveyed,
     landmark_truth,
     true_pairs,
+    truth_or_unknown,
 )
 from experiments.pipeline.stages.slam import Associations
+from mapfusion.errors import InputError
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.robot_log import RobotTruth
+from mapfusion.robot_log import (
+    Observations,
+    RobotLog,
+    RobotTruth,
+    write_truth_points,
+    write_truth_poses,
+)
 from tests.helpers.made_up_maps import landmark_map
 
 
@@ -161,3 +172,58 @@ def test_path_starts_at_the_first_known_pose() -> None:
     expected = [[0, 0, 0], [1, 0, 0], [1, 1, np.pi / 2]]  # forward is x, left is y
     np.testing.assert_allclose(path.T_map_robot[1:], expected, atol=1e-12)
     assert np.isnan(path.T_map_robot[0]).all()
+
+
+def two_frames() -> tuple[RobotLog, np.ndarray, np.ndarray]:
+    """Return a log without noise, its true poses, and the true points of its observations."""
+    rng = np.random.default_rng(2)
+    poses = np.array([[1.0, -2.0, 0.3], [1.5, -1.0, 2.0], [4.0, 0.0, -1.0]])
+    iteration, points = np.array([0, 0, 1, 2]), rng.normal(size=(4, 3))
+    # in the complex plane: local = (world - position) exp(-i heading)
+    ahead = np.exp(-1j * poses[iteration, 2])
+    local = (points[:, :2] - poses[iteration, :2]) @ [1, 1j] * ahead
+    position = np.column_stack([local.real, local.imag, points[:, 2]])
+    seen = Observations(position, np.tile(np.eye(3), (4, 1, 1)))
+    log = RobotLog("R1", False, np.arange(3.0), np.zeros((3, 3)), iteration, seen)
+    return log, poses, points
+
+
+def test_true_poses_place_the_observations(tmp_path: Path) -> None:
+    log, poses, points = two_frames()
+    poses[1] = np.nan
+    write_truth_poses(tmp_path, poses)
+    truth = truth_or_unknown(tmp_path, log)
+    np.testing.assert_array_equal(truth.T_world_robot, poses)
+    np.testing.assert_allclose(truth.point_world_m[[0, 1, 3]], points[[0, 1, 3]], atol=1e-12)
+    assert np.isnan(truth.point_world_m[2]).all()
+    assert not is_surveyed(tmp_path)
+
+
+def test_true_points_alone_leave_the_poses_unknown(tmp_path: Path) -> None:
+    log, _, points = two_frames()
+    nothing = truth_or_unknown(tmp_path, log)
+    assert np.isnan(nothing.T_world_robot).all()
+    assert np.isnan(nothing.point_world_m).all()
+    write_truth_points(tmp_path, points)
+    truth = truth_or_unknown(tmp_path, log)
+    assert np.isnan(truth.T_world_robot).all()
+    np.testing.assert_array_equal(truth.point_world_m, points)
+    assert is_surveyed(tmp_path)
+    write_truth_points(tmp_path, points[:2])
+    with pytest.raises(InputError, match=r"truth_points\.parquet: 2 rows, the log has 4"):
+        truth_or_unknown(tmp_path, log)
+
+
+def test_the_origin_of_a_map_is_fitted_to_true_points() -> None:
+    rng = np.random.default_rng(3)
+    T_world_map = np.array([3.0, -1.0, 0.7])
+    own = rng.normal(size=(12, 3))
+    maps = {4: landmark_map(own[:5]), 9: landmark_map(own)}
+    points = {k: se2.transform_points(T_world_map, each.position_m) for k, each in maps.items()}
+    points[9][:3] = np.nan
+    unknown = PathTruth.of(RobotTruth(np.full((3, 3), np.nan), np.empty((0, 3))))
+    found = unknown.or_fitted(maps, points)
+    assert found.fitted
+    np.testing.assert_allclose(found.T_world_map, T_world_map, atol=1e-12)
+    known = PathTruth.of(RobotTruth(np.zeros((3, 3)), np.empty((0, 3))))
+    assert known.or_fitted(maps, points) is known

@@ -14,7 +14,14 @@ from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import export_drive, read_recording
 from mapfusion.datasets.rosbag import RosbagSettings, decode_image, lookup_transform
 from mapfusion.errors import InputError
-from tests.mapfusion.datasets.written_layouts import CAMERA, POSES, TIMES_S, drive
+from tests.mapfusion.datasets.written_layouts import (
+    CAMERA,
+    POSES,
+    TIMES_S,
+    drive,
+    read_yaml,
+    write_calibration,
+)
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 if "tf2_msgs/msg/TFMessage" not in STORE.types:
@@ -90,10 +97,10 @@ def messages(encoding: str) -> list[tuple[str, str, int, Any]]:
     return [("/tf_static", "tf2_msgs/msg/TFMessage", 0, static), *found]
 
 
-def write(path: Path, encoding: str = "mono8") -> Path:
+def write(path: Path, encoding: str = "mono8", sent: list | None = None) -> Path:
     with Writer(path, version=9) as bag:
         connections: dict[str, Any] = {}
-        for topic, kind, k, message in messages(encoding):
+        for topic, kind, k, message in sent or messages(encoding):
             if topic not in connections:
                 connections[topic] = bag.add_connection(topic, kind, typestore=STORE)
             data = STORE.serialize_cdr(message, kind)
@@ -182,3 +189,93 @@ def test_damaged_bags_are_one_line(bag: Path, tmp_path: Path) -> None:
     for wrong in (tmp_path / "none.bag", tmp_path):
         with pytest.raises(InputError, match=str(wrong)):
             read_recording("rosbag", wrong, settings())
+
+
+def without_info() -> list:
+    return [each for each in messages("mono8") if "camera_info" not in each[0]]
+
+
+def test_a_bag_without_camera_info_takes_a_calibration_file(tmp_path: Path, bag: Path) -> None:
+    path = write(tmp_path / "drive", sent=without_info())
+    lacking = r"no such topic /left/camera_info .* type: none; .* --calibration FILE"
+    with pytest.raises(InputError, match=lacking):
+        read_recording("rosbag", path, settings())
+    write_calibration(tmp_path / "pair.yaml")
+    own = settings(calibration=str(tmp_path / "pair.yaml"))
+    found = read_recording("rosbag", path, own, read_yaml)
+    expected = read_recording("rosbag", bag, settings()).calibration
+    assert (found.calibration.left, found.calibration.right) == (expected.left, expected.right)
+    np.testing.assert_allclose(found.calibration.T_left_right, expected.T_left_right, atol=1e-12)
+
+
+def test_compressed_topics_have_camera_info_one_level_up(tmp_path: Path) -> None:
+    """As image_transport names them: /left/image/compressed beside /left/camera_info."""
+    sent = [
+        (f"{topic}/compressed" if topic.endswith("image") else topic, *rest)
+        for topic, *rest in messages("compressed")
+    ]
+    path = write(tmp_path / "drive", sent=sent)
+    topics = {f"{side}": f"/{side}/image/compressed" for side in SIDES}
+    recording = read_recording("rosbag", path, settings(**topics))
+    assert recording.calibration.left.focal_px == (CAMERA.focal_px,) * 2
+    for found, image in zip(recording.pair(0), drive()[0], strict=True):
+        np.testing.assert_array_equal(found, image)
+
+
+@pytest.mark.parametrize("colours", [False, True])
+def test_the_format_of_a_compressed_picture_tells_a_mosaic(colours: bool) -> None:
+    """Red rises to the right and blue downwards; without demosaicing neighbours differ by much."""
+    v, u = np.mgrid[:40, :60]
+    rgb = np.stack([4 * u, 0 * u + 100, 6 * v], axis=-1).astype(np.uint8)
+    mosaic = rgb[:, :, 1].copy()
+    mosaic[::2, ::2], mosaic[1::2, 1::2] = rgb[::2, ::2, 0], rgb[1::2, 1::2, 2]
+    picture = rgb[:, :, ::-1] if colours else mosaic
+    data = cv2.imencode(".png", picture)[1].ravel()
+    kind = T["sensor_msgs/msg/CompressedImage"]
+    found = decode_image(kind(header(0, "c"), "bayer_rggb8; png compressed", data))
+    luma = rgb @ [0.299, 0.587, 0.114]
+    np.testing.assert_allclose(found[2:-2, 2:-2], luma[2:-2, 2:-2], atol=2)
+
+
+def test_eight_coefficients_are_the_rational_model(tmp_path: Path) -> None:
+    """The raw lens bends points as the published formula does."""
+    coefficients = np.array([0.3, -0.05, 1e-4, -2e-4, 0.01, 0.6, 0.02, 0.005])
+    sent = messages("mono8")
+    for _, kind, _, message in sent:
+        if kind.endswith("CameraInfo"):
+            object.__setattr__(message, "distortion_model", "rational_polynomial")
+            object.__setattr__(message, "d", coefficients)
+    path = write(tmp_path / "drive", sent=sent)
+    lens = read_recording("rosbag", path, settings()).calibration.left
+    assert lens.coefficients == tuple(coefficients)
+    x, y = 0.3, -0.2
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    s = x * x + y * y
+    radial = (1 + k1 * s + k2 * s**2 + k3 * s**3) / (1 + k4 * s + k5 * s**2 + k6 * s**3)
+    bent = (
+        x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x),
+        y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
+    )
+    pixel = np.array([bent]) * lens.focal_px + lens.center_px
+    np.testing.assert_allclose(lens.rays(pixel)[0], [x, y, 1.0], atol=1e-5)
+    for _, kind, _, message in sent:
+        if kind.endswith("CameraInfo") and "right" in message.header.frame_id:
+            object.__setattr__(message, "d", np.ones(12))
+    path = write(tmp_path / "wrong", sent=sent)
+    with pytest.raises(InputError, match=r"camera_info of the right camera: .* 12 numbers"):
+        read_recording("rosbag", path, settings())
+
+
+def test_repeated_times_are_refused_or_dropped_and_counted(tmp_path: Path) -> None:
+    sent = []
+    for topic, kind, k, message in messages("mono8"):
+        sent.append((topic, kind, k, message))
+        if topic == "/left/image" and k > 0:
+            sent.append((topic, kind, k, message))
+    path = write(tmp_path / "drive", sent=sent)
+    with pytest.raises(InputError, match="repeats the time before; --repeated first"):
+        read_recording("rosbag", path, settings())
+    recording = read_recording("rosbag", path, settings(repeated="first"))
+    assert len(recording) == 3
+    assert len(recording.dropped) == 1
+    assert recording.dropped[0].startswith("2 pictures of /left/image that repeat the time")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from mapfusion.errors import InputError
+from mapfusion.fastslam.association import Association
 from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
-from mapfusion.fastslam.mapping import build_map, run_log
+from mapfusion.fastslam.mapping import association_for, build_map, run_log
 from mapfusion.robot_log import Observations, RobotLog
 from tests.mapfusion.fastslam.landmark_worlds import drive
 
@@ -93,3 +94,39 @@ def test_odometry_that_observations_told_and_they_count_half_each() -> None:
         np.testing.assert_allclose(own.result.log_weights, other.result.log_weights, atol=1e-6)
     with pytest.raises(ValueError, match="odometry_covariance: shape"):
         next(iter(run_log(log, SETTINGS, np.random.default_rng(0), odometry_covariance=told[1:])))
+
+
+@pytest.mark.parametrize(
+    ("has", "stated", "expected"),
+    [
+        ("", "descriptor", "gate"),
+        ("label", "descriptor", "label"),
+        ("some labels", "descriptor", "gate"),
+        ("descriptor", "label", "descriptor"),
+        ("label descriptor", "descriptor", "descriptor"),
+        ("label", "gate", "gate"),
+        ("some labels", "label", "label"),  # refused: the labels of the others are missing
+    ],
+)
+def test_the_log_chooses_an_association_that_it_allows(
+    has: str, stated: str, expected: str
+) -> None:
+    log = log_of(planar=False)
+    n = len(log.observations)
+    label = np.arange(n, dtype=np.int32) % 5 if "label" in has else None
+    if label is not None and "some" in has:
+        label[0] = -1
+    descriptor = np.ones((n, 64), np.float32) if "descriptor" in has else None
+    seen = replace(log.observations, label=label, descriptor=descriptor)
+    log = replace(log, observations=seen)
+    assert association_for(log, Association(stated)) is Association(expected)
+    settings = replace(SETTINGS, association=Association(stated))
+    if "some" in has and stated == "label":
+        with pytest.raises(InputError, match=r"1 of .* observations have no label"):
+            build_map(log, settings, np.random.default_rng(0))
+    else:
+        allowed = replace(settings, association=Association(expected))
+        found, chosen = (
+            build_map(log, each, np.random.default_rng(0)) for each in (settings, allowed)
+        )
+        np.testing.assert_array_equal(found.position_m, chosen.position_m)

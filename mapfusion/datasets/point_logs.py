@@ -1,0 +1,486 @@
+"""Logs of points, or of ranges and bearings, with odometry at times of its own.
+
+A recording is a folder of tables, each NAME.csv or NAME.parquet. Times are seconds on one clock,
+angles are in radians, and the robot frame has x ahead and y left.
+
+- `odometry`: `time_s` and either dead-reckoned poses (`x_m`, `y_m`, `theta_rad`, in any frame) or
+  velocities (`speed_m_s`, `turn_rate_rad_s`), each of which holds until the next one.
+- `points`: `time_s` and a position in the frame of the sensor (`x_m`, `y_m`, `z_m`), with its
+  covariance (`cov_xx_m2`, ...) or the setting `sigma_m`. Without `z_m` the points are planar.
+- `ranges`: `time_s`, `range_m`, `bearing_rad`, to the left positive; planar.
+- Both may hold `label` (a known identity) and `descriptor_0`, `descriptor_1`, ...
+- `truth_poses`: `time_s`, `x_m`, `y_m`, `theta_rad`; optional; may have gaps.
+- `landmarks`: surveyed points, `label`, `x_m`, `y_m` and `z_m`; optional.
+
+A folder without odometry holds one such folder for each robot. Their landmarks may be in the folder
+above.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pyarrow as pa
+
+from mapfusion.errors import InputError
+from mapfusion.files import (
+    COVARIANCE_FIELDS,
+    POSE_FIELDS,
+    POSITION_FIELDS,
+    column,
+    columns,
+    float_fields,
+    point_fields,
+    points_from,
+    require_cells,
+    schema,
+)
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import between, compose, rotation, wrap
+from mapfusion.parameters import Range, require_in_range
+from mapfusion.robot_log import (
+    TRUTH_FILES,
+    Observations,
+    RobotLog,
+    write_log,
+    write_truth_points,
+    write_truth_poses,
+)
+from mapfusion.tables import (
+    APPEARANCE_FIELDS,
+    NO_LABEL,
+    appearance_from,
+    described,
+    read_open_table,
+    require_appearance,
+    table_path,
+)
+
+PosesAt = Callable[[Float], Float]
+MAX_FRAMES = 1_000_000  # eleven days at one frame a second
+_LONGEST_HOLD_S = 1.0  # before the first and after the last pose the robot is taken to stand still
+_LARGEST_BEARING = 2 * np.pi  # conventions are -pi to pi and 0 to 2 pi; degrees lie beyond
+_VELOCITY_FIELDS = ["speed_m_s", "turn_rate_rad_s"]
+_POLAR_FIELDS = ["range_m", "bearing_rad"]
+_TIME = described(pa.field("time_s", pa.float64()), "time in seconds")
+
+
+def _unknown(fields: list[pa.Field], about: str) -> list[pa.Field]:
+    """Return optional columns, NaN where they are missing."""
+    return [described(field, about, np.nan) for field in fields]
+
+
+ODOMETRY = schema(
+    "point_log.odometry",
+    1,
+    [
+        _TIME,
+        *_unknown(float_fields(POSE_FIELDS), "dead-reckoned pose in any frame"),
+        *_unknown(float_fields(_VELOCITY_FIELDS), "velocity until the next row"),
+    ],
+)
+POINTS = schema(
+    "point_log.points",
+    1,
+    [
+        _TIME,
+        *(described(field, "point in the sensor frame") for field in point_fields()[:3]),
+        *_unknown(point_fields()[3:], "covariance of the point; or the setting sigma_m"),
+        *APPEARANCE_FIELDS,
+    ],
+)
+RANGES = schema(
+    "point_log.ranges",
+    1,
+    [
+        _TIME,
+        *(
+            described(field, "range and bearing from the sensor; bearings are positive to the left")
+            for field in float_fields(_POLAR_FIELDS)
+        ),
+        *APPEARANCE_FIELDS,
+    ],
+)
+TRUE_POSES = schema(
+    "point_log.truth_poses",
+    1,
+    [_TIME, *(described(f, "true pose T_world_robot") for f in float_fields(POSE_FIELDS))],
+)
+LANDMARKS = schema(
+    "point_log.landmarks",
+    1,
+    [
+        described(pa.field("label", pa.int32()), "identity of the landmark"),
+        *(
+            described(field, "surveyed point in the world")
+            for field in float_fields(POSITION_FIELDS)
+        ),
+    ],
+)
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Settings of the frames of a log.
+
+    Attributes:
+        frame_s: time between frames, whose measurements odometry moves into the robot frame at the
+            frame's time; a frame keeps the last measurement of each label. 0: a frame at each time
+            of the measurements.
+        longest_truth_gap_s: longest gap over which the truth is interpolated.
+        sensor_x_m: position of the sensor in the robot frame, ahead.
+        sensor_y_m: position of the sensor in the robot frame, to the left.
+        sensor_theta_rad: heading of the sensor in the robot frame.
+    """
+
+    frame_s: Annotated[float, Range(0, 1e4, "s")] = 0.0
+    longest_truth_gap_s: Annotated[float, Range(0, 1e4, "s")] = 1.0
+    sensor_x_m: Annotated[float, Range(-100, 100, "m")] = 0.0
+    sensor_y_m: Annotated[float, Range(-100, 100, "m")] = 0.0
+    sensor_theta_rad: Annotated[float, Range(-_LARGEST_BEARING, _LARGEST_BEARING, "rad")] = 0.0
+
+    def __post_init__(self) -> None:
+        require_in_range(self)
+
+
+@dataclass(frozen=True)
+class PointsSettings(_Frames):
+    """Settings of the importer of point logs.
+
+    Attributes:
+        sigma_m: standard deviation of a point along each axis, for tables without covariances; 0
+            if it is not stated.
+    """
+
+    sigma_m: Annotated[float, Range(0, 100, "m")] = 0.0
+
+
+@dataclass(frozen=True)
+class RangesSettings(_Frames):
+    """Settings of the importer of logs of ranges and bearings.
+
+    Attributes:
+        range_sigma_m: constant part of the standard deviation of a range.
+        range_sigma_ratio: part of the standard deviation that is proportional to the range.
+        bearing_sigma_rad: standard deviation of a bearing; 0 if it is not stated.
+    """
+
+    range_sigma_m: Annotated[float, Range(0, 100, "m")] = 0.0
+    range_sigma_ratio: Annotated[float, Range(0, 1, "1")] = 0.0
+    bearing_sigma_rad: Annotated[float, Range(0, np.pi, "rad")] = 0.0
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Measured points of a robot over time, in the robot frame at their own times.
+
+    Attributes:
+        time_s: ascending times, shape (N,).
+        observations: the points.
+        planar: True for points without heights.
+    """
+
+    time_s: Float
+    observations: Observations
+    planar: bool
+
+
+def import_points(
+    folder: Path, destination: Path, settings: PointsSettings | None = None
+) -> list[Path]:
+    """Write a log for each robot of a recording of points, with the truth if it is recorded.
+
+    Returns:
+        Folders of the logs, in the order of the names of the robots.
+
+    Raises:
+        InputError: a table is missing, damaged or contradicts another one; nothing is written.
+    """
+    chosen = settings or PointsSettings()
+    return _import_robots(folder, destination, chosen, partial(_read_points, settings=chosen))
+
+
+def import_ranges(
+    folder: Path, destination: Path, settings: RangesSettings | None = None
+) -> list[Path]:
+    """Write a log for each robot of a recording of ranges and bearings; see `import_points`."""
+    chosen = settings or RangesSettings()
+    return _import_robots(folder, destination, chosen, partial(_read_ranges, settings=chosen))
+
+
+def _import_robots(
+    folder: Path, destination: Path, settings: _Frames, read: Callable[[Path], Measurements]
+) -> list[Path]:
+    """Write the logs of the robots in a folder; `read` returns the measurements of one."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder (expected a recording with odometry.csv)")
+    robots = [each for each in (folder, *sorted(folder.iterdir())) if _holds_odometry(each)]
+    if not robots:
+        raise InputError(f"{folder}: no odometry.csv or odometry.parquet, nor in a folder below")
+    made = []
+    for robot in robots[:1] if robots[0] == folder else robots:
+        measured, odometry_at = read(robot), _read_odometry(table_path(robot, "odometry"))
+        clock_s = _clock(robot, measured.time_s, settings.frame_s)
+        log = log_on_clock(robot.resolve().name, clock_s, odometry_at, measured)
+        poses, points = table_path(robot, "truth_poses"), None
+        T_world_robot = _read_true_poses(poses, clock_s, settings) if poses.is_file() else None
+        surveys = (table_path(each, "landmarks") for each in (robot, folder))
+        survey = next((path for path in surveys if path.is_file()), None)
+        if survey is not None:
+            points = _true_points(survey, log.observations.label)
+        made.append((destination / log.robot, log, T_world_robot, points))
+    for path, log, T_world_robot, points in made:
+        write_log(path, log)
+        for outdated in TRUTH_FILES:  # of an earlier import into the same folder
+            (path / outdated).unlink(missing_ok=True)
+        if T_world_robot is not None:
+            write_truth_poses(path, T_world_robot)
+        if points is not None:
+            write_truth_points(path, points)
+    return [path for path, *_ in made]
+
+
+def _holds_odometry(folder: Path) -> bool:
+    return table_path(folder, "odometry").is_file()
+
+
+def _read_timed(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
+    """Read a table with times that do not decrease; raises InputError."""
+    table, attributes = read_open_table(path, table_schema)
+    require_cells(path, table, ["time_s"], np.isfinite, "give a finite number")
+    if not table.num_rows:
+        raise InputError(f"{path}: holds no row")
+    back = np.flatnonzero(np.diff(column(table, "time_s")) < 0)
+    if len(back):
+        row = int(back[0]) + 1
+        raise InputError(f"{path}: column time_s: runs back in row {row}; sort the rows by time")
+    return table, attributes
+
+
+def _read_points(robot: Path, settings: PointsSettings) -> Measurements:
+    """Read the table `points` of a robot."""
+    path = table_path(robot, "points")
+    table, attributes = _read_timed(path, POINTS)
+    require_cells(path, table, POSITION_FIELDS, np.isfinite, "give a finite number, or remove it")
+    planar = attributes.get("planar") == "true"
+    if np.isnan(column(table, COVARIANCE_FIELDS[0])).all():
+        if not settings.sigma_m:
+            stated = "give --param sigma_m=..., the standard deviation of a point along each axis"
+            raise InputError(f"{path}: has no covariances (cov_xx_m2, ...); {stated}")
+        position = columns(table, POSITION_FIELDS)
+        axes = np.array([1.0, 1.0, 0.0 if planar else 1.0])
+        covariance = np.tile(np.diag(axes * settings.sigma_m**2), (len(position), 1, 1))
+    else:
+        require_cells(path, table, COVARIANCE_FIELDS, np.isfinite, "give a finite number")
+        position, covariance = points_from(table)
+    return _measured(path, table, position, covariance, planar, settings)
+
+
+def _read_ranges(robot: Path, settings: RangesSettings) -> Measurements:
+    """Read the table `ranges` of a robot."""
+    path = table_path(robot, "ranges")
+    table, _ = _read_timed(path, RANGES)
+    positive = "ranges are positive, in metres; remove rows without a return"
+    require_cells(path, table, ["range_m"], lambda r: np.isfinite(r) & (r > 0), positive)
+    limit = "bearings are in radians, -pi to pi or 0 to 2 pi; are they degrees?"
+    require_cells(path, table, ["bearing_rad"], lambda b: np.abs(b) <= _LARGEST_BEARING, limit)
+    lacking = [] if settings.range_sigma_m or settings.range_sigma_ratio else ["range_sigma_m"]
+    lacking += [] if settings.bearing_sigma_rad else ["bearing_sigma_rad"]
+    if lacking:
+        asked = " ".join(f"--param {name}=..." for name in lacking)
+        raise InputError(f"{path}: the noise is not stated; give {asked} (standard deviations)")
+    range_m, bearing_rad = columns(table, _POLAR_FIELDS).T
+    range_sigma_m = np.hypot(settings.range_sigma_m, settings.range_sigma_ratio * range_m)
+    points = points_of_ranges(range_m, bearing_rad, range_sigma_m, settings.bearing_sigma_rad)
+    return _measured(path, table, *points, True, settings)
+
+
+def _measured(
+    path: Path, table: pa.Table, position: Float, covariance: Float, planar: bool, settings: _Frames
+) -> Measurements:
+    """Return measurements in the robot frame, given those in the sensor frame."""
+    require_appearance(path, table)
+    R = np.eye(3)
+    R[:2, :2] = rotation(np.array(settings.sensor_theta_rad))
+    moved = position @ R.T + [settings.sensor_x_m, settings.sensor_y_m, 0.0]
+    observations = Observations(moved, R @ covariance @ R.T, *appearance_from(table))
+    return Measurements(column(table, "time_s"), observations, planar)
+
+
+def points_of_ranges(
+    range_m: Float, bearing_rad: Float, range_sigma_m: Float, bearing_sigma_rad: float
+) -> tuple[Float, Float]:
+    """Return planar points (N, 3) of ranges and bearings (N,), and their covariances (N, 3, 3).
+
+    The covariance is of first order in the noise.
+    """
+    n, direction = len(range_m), rotation(bearing_rad)
+    position, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    position[:, :2] = range_m[:, None] * direction[:, :, 0]
+    along_and_across = np.zeros((n, 2, 2))
+    along_and_across[:, 0, 0] = range_sigma_m**2
+    along_and_across[:, 1, 1] = (range_m * bearing_sigma_rad) ** 2
+    covariance[:, :2, :2] = direction @ along_and_across @ np.swapaxes(direction, 1, 2)
+    return position, covariance
+
+
+def _clock(robot: Path, time_s: Float, frame_s: float) -> Float:
+    """Return the times of the frames, shape (T,), for measurements at `time_s`."""
+    if not frame_s:
+        clock_s = np.unique(time_s)
+    else:
+        n = (time_s[-1] - time_s[0]) / frame_s
+        if not n < MAX_FRAMES:
+            limit = f"more than {MAX_FRAMES} frames of {frame_s:g} s; are its times seconds?"
+            raise InputError(f"{robot}: measurements over {time_s[-1] - time_s[0]:g} s are {limit}")
+        clock_s = time_s[0] + frame_s * np.arange(int(np.ceil(n)) + 1)
+    return clock_s
+
+
+def log_on_clock(
+    robot: str, clock_s: Float, poses_at: PosesAt, measured: Measurements, **extras: Any
+) -> RobotLog:
+    """Return a log with a frame at each time of a clock.
+
+    A frame holds the measurements since the frame before, moved into its robot frame by odometry.
+    Of the measurements of one label in a frame, the last one is kept. Later measurements than the
+    last frame are left out.
+
+    Args:
+        robot: name of the robot.
+        clock_s: increasing times of the frames, shape (T,).
+        poses_at: function that returns dead-reckoned poses (N, 3) at times (N,).
+        measured: measurements of the robot.
+        extras: further arguments of `RobotLog`.
+    """
+    frame, seen = np.searchsorted(clock_s, measured.time_s), measured.observations
+    kept = frame < len(clock_s)
+    if seen.label is not None:
+        pairs = np.stack([frame, seen.label], -1)[::-1]
+        last = np.zeros(len(frame), dtype=bool)
+        last[len(frame) - 1 - np.unique(pairs, axis=0, return_index=True)[1]] = True
+        kept &= last | (seen.label == NO_LABEL)
+    frame, seen, time_s = frame[kept], seen[kept], measured.time_s[kept]
+
+    T_start_frame = poses_at(clock_s)
+    T_frame_measured = between(T_start_frame[frame], poses_at(time_s))
+    R = np.tile(np.eye(3), (len(frame), 1, 1))
+    R[:, :2, :2] = rotation(T_frame_measured[:, 2])
+    position = np.einsum("nij,nj->ni", R, seen.position_m)
+    position[:, :2] += T_frame_measured[:, :2]
+    covariance = R @ seen.covariance_m2 @ np.swapaxes(R, 1, 2)
+
+    increments = np.zeros((len(clock_s), 3))
+    increments[1:] = between(T_start_frame[:-1], T_start_frame[1:])
+    observations = Observations(position, covariance, seen.descriptor, seen.label)
+    times = clock_s - clock_s[0]
+    return RobotLog(robot, measured.planar, times, increments, frame, observations, **extras)
+
+
+def _read_odometry(path: Path) -> PosesAt:
+    """Read the odometry of a robot and return its poses as a function of time."""
+    table, _ = _read_timed(path, ODOMETRY)
+    time_s = column(table, "time_s")
+    poses, velocities = (columns(table, names) for names in (POSE_FIELDS, _VELOCITY_FIELDS))
+    given = [not np.isnan(each).all() for each in (poses, velocities)]
+    if sum(given) != 1:
+        found = "has both poses and velocities" if all(given) else "has no poses or velocities"
+        either = f"{', '.join(POSE_FIELDS)}, or {', '.join(_VELOCITY_FIELDS)}"
+        raise InputError(f"{path}: {found}; give either {either}")
+    names = POSE_FIELDS if given[0] else _VELOCITY_FIELDS
+    require_cells(path, table, names, np.isfinite, "give a finite number")
+    repeated = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(repeated):
+        raise InputError(f"{path}: column time_s: repeats in row {int(repeated[0]) + 1}")
+
+    def poses_at(wanted_s: Float) -> Float:
+        beyond = np.abs(wanted_s - np.clip(wanted_s, time_s[0], time_s[-1])) > _LONGEST_HOLD_S
+        if beyond.any():
+            spans = f"odometry of {time_s[0]:.15g} to {time_s[-1]:.15g} s has no pose at"
+            moment = f"{wanted_s[beyond][0]:.15g} s, where something is measured"
+            raise InputError(f"{path}: {spans} {moment}; is it another recording's, or clock's?")
+        held_s = np.clip(wanted_s, time_s[0], time_s[-1])
+        if given[1]:
+            return dead_reckoning(np.column_stack([time_s, velocities]), held_s)
+        return interpolate_poses(held_s, np.column_stack([time_s, poses]), np.inf)
+
+    return poses_at
+
+
+def dead_reckoning(odometry: Float, time_s: Float) -> Float:
+    """Return dead-reckoned poses, shape (N, 3), at times of shape (N,).
+
+    Each velocity (time_s, speed, turn rate) holds until the next one, so the robot moves along
+    arcs. It stands still before the first velocity.
+    """
+    duration = np.diff(odometry[:, 0])
+    steps = _arc(odometry[:-1, 1], odometry[:-1, 2], duration)
+    nodes = np.zeros((len(odometry), 3))
+    # A chain of poses is a sum once each step is turned by the heading before it.
+    nodes[1:, 2] = np.cumsum(steps[:, 2])
+    turned = np.einsum("nij,nj->ni", rotation(nodes[:-1, 2]), steps[:, :2])
+    nodes[1:, :2] = np.cumsum(turned, axis=0)
+    row = np.searchsorted(odometry[:, 0], time_s, side="right") - 1
+    begun = row >= 0
+    row = np.maximum(row, 0)
+    since_s = np.where(begun, time_s - odometry[row, 0], 0.0)
+    return compose(nodes[row], _arc(odometry[row, 1], odometry[row, 2], since_s))
+
+
+def _arc(speed_m_s: Float, turn_rad_s: Float, duration_s: Float) -> Float:
+    """Return motions, shape (N, 3), at constant velocities."""
+    angle = turn_rad_s * duration_s
+    # sinc is exact through zero: chord = length sin(a/2) / (a/2), along half the angle.
+    chord = speed_m_s * duration_s * np.sinc(angle / (2 * np.pi))
+    return np.stack([chord * np.cos(angle / 2), chord * np.sin(angle / 2), angle], -1)
+
+
+def interpolate_poses(wanted_s: Float, timed: Float, longest_gap_s: float) -> Float:
+    """Return poses, shape (T, 3), at wanted times; NaN in longer gaps and outside.
+
+    Args:
+        wanted_s: times, shape (T,).
+        timed: rows of time_s, x, y, theta in the order of time, shape (N, 4).
+        longest_gap_s: longest gap over which poses are interpolated.
+    """
+    if len(timed) == 1:
+        return np.where((wanted_s == timed[0, 0])[:, None], timed[0, 1:], np.nan)
+    row = np.clip(np.searchsorted(timed[:, 0], wanted_s, side="right") - 1, 0, len(timed) - 2)
+    before, after = timed[row], timed[row + 1]
+    gap_s = after[:, 0] - before[:, 0]
+    share = (wanted_s - before[:, 0]) / np.where(gap_s > 0, gap_s, 1.0)
+    pose = before[:, 1:] + share[:, None] * (after[:, 1:] - before[:, 1:])
+    pose[:, 2] = wrap(before[:, 3] + share * wrap(after[:, 3] - before[:, 3]))
+    known = (share >= 0) & (share <= 1) & (gap_s <= longest_gap_s)
+    return np.where(known[:, None], pose, np.nan)
+
+
+def _read_true_poses(path: Path, clock_s: Float, settings: _Frames) -> Float:
+    """Return the true poses (T, 3) at the times of the frames; NaN where unknown."""
+    table, _ = _read_timed(path, TRUE_POSES)
+    require_cells(path, table, POSE_FIELDS, np.isfinite, "give a finite number, or remove the row")
+    timed = np.column_stack([column(table, "time_s"), columns(table, POSE_FIELDS)])
+    if timed[-1, 0] < clock_s[0] or timed[0, 0] > clock_s[-1]:
+        spans = f"{timed[0, 0]:.3f} to {timed[-1, 0]:.3f} s, measurements are of"
+        last = f"{clock_s[0]:.3f} to {clock_s[-1]:.3f} s; no time is in both"
+        raise InputError(f"{path}: the truth is of {spans} {last}")
+    return interpolate_poses(clock_s, timed, settings.longest_truth_gap_s)
+
+
+def _true_points(path: Path, label: np.ndarray | None) -> Float:
+    """Return the surveyed points of labels (N,), shape (N, 3); NaN where unknown."""
+    table, _ = read_open_table(path, LANDMARKS)
+    if label is None:
+        raise InputError(f"{path}: names landmarks by label, but the measurements have no labels")
+    require_cells(path, table, POSITION_FIELDS, np.isfinite, "give a finite number")
+    known, point_m = column(table, "label"), columns(table, POSITION_FIELDS)
+    twice = np.flatnonzero(np.bincount(known - known.min(initial=0)) > 1)
+    if len(twice):
+        raise InputError(f"{path}: has label {int(twice[0] + known.min())} twice")
+    order = np.argsort(known)
+    place = np.clip(np.searchsorted(known[order], label), 0, len(known) - 1)
+    found = known[order][place] == label
+    return np.where(found[:, None], point_m[order][place], np.nan)

@@ -1,0 +1,42 @@
+"""The worked example of the page on logs of points and ranges, from tables to a map."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.geometry import se2
+from mapfusion.landmark_map import read_map
+from tests.helpers.tiny_scenario import command
+
+PAGE = Path(__file__).parents[3] / "experiments" / "docs" / "point_logs.md"
+
+
+def test_the_worked_example_maps_the_trees(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = PAGE.read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    names: dict[str, np.ndarray] = {}
+    exec(program, names)
+    lines = [line for line in text.splitlines() if line.startswith("mapfusion ")]
+    imported, mapped = (command(capsys, *shlex.split(line)[1:]) for line in lines)
+    assert (imported.code, mapped.code) == (0, 0)
+    assert "60 frames" in imported.out
+    assert "associated by gate" in imported.out
+    assert "no descriptor: they are associated by gate" in mapped.err
+    landmarks = read_map(Path("orchard.smoothed.parquet"))
+    trees = np.column_stack([names["trees"], np.zeros(8)])
+    # The map begins at the first pose: at (2, 0), with the heading of the y axis.
+    world = se2.transform_points(np.array([2.0, 0.0, np.pi / 2]), landmarks.position_m)
+    nearest = np.argmin(np.linalg.norm(world[:, None] - trees, axis=2), axis=1)
+    assert sorted(nearest) == list(range(8))
+    T = np.array(fit_rigid(trees[nearest], world, np.arange(8)))
+    apart = se2.transform_points(T, world) - trees[nearest]
+    # Some forty sightings of 0.05 m each leave about a centimetre.
+    assert np.sqrt(np.mean(np.sum(apart**2, axis=1))) < 0.03
+    assert np.hypot(*T[:2]) < 0.1
