@@ -27,7 +27,7 @@ _NAMES_OF = {
     "fusion.merge": ("fuse_maps",),
     "fusion.team_graph": ("EdgeStatus", "TeamParameters", "Unconfirmed"),
     "landmark_map": ("LandmarkMap", "read_map", "write_map"),
-    "map_merging": ("MapAlignment", "MergedMaps", "align_maps", "merge_maps"),
+    "fusion.map_merging": ("MapAlignment", "MergedMaps", "align_maps", "merge_maps"),
     "robot_log": ("Observations", "RobotLog", "read_log", "write_log"),
     "smoother.smooth": ("AssociatedLog",),
     "verification.false_alarms": ("Acceptance",),

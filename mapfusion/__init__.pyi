@@ -22,6 +22,10 @@ from mapfusion.fusion.fusers import FusedMap as FusedMap
 from mapfusion.fusion.fusers import Fusion as Fusion
 from mapfusion.fusion.fusers import MergeParameters as MergeParameters
 from mapfusion.fusion.fusers import make_fuser as make_fuser
+from mapfusion.fusion.map_merging import MapAlignment as MapAlignment
+from mapfusion.fusion.map_merging import MergedMaps as MergedMaps
+from mapfusion.fusion.map_merging import align_maps as align_maps
+from mapfusion.fusion.map_merging import merge_maps as merge_maps
 from mapfusion.fusion.merge import merge as _merge
 from mapfusion.fusion.team_graph import EdgeStatus as EdgeStatus
 from mapfusion.fusion.team_graph import TeamParameters as TeamParameters
@@ -29,10 +33,6 @@ from mapfusion.fusion.team_graph import Unconfirmed as Unconfirmed
 from mapfusion.landmark_map import LandmarkMap as LandmarkMap
 from mapfusion.landmark_map import read_map as read_map
 from mapfusion.landmark_map import write_map as write_map
-from mapfusion.map_merging import MapAlignment as MapAlignment
-from mapfusion.map_merging import MergedMaps as MergedMaps
-from mapfusion.map_merging import align_maps as align_maps
-from mapfusion.map_merging import merge_maps as merge_maps
 from mapfusion.robot_log import Observations as Observations
 from mapfusion.robot_log import RobotLog as RobotLog
 from mapfusion.robot_log import read_log as read_log

@@ -251,8 +251,8 @@ def require_map_file(path: Path, inputs: Sequence[Path | str | None], n_maps: in
     The files of joint covariance and viewing evidence that belong to a Parquet map must not be
     files of an input either.
     """
+    from mapfusion.fusion.map_merging import numbered_path
     from mapfusion.landmark_map import MAP_ENDINGS
-    from mapfusion.map_merging import numbered_path
     from mapfusion.tables import is_alone
 
     require_file("--output", path, MAP_ENDINGS, inputs)

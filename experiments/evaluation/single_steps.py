@@ -31,9 +31,9 @@ from mapfusion.datasets.log_consistency import Finding, gate_finding
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
+from mapfusion.fusion.map_merging import MapAlignment, MergedMaps, align_maps, load_map, merge_maps
 from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap, map_writes
-from mapfusion.map_merging import MapAlignment, MergedMaps, align_maps, load_map, merge_maps
 from mapfusion.robot_log import (
     TRUTH_FILES,
     read_log,

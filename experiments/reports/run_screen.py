@@ -46,9 +46,7 @@ from experiments.reports.layout import (
 from experiments.studies.method_comparison import Recommendation, aligner_summary, recommend
 from experiments.studies.statistics import ROBOT_PAIR, error_bands
 from mapfusion.align.alignment import NOT_RUN, Status
-from mapfusion.fusion.team_graph import EdgeStatus
-from mapfusion.geometry.se2 import motion_sigma
-from mapfusion.map_merging import (
+from mapfusion.fusion.map_merging import (
     MapAlignment,
     MergedMaps,
     advice,
@@ -56,6 +54,8 @@ from mapfusion.map_merging import (
     motion_text,
     sigma_text,
 )
+from mapfusion.fusion.team_graph import EdgeStatus
+from mapfusion.geometry.se2 import motion_sigma
 from sim.renderer import NAMES
 
 
@@ -392,9 +392,9 @@ def print_alignments(alignments: Sequence[MapAlignment]) -> None:
         inliers=found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str),
         time=(1e3 * found["elapsed_s"]).map(two_digits),
     )
-    note = "T_a_b: refined; sigma: where the maps overlap; pairs: supporting correspondences;\n"
-    note += "NFA: number of alignments with as much support by chance; time: of the estimate;\n"
-    note += "more with --json"
+    note = "T_a_b: refined; sigma: where the maps overlap; pairs: correspondences that\n"
+    note += "support it; NFA: number of alignments with as much support by chance; time:\n"
+    note += "of the estimate; more with --json"
     if found["lower_bound"].any() and np.isfinite(sigma_m).any():
         note += f"\n{_LOWER_BOUND}"
     print_frame(shown, _ALIGNMENTS, "", note)

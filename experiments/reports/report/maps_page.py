@@ -13,8 +13,7 @@ from experiments.reports.report.document import write_page
 from experiments.reports.report.map_view import SMOOTH, ellipse_polygons
 from mapfusion.errors import InputError
 from mapfusion.files import write_whole
-from mapfusion.geometry.numerics import Float
-from mapfusion.map_merging import (
+from mapfusion.fusion.map_merging import (
     MapAlignment,
     MergedMaps,
     advice,
@@ -22,6 +21,7 @@ from mapfusion.map_merging import (
     motion_text,
     sigma_text,
 )
+from mapfusion.geometry.numerics import Float
 from mapfusion.plotting import (
     ACCEPTED_COLOUR,
     LEVEL_TEXT,

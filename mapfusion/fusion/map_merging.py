@@ -194,9 +194,11 @@ class MapAlignment:
     def refusal(self) -> str:
         """Why the motion is not accepted, and what to do about it."""
         reason = self.reason.removesuffix(f"; {self.hint}")
-        remedy = self.hint or _REMEDIES[self.status]
-        why = f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}"
-        return f"{_sentence(why)} {_sentence(remedy)}"
+        why = _sentence(f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}")
+        heights = self.registered.refined.heights
+        if heights is not None and heights.loses_pairs:  # the reason says what to do
+            return why
+        return f"{why} {_sentence(self.hint or _REMEDIES[self.status])}"
 
     @property
     def advice(self) -> str:
@@ -319,7 +321,7 @@ def advice(found: Sequence[MapAlignment]) -> str:
         agree = "all" if len(accepted) == len(found) else f"{len(accepted)} of"
         text += f", and {agree} {len(found)} methods agree"
     text += "."
-    return f"{text} {_sentence(best.reason)}" if best.reason else text
+    return f"{text} Note: {_sentence(best.reason)}" if best.reason else text
 
 
 _RANKS = [Status.ACCEPTED, Status.AMBIGUOUS, Status.TOO_UNCERTAIN, Status.REFUSED]

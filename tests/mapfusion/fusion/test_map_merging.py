@@ -14,9 +14,9 @@ from PIL import Image
 
 import mapfusion
 from mapfusion.align.alignment import Status
+from mapfusion.fusion.map_merging import MapAlignment, advice, best_alignment
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap, write_map
-from mapfusion.map_merging import MapAlignment, advice, best_alignment
 from mapfusion.plotting import ELLIPSE_BOUND, bounds, largest_magnification
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
