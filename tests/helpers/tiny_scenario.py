@@ -25,6 +25,7 @@ drive: {frames: 44}
 camera: {width_px: 160, height_px: 120, focal_px: 144.25}
 slam: {filter: {n_particles: 30, proposal: motion}}
 align:
+  evidence: {least_ratio: 1}  # what both see is less than a room
   repetitions: 2
   aligners:
     - {name: ransac, method: ransac}
@@ -40,8 +41,7 @@ expect:
 TRIO = (
     TINY.replace("name: tiny", "name: trio")
     .replace("drive:", "  - {name: R3, start: [0.9, 2.0, 0.1], route: [[2.5, 2.0]]}\ndrive:")
-    # all that the three see is less than a room
-    .replace("align:", "align:\n  evidence: {place_m: 0}")
+    .replace("{least_ratio: 1}", "{place_m: 0, least_ratio: 1}")
     .replace("repetitions: 2", "repetitions: 3")
     .replace("evaluate:", "    - {name: impicp, method: impicp}\nevaluate:")
 )
