@@ -134,7 +134,7 @@ def read_open_table(
         if here := [f"{name} for {similar[name]}" for name in missing if name in similar]:
             more = ", ..." if len(here) > _MAX_NAMED else ""
             remedy = f"did you mean {', '.join(here[:_MAX_NAMED])}{more}?"
-        elif kind == "landmark_map" and all(name.startswith("cov_") for name in missing):
+        elif kind == "landmark_map" and {"cov_xx_m2", "cov_yy_m2"} <= set(missing):
             remedy = "`--sigma 0.05` states one standard deviation for all landmarks, in metres"
         raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")
     if similar:

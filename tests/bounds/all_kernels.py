@@ -26,6 +26,7 @@ from sim.world import write_faces
 from tests.experiments.studies.test_refusal_trial import (
     test_calibration_counts_every_motion_of_two_pairs,
 )
+from tests.mapfusion.align.made_fields import made_field
 from tests.mapfusion.align.map_pairs import given_pairs
 from tests.mapfusion.align.test_clique import on_bits, random_graph
 from tests.mapfusion.align.test_correspondences import two_maps
@@ -94,6 +95,8 @@ def alignments() -> None:
         of.register(np.random.default_rng(1))
     first, second, _ = two_maps(np.random.default_rng(0), 40)
     match(first, second)
+    field = made_field(np.random.default_rng(1), 12, 8, sizes=True)
+    match(field.map_a, field.map_b)
     test_each_box_holds_its_points_and_halves_those_of_the_one_above("spread")
     test_finds_what_looking_at_all_finds("spread", "with others", 75)
     test_what_was_found_before_gives_the_same_verdict()

@@ -23,6 +23,7 @@ logs: [R1, R2]
 slam: {filter: {n_particles: 30, proposal: motion}}
 smooth: {stray_m: 0.003}
 align:
+  evidence: {least_ratio: 1}
   repetitions: 2
   aligners:
     - {name: ransac, method: ransac}

@@ -88,7 +88,7 @@ def test_a_merge_tells_that_no_evidence_could_be_sought(
     told = command(capsys, "merge", a, b, *ONE, "-o", tmp_path / "f.parquet").out.splitlines()
     note = "no evidence to the contrary could be sought: map a has no viewing evidence"
     assert note in told[-1]
-    assert "are the same observations in a and b" in told[-1]  # their descriptors are equal
+    assert "a and b are the same map" in told[-1]
     assert not any("evidence" in line for line in told[:-1])
     assert note in command(capsys, "align", a, b, *ONE).out
 

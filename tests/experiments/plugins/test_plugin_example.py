@@ -31,7 +31,7 @@ T_A_B = np.array([1.0, -2.0, 0.3])
 PLUGGED = (
     TINY.replace("name: tiny", "name: plugged")
     # all that the two see is less than a room
-    .replace("align:", "align:\n  evidence: {place_m: 0}")
+    .replace("{least_ratio: 1}", "{place_m: 0, least_ratio: 1}")
     .replace(
         "    - {name: icp, method: icp}\n",
         """\
@@ -117,10 +117,8 @@ def test_align_with_the_example(
 ) -> None:
     ended = command(capsys, "align", *maps, "--set", entry("best_share"))
     assert (ended.code, ended.complaints) == (0, [])
-    rows = [line for line in ended.out.splitlines() if line.strip().startswith("theirs")]
-    assert rows[0].split()[1] == "accepted"  # shown as soon as the method has answered
-    row = rows[1]
-    assert row.split()[1:4] == ["1.000", "-2.000", "0.3000"]
+    (row,) = (line for line in ended.out.splitlines() if line.strip().startswith("theirs"))
+    assert row.split()[1:5] == ["accepted", "1.000", "-2.000", "0.3000"]
     assert "20/20" in ended.out
 
 

@@ -100,7 +100,7 @@ def test_maps_of_other_programs_as_align_reads_them(
     frame = frame.assign(cov_xy_m2=0.0, cov_yy_m2=0.01)
     frame.assign(label=[3, 4]).to_csv(tmp_path / "north.csv", index=False)
     frame.to_parquet(tmp_path / "south.parquet")
-    for name, by in (("north.csv", "labels"), ("south.parquet", "nothing")):
+    for name, by in (("north.csv", "labels"), ("south.parquet", "geometry alone")):
         reply = command(capsys, "inspect", tmp_path / name)
         assert reply.code == 0
         assert f"{name}: landmark_map" in reply.out.replace("\n", " ")

@@ -104,7 +104,9 @@ def test_results_are_described_in_a_line(found: MapAlignment) -> None:
 
 def test_the_advice_says_what_to_use_and_how_sure_it_is(found: MapAlignment) -> None:
     x, y, theta = found.T_a_b
-    sigma_m, sigma_rad = se2.motion_sigma(found.covariance)
+    overlap = found.registered.refined.overlap
+    assert overlap is not None
+    sigma_m, sigma_rad = se2.motion_sigma(overlap.covariance)
     said = found.advice
     assert f"Use T_a_b = ({x:.3f} m, {y:.3f} m, {theta:.4f} rad) of ransac" in said
     assert f"sigma ≥ {sigma_m:.3f} m, ≥ {sigma_rad:.4f} rad" in said
