@@ -52,7 +52,8 @@ class EvidenceParameters:
             the smaller map lies in such a place and agrees, its surroundings were not compared.
         least_ratio: smallest likelihood ratio of the regions, right motion over wrong motion, if
             maps repeat structure or another motion fits; multiplied by the number of motions that
-            pass the test against chance. In other maps only supporters within two regions need it.
+            pass the test against chance. In other maps it is needed if a region contradicts, or for
+            supporters within two regions, by the regions around them.
             At most one pair of maps in this number has a wrong motion that reaches it (Markov's and
             Boole's inequalities). By default this is at most 2 % of runs with 20 evaluated pairs of
             maps.

@@ -427,16 +427,16 @@ class PairVerifier:
     ) -> float:
         """Return log10 of the largest `least_ratio` that the regions pass; infinite without limit.
 
-        Maps without repeated structure and without another motion need no evidence if the
-        supporters extend over two regions or more. Less may be a copy that led to the motion as a
-        whole. It is then one region, which is no evidence.
+        Maps without repeated structure and without another motion need no evidence if no region
+        contradicts and the supporters extend over two regions or more. Less may be a copy that led
+        to the motion as a whole. It is then one region, which is no evidence.
         """
         ratio = regions.log10_evidence(evidence.shares)
         # the best of n wrong motions reaches the threshold n times as often (Boole)
         passed = ratio - math.log10(evidence.n_motions(self._bound))
         if rival is not None or evidence.repeats(self._bound):
             return passed
-        if ratio < 0 and regions.n_contradicted:
+        if regions.n_contradicted:
             return passed
         if (extent_m := self._extent_m(alignment)) < _TOUCHED * evidence.region_m:
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
@@ -468,10 +468,9 @@ class PairVerifier:
             return f"{{told}}, too few beside {self._named(rival)}"
         if evidence.repeats(self._bound):
             return "{told}, too few for maps that hold things twice"
-        # No structure repeats and no other motion fits. One contradicting region is then a reason
-        # for doubt if the regions, without the one that led to the motion, do not favour it.
-        if ratio < 0 < regions.n_contradicted:
-            return "{told}; beside the one that led to it they speak against it"
+        # No structure repeats and no other motion fits: a contradicting region is reason for doubt.
+        if regions.n_contradicted:
+            return f"{{told}}, too few beside {regions.n_contradicted} that are missing from one"
         what = f"all that agrees lies within {_TOUCHED * evidence.region_m:.2g} m"
         return f"{what} and could be a copy; too few regions around confirm it"
 

@@ -132,7 +132,7 @@ def test_what_is_missing_makes_doubt_though_nothing_repeats() -> None:
     said, _ = verdict(mapped(first, 4, 12, seed=4), mapped(second, 4, 12, seed=5))
     assert said.status is Status.AMBIGUOUS
     assert (said.n_confirmed, said.n_contradicted) == (3, 2)
-    assert "beside the one that led to it they speak against it" in said.reason
+    assert "too few beside 2 that are missing from one" in said.reason
 
 
 def test_a_picture_in_two_worlds_is_contradicted_by_all_around_it() -> None:
