@@ -435,7 +435,7 @@ class MergedMaps:
             f"maps. Largest {sigma_text(largest, self.is_lower_bound(fused))}."
         )
         if self.note:
-            text += f" {_sentence(self.note)}"
+            text += f" Note: {_sentence(self.note)}"
         left = [f"{name} is left out: {_sentence(reason)}" for name, reason in fused.left_out]
         return " ".join([text, *left])
 

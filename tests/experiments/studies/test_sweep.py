@@ -60,7 +60,7 @@ def short_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # so that all runs have something to fuse: small maps of few particles, which see one place
     asked = asked.replace("frames: 12", "frames: 16")
     evidence = "{place_m: 0, least_ratio: 1, max_sigma_rad: 1}"
-    asked = asked.replace("align:", f"align:\n  evidence: {evidence}")
+    asked = asked.replace("{least_ratio: 1}", evidence)
     path.write_text(asked, encoding="utf-8")
     return path
 
