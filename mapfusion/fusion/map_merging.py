@@ -192,7 +192,7 @@ class MapAlignment:
 
     @property
     def refusal(self) -> str:
-        """Why the motion is not accepted, and what to do about it."""
+        """Reason why the motion is not accepted, and a remedy."""
         reason = self.reason.removesuffix(f"; {self.hint}")
         why = _sentence(f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}")
         heights = self.registered.refined.heights
@@ -202,7 +202,7 @@ class MapAlignment:
 
     @property
     def advice(self) -> str:
-        """Which motion to use, how sure it is, or why there is none and what to do."""
+        """Sentences on the motion to use and its uncertainty, or on why there is none."""
         return advice([self])
 
     def to_pandas(self) -> "pd.DataFrame":
@@ -419,7 +419,7 @@ class MergedMaps:
 
     @property
     def advice(self) -> str:
-        """What was merged, how sure it is, and what to do about maps that were left out."""
+        """Sentences on the merged maps, their uncertainty, and the maps that were left out."""
         if not self.any_merged:
             (a, b), first = min(
                 self.alignments.items(), key=lambda each: _RANKS.index(each[1].status)

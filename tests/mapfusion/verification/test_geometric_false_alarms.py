@@ -85,7 +85,7 @@ def test_motions_of_two_pairs_are_counted():
 
 
 def test_chance_of_agreeing_is_that_of_the_density():
-    """Of uniform points the share of places within r of one is 1 - exp(-density pi r^2)."""
+    """A place lies within r of a uniform point with probability 1 - exp(-density pi r^2)."""
     rng, side_m = np.random.default_rng(3), 40.0
     a, b = rng.uniform(0, side_m, (800, 2)), rng.uniform(8, side_m - 8, (200, 2))
     null = RandomPlacement(planar_site(a), planar_site(b), 0.25)
