@@ -10,7 +10,7 @@ import numpy as np
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.geometry.se2 import inverse, transform_points
+from mapfusion.geometry.se2 import inverse, rotation, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.verification.likelihood import (
@@ -34,6 +34,7 @@ from mapfusion.verification.visibility import (
     ObservedLandmarks,
     ViewingHistory,
     classify_visibility,
+    wall_directions,
 )
 
 
@@ -314,6 +315,10 @@ class ViewedMap:
         """Number of landmarks near each landmark, shape (N,)."""
         return count_neighbours(np.ones(len(self.landmarks), np.bool_), self.described.near)
 
+    @cached_property
+    def _walls(self) -> Float:
+        return wall_directions(self.described.near)
+
     def transformed(self, T: Float) -> Float:
         """Return the positions under a motion of the plane, shape (N, 3)."""
         p = self.landmarks.position_m.copy()
@@ -326,7 +331,7 @@ class ViewedMap:
         angle = viewing.direction_rad + T[2]
         direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         distance = np.where(viewing.n_views > 0, viewing.distance_m, 0.0)
-        return ObservedLandmarks(p, direction, distance)
+        return ObservedLandmarks(p, direction, distance, self._walls @ rotation(T[2]).T)
 
 
 class ViewedMapPair:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.geometry.numerics import WORD, Float, kernel, packed, popcount, trailing_zeros
 from mapfusion.geometry.se2 import wrap
 from mapfusion.viewing import FieldOfView, Viewing
@@ -152,7 +153,11 @@ UNSEEN, MAY, MUST = 0, 1, 2
 
 
 class ViewpointTolerance(NamedTuple):
-    """Viewpoints with similar descriptors: largest ratio of distances and largest angle."""
+    """Viewpoints with similar descriptors: largest ratio of scales and largest angle.
+
+    The picture of a wall is scaled by the distance, and across also by the sine of the angle
+    between the line of sight and the wall. The ratio bounds both.
+    """
 
     ratio: float
     slant_rad: float
@@ -188,11 +193,55 @@ class ObservedLandmarks(NamedTuple):
         p: positions, shape (N, 3).
         direction: unit vectors from the observing robot to the landmark, shape (N, 2).
         distance_m: distance from the observing robot, shape (N,); 0 if unknown.
+        wall: unit vectors along the wall that contains the landmark, shape (N, 2); 0 if unknown.
     """
 
     p: Float
     direction: Float
     distance_m: Float
+    wall: Float
+
+
+# Landmarks within this distance in the plane, at least so many, give the direction of a wall. The
+# spread of the landmarks across it is at most this share of the spread along it.
+_WALL_RADIUS_M, _LEAST_OF_WALL, _WALL_THICKNESS = 0.5, 5, 0.3
+
+
+def wall_directions(near: Grid) -> Float:
+    """Return unit vectors along the walls that contain N landmarks, shape (N, 2); 0 without a wall.
+
+    The direction is the principal axis of the landmarks around each landmark.
+    """
+    n, xx, xy, yy = _second_moments(near)
+    mean, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)  # eigenvalues are mean + half, - half
+    straight = (n >= _LEAST_OF_WALL) & (mean - half <= _WALL_THICKNESS**2 * (mean + half))
+    angle = np.arctan2(2 * xy, xx - yy) / 2
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1) * (straight & (half > 0))[:, None]
+
+
+@kernel
+def _second_moments(near: Grid) -> tuple[np.ndarray, Float, Float, Float]:
+    """Return the number and the second central moments (N,) of the landmarks around each one."""
+    p, row_of = near.p, near.row
+    n = np.zeros(len(p), np.int64)
+    xx, xy, yy = np.zeros(len(p)), np.zeros(len(p)), np.zeros(len(p))
+    runs = np.empty((near.shape[1], 2), np.int64)
+    for k in range(len(p)):
+        x = y = 0.0
+        i = row_of[k]
+        for run in range(ranges_within(p[k, 0], p[k, 1], _WALL_RADIUS_M, near, runs)):
+            for m in range(runs[run, 0], runs[run, 1]):
+                dx, dy = p[m, 0] - p[k, 0], p[m, 1] - p[k, 1]
+                if dx * dx + dy * dy <= _WALL_RADIUS_M * _WALL_RADIUS_M:
+                    n[i] += 1
+                    x, y = x + dx, y + dy
+                    xx[i] += dx * dx
+                    xy[i] += dx * dy
+                    yy[i] += dy * dy
+        xx[i] -= x * x / n[i]
+        xy[i] -= x * y / n[i]
+        yy[i] -= y * y / n[i]
+    return n, xx, xy, yy
 
 
 @kernel
@@ -201,7 +250,7 @@ def classify_visibility(seen: ObservedLandmarks, history: ViewingHistory) -> np.
 
     A class needs at least LEAST_FRAMES frames with the landmark in view.
     """
-    p, direction, distance_m = seen
+    p, direction, distance_m, wall = seen
     # unpacked once: each access through the tuple would count references
     blocks, poses, parts, reach_m, bearing_rad, range_m, height_m = history
     x, y, radius, cos, sin, least_cos, block_reach_m = blocks
@@ -223,7 +272,7 @@ def classify_visibility(seen: ObservedLandmarks, history: ViewingHistory) -> np.
             while word and must < LEAST_FRAMES:
                 c = w * WORD + trailing_zeros(word)
                 word &= word - np.uint64(1)
-                sight = p[i, 0], p[i, 1], ux, uy, r * r
+                sight = p[i, 0], p[i, 1], ux, uy, r * r, wall[i, 0], wall[i, 1]
                 _flag_poses(sight, c, levels, poses, parts, range_m, len(height_m), flags)
                 unsure = (lanes[0] >> np.uint64(_UNSURE_BIT)) & _ONES
                 while unsure:
@@ -286,7 +335,7 @@ def _mark_possible_blocks(
 
 @kernel
 def _flag_poses(
-    sight: tuple[float, float, float, float, float],
+    sight: tuple[float, float, float, float, float, float, float],
     c: int,
     levels: int,
     poses: Poses,
@@ -297,13 +346,14 @@ def _flag_poses(
 ) -> None:
     """Set the flags (FRAMES_PER_BLOCK,) of each pose of block c for one landmark.
 
-    `sight` is the landmark's position, its viewing direction and the square of its viewing
-    distance. Bit h of `levels` is set if its height is in view at step h of the range. The loop is
+    `sight` is the landmark's position, its viewing direction, the square of its viewing distance
+    and the direction of its wall. Bit h of `levels` is set if its height is in view at step h of the range. The loop is
     vectorised: no branch, and unsigned indices.
     """
     x, y, cos, sin, reach_m = poses
     part_of, first, per_slope = parts
-    at_x, at_y, ux, uy, r2 = sight
+    at_x, at_y, ux, uy, r2, wall_x, wall_y = sight
+    own_facing2 = (ux * wall_y - uy * wall_x) ** 2  # squared sine of the angle to the wall
     nearest, farthest, columns = range_m[0], range_m[1], reach_m.shape[1] // FRAMES_PER_BLOCK
     per_range = farthest if farthest > 0 else 1.0
     row = np.uint64(c)
@@ -311,6 +361,7 @@ def _flag_poses(
         dx, dy = at_x - x[c, k], at_y - y[c, k]
         square, along = dx * dx + dy * dy, dx * ux + dy * uy
         away = math.sqrt(square)
+        facing2, seen2 = (dx * wall_y - dy * wall_x) ** 2, own_facing2 * square
         ahead, left = cos[c, k] * dx + sin[c, k] * dy, cos[c, k] * dy - sin[c, k] * dx
         slope = left / max(ahead, _LEAST_AHEAD)
         cell = np.uint64(min(max((slope - first) * per_slope, 0.0), CELLS - 1.0))
@@ -322,6 +373,8 @@ def _flag_poses(
             & (_MAY_RATIO2 * square <= _MAY_RATIO2 * _MAY_RATIO2 * r2)
             & (along > 0)
             & (along * along >= _MAY_COS2 * square)
+            & (seen2 <= _MAY_RATIO2 * facing2)
+            & (facing2 <= _MAY_RATIO2 * seen2)
             & ((ahead > 0) | unsure)
             & (nearest <= away)
             & (away <= farthest)
@@ -332,5 +385,7 @@ def _flag_poses(
             (r2 <= _MUST_RATIO2 * square)
             & (_MUST_RATIO2 * square <= _MUST_RATIO2 * _MUST_RATIO2 * r2)
             & (along * along >= _MUST_COS2 * square)
+            & (seen2 <= _MUST_RATIO2 * facing2)
+            & (facing2 <= _MUST_RATIO2 * seen2)
         )
         flags[k] = may * ((1 << _MAY_BIT) + (alike << _ALIKE_BIT) + (unsure << _UNSURE_BIT))

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from mapfusion.align.nearest_neighbours import Grid
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.verification.regions import ViewedMap
 from mapfusion.verification.visibility import (
@@ -16,6 +17,7 @@ from mapfusion.verification.visibility import (
     ObservedLandmarks,
     ViewingHistory,
     classify_visibility,
+    wall_directions,
 )
 from mapfusion.viewing import BEARINGS, RANGES, FieldOfView, Viewing
 from mapfusion.vision.tracking import TrackParameters
@@ -25,7 +27,8 @@ from tests.mapfusion.verification.two_rooms import Wall, between, mapped
 def slowly(seen: ObservedLandmarks, viewing: Viewing) -> list[int]:
     """Classify the visibility pose by pose, by angles."""
     how, field = [], viewing.field
-    for p, direction, before in zip(*seen, strict=True):
+    for p, direction, before, wall in zip(*seen, strict=True):
+        own_sine = abs(direction[0] * wall[1] - direction[1] * wall[0])
         alike, frames = 0, 0
         for t, (x, y, theta) in enumerate(viewing.pose):
             sight = np.array([p[0] - x, p[1] - y])
@@ -33,6 +36,9 @@ def slowly(seen: ObservedLandmarks, viewing: Viewing) -> list[int]:
             if not before / 2 <= range_m <= 2 * before or range_m == 0:
                 continue
             slant = math.acos(np.clip(sight @ direction / range_m, -1, 1))
+            sine = abs(sight[0] * wall[1] - sight[1] * wall[0]) / range_m
+            if not own_sine / 2 <= sine <= 2 * own_sine:
+                continue
             bearing = math.remainder(math.atan2(sight[1], sight[0]) - theta, 2 * math.pi)
             low, high = field.bearing_rad
             if slant > math.radians(45) or not low <= bearing <= high:
@@ -44,10 +50,18 @@ def slowly(seen: ObservedLandmarks, viewing: Viewing) -> list[int]:
             unhidden = range_m <= viewing.reach_m[t, part] + 0.3
             if lowest <= p[2] <= highest and unhidden:
                 near = before / 1.4 <= range_m <= 1.4 * before
+                near = near and own_sine / 1.4 <= sine <= 1.4 * own_sine
                 alike, frames = alike + (near and slant <= math.radians(30)), frames + 1
         seen_so = MAY if frames >= LEAST_FRAMES else UNSEEN
         how.append(MUST if alike >= LEAST_FRAMES else seen_so)
     return how
+
+
+def walls(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Return unit vectors (n, 2), a third of them 0."""
+    angle = rng.uniform(-np.pi, np.pi, n)
+    known = rng.uniform(size=n) > 1 / 3
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1) * known[:, None]
 
 
 def test_equals_the_slow_twin_on_any_places() -> None:
@@ -57,7 +71,7 @@ def test_equals_the_slow_twin_on_any_places() -> None:
     n, angle = 8000, rng.uniform(-0.8, 0.8, 8000)
     places = np.stack([rng.uniform(1, 4, n), rng.uniform(-6, 2, n), rng.uniform(0, 1.3, n)], axis=1)
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    seen = ObservedLandmarks(places, direction, rng.uniform(1.5, 7, n))
+    seen = ObservedLandmarks(places, direction, rng.uniform(1.5, 7, n), walls(rng, n))
     how = classify_visibility(seen, ViewingHistory.of(landmarks.viewing))
     assert how.tolist() == slowly(seen, landmarks.viewing)
     assert np.bincount(how, minlength=3).min() > 50
@@ -80,7 +94,7 @@ def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     distance = rng.uniform(0.5, 6, n)
     places = np.column_stack([at + distance[:, None] * direction, rng.uniform(0, 1.4, n)])
-    seen = ObservedLandmarks(places, direction, distance)
+    seen = ObservedLandmarks(places, direction, distance, walls(rng, n))
     how = classify_visibility(seen, ViewingHistory.of(viewing))
     assert how.tolist() == slowly(seen, viewing)
     assert np.bincount(how, minlength=3).min() > 50
@@ -100,7 +114,8 @@ def test_what_is_straight_behind_is_not_in_view(half_view_rad: float) -> None:
     reach = np.full((n_frames, BEARINGS), 5.0, np.float32)
     ways = one, one, np.ones(1, np.int32), path, reach, field
     for x, how in ((2.0, MUST), (-2.0, UNSEEN)):
-        seen = ObservedLandmarks(np.array([[x, 0.0, 0.5]]), np.array([[np.sign(x), 0.0]]), 2 * one)
+        place, direction = np.array([[x, 0.0, 0.5]]), np.array([[np.sign(x), 0.0]])
+        seen = ObservedLandmarks(place, direction, 2 * one, np.zeros((1, 2)))
         assert classify_visibility(seen, ViewingHistory.of(Viewing(*ways))).tolist() == [how]
 
 
@@ -109,7 +124,8 @@ def test_where_nothing_was_seen_nothing_is_in_view() -> None:
     one, path = np.ones(1), np.zeros((9, 3))
     reach = np.zeros((9, BEARINGS), np.float32)
     viewing = Viewing(one, one, np.ones(1, np.int32), path, reach, nowhere)
-    seen = ObservedLandmarks(np.array([[0.2, 0.0, 0.5]]), np.array([[1.0, 0.0]]), 0.2 * one)
+    place, direction = np.array([[0.2, 0.0, 0.5]]), np.array([[1.0, 0.0]])
+    seen = ObservedLandmarks(place, direction, 0.2 * one, np.zeros((1, 2)))
     assert classify_visibility(seen, ViewingHistory.of(viewing)).tolist() == [UNSEEN]
 
 
@@ -144,3 +160,44 @@ def test_from_the_other_side_nothing_must_be_seen() -> None:
     a = ViewedMap(mapped(Wall(8, seed=7), 1, 6, seed=8))
     here = a.observed_from(np.zeros(3))
     assert not classify_visibility(here._replace(direction=-here.direction), a.history).any()
+
+
+def test_a_wall_seen_along_its_face_is_not_seen_alike_from_the_front() -> None:
+    """Both lines of sight differ by 25 degrees, within the tolerance of directions."""
+    n_frames, one = LEAST_FRAMES, np.ones(1)
+    field = FieldOfView(
+        np.array([-0.5, 0.5]), np.array([0.5, 6.0]), np.tile([0.0, 1.0], (RANGES, 1))
+    )
+    viewing = Viewing(
+        one,
+        one,
+        np.ones(1, np.int32),
+        np.zeros((n_frames, 3)),
+        np.full((n_frames, BEARINGS), 5.0, np.float32),
+        field,
+    )
+    before = math.radians(25)
+    direction = np.array([[math.cos(before), math.sin(before)]])
+    for wall_degrees, how in ((90, MUST), (0, UNSEEN), (-35, MAY)):
+        angle = math.radians(wall_degrees)
+        wall = np.array([[math.cos(angle), math.sin(angle)]])
+        seen = ObservedLandmarks(np.array([[3.0, 0.0, 0.5]]), direction, 3 * one, wall)
+        assert classify_visibility(seen, ViewingHistory.of(viewing)).tolist() == [how]
+
+
+def test_walls_have_directions_and_their_corners_have_none() -> None:
+    rng = np.random.default_rng(2)
+    turn = math.radians(25)
+    along = np.array([math.cos(turn), math.sin(turn)])
+    across = np.array([-along[1], along[0]])
+    steps = np.arange(0, 6, 0.1)
+    wall, side = steps[:, None] * along, steps[:, None] * across
+    p = np.concatenate([wall, side, [[-5.0, -5.0]]])
+    p += rng.normal(0, 0.01, p.shape)
+    found = wall_directions(Grid.of(p))
+    n, far = len(steps), steps > 0.6
+    off_along, off_across = np.abs(found @ across), np.abs(found @ along)
+    assert off_along[:n][far].max() < 0.1
+    assert off_across[n : 2 * n][far].max() < 0.1
+    np.testing.assert_allclose(np.linalg.norm(found[: 2 * n][np.tile(far, 2)], axis=1), 1)
+    assert not found[[0, n, 2 * n]].any()  # the corner, twice, and a landmark alone
