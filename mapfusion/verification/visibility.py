@@ -146,9 +146,12 @@ class ViewingHistory(NamedTuple):
 # third frame on, and a landmark needs three observations (the defaults of
 # `TrackParameters.min_length` and `min_count`).
 LEAST_FRAMES = 5
-# Visibility of a landmark from a path. UNSEEN: not in view. MAY: in view from another distance or
-# side, where only some landmarks are matched again, because the descriptor window covers other
-# surfaces and the slant changes it. MUST: in view from a similar viewpoint, where nearly all are.
+# Frames in view of which LEAST_FRAMES consecutive ones remain if a track is lost in any one frame.
+SURE_FRAMES = 2 * LEAST_FRAMES
+# Visibility of a landmark from a path. UNSEEN: not in view. MAY: in view for a short time or from
+# another distance or side, where only some landmarks are matched again, because the descriptor
+# window covers other surfaces and the slant changes it. MUST: in view for long enough from a
+# similar viewpoint, where nearly all are.
 UNSEEN, MAY, MUST = 0, 1, 2
 
 
@@ -248,7 +251,7 @@ def _second_moments(near: Grid) -> tuple[np.ndarray, Float, Float, Float]:
 def classify_visibility(seen: ObservedLandmarks, history: ViewingHistory) -> np.ndarray:
     """Return UNSEEN, MAY or MUST for each landmark, shape (N,).
 
-    A class needs at least LEAST_FRAMES frames with the landmark in view.
+    MAY needs at least LEAST_FRAMES frames with the landmark in view, MUST needs SURE_FRAMES.
     """
     p, direction, distance_m, wall = seen
     # unpacked once: each access through the tuple would count references
@@ -269,7 +272,7 @@ def classify_visibility(seen: ObservedLandmarks, history: ViewingHistory) -> np.
         must = may = 0
         for w in range(len(eights) // 8):
             word = packed(eights, w)
-            while word and must < LEAST_FRAMES:
+            while word and must < SURE_FRAMES:
                 c = w * WORD + trailing_zeros(word)
                 word &= word - np.uint64(1)
                 sight = p[i, 0], p[i, 1], ux, uy, r * r, wall[i, 0], wall[i, 1]
@@ -291,9 +294,9 @@ def classify_visibility(seen: ObservedLandmarks, history: ViewingHistory) -> np.
                     flags[k] *= in_view
                 may += popcount((lanes[0] >> np.uint64(_MAY_BIT)) & _ONES)
                 must += popcount((lanes[0] >> np.uint64(_ALIKE_BIT)) & _ONES)
-            if must >= LEAST_FRAMES:
+            if must >= SURE_FRAMES:
                 break
-        if must >= LEAST_FRAMES:
+        if must >= SURE_FRAMES:
             how[i] = MUST
         elif may >= LEAST_FRAMES:
             how[i] = MAY
@@ -347,8 +350,8 @@ def _flag_poses(
     """Set the flags (FRAMES_PER_BLOCK,) of each pose of block c for one landmark.
 
     `sight` is the landmark's position, its viewing direction, the square of its viewing distance
-    and the direction of its wall. Bit h of `levels` is set if its height is in view at step h of the range. The loop is
-    vectorised: no branch, and unsigned indices.
+    and the direction of its wall. Bit h of `levels` is set if its height is in view at step h of
+    the range. The loop is vectorised: no branch, and unsigned indices.
     """
     x, y, cos, sin, reach_m = poses
     part_of, first, per_slope = parts

@@ -13,6 +13,7 @@ from mapfusion.verification.visibility import (
     LEAST_FRAMES,
     MAY,
     MUST,
+    SURE_FRAMES,
     UNSEEN,
     ObservedLandmarks,
     ViewingHistory,
@@ -53,7 +54,7 @@ def slowly(seen: ObservedLandmarks, viewing: Viewing) -> list[int]:
                 near = near and own_sine / 1.4 <= sine <= 1.4 * own_sine
                 alike, frames = alike + (near and slant <= math.radians(30)), frames + 1
         seen_so = MAY if frames >= LEAST_FRAMES else UNSEEN
-        how.append(MUST if alike >= LEAST_FRAMES else seen_so)
+        how.append(MUST if alike >= SURE_FRAMES else seen_so)
     return how
 
 
@@ -97,13 +98,13 @@ def test_equals_the_slow_twin_on_a_path_that_winds(half_view_rad: float) -> None
     seen = ObservedLandmarks(places, direction, distance, walls(rng, n))
     how = classify_visibility(seen, ViewingHistory.of(viewing))
     assert how.tolist() == slowly(seen, viewing)
-    assert np.bincount(how, minlength=3).min() > 50
+    assert np.bincount(how, minlength=3).min() > 20
 
 
 @pytest.mark.parametrize("half_view_rad", [0.4, 2.0])
 def test_what_is_straight_behind_is_not_in_view(half_view_rad: float) -> None:
     """The robot turns once, so that a block contains different headings."""
-    n_frames, one = LEAST_FRAMES + 1, np.ones(1)
+    n_frames, one = SURE_FRAMES + 1, np.ones(1)
     path = np.zeros((n_frames, 3))
     path[0, 2] = 3.1
     field = FieldOfView(
@@ -164,7 +165,7 @@ def test_from_the_other_side_nothing_must_be_seen() -> None:
 
 def test_a_wall_seen_along_its_face_is_not_seen_alike_from_the_front() -> None:
     """Both lines of sight differ by 25 degrees, within the tolerance of directions."""
-    n_frames, one = LEAST_FRAMES, np.ones(1)
+    n_frames, one = SURE_FRAMES, np.ones(1)
     field = FieldOfView(
         np.array([-0.5, 0.5]), np.array([0.5, 6.0]), np.tile([0.0, 1.0], (RANGES, 1))
     )

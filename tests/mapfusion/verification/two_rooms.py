@@ -44,7 +44,7 @@ def mapped(
     The camera faces the wall at a distance of 3 m.
     """
     rng = np.random.default_rng(seed)
-    x = np.arange(first_x, last_x, 0.25)
+    x = np.arange(first_x, last_x, 0.125)
     path_world = np.stack([x, np.zeros(len(x)), np.full(len(x), np.pi / 2)], axis=1)
     T_world_map = path_world[0]
     path = se2.between(T_world_map, path_world)
