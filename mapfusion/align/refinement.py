@@ -95,10 +95,13 @@ class Refinement:
             # Labels are rarely false, and a gate that excludes the bent part of a map would align
             # the other part only. s_drift starts at a third of the gate, three times the RMS
             # residual; no residual of n exceeds sqrt(n) times the RMS, so that up to 81 labels all
-            # take part.
+            # take part. Covariances in the frame of the start can be larger than the gate; uniform
+            # false pairs would then be more probable than true ones.
             off = pairs.p_a[:, :2] - transform_points(T_a_b, pairs.p_b[:, :2])
             rms_m = math.sqrt(np.mean(np.sum(off**2, axis=1)))
-            gate_m = max(self.gate_m, _GATE_SIGMAS**2 * rms_m)
+            stated = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
+            sigma_m = math.sqrt(np.linalg.eigvalsh(stated).max())
+            gate_m = max(self.gate_m, _GATE_SIGMAS**2 * rms_m, _GATE_SIGMAS * sigma_m)
         rows = pairs.of_one_height(self.height)
         planar = pairs[rows].in_plan()
         limits = (gate_m, self.least_drift_m, self.max_rounds)

@@ -310,3 +310,17 @@ def test_covariance_of_exact_maps_is_that_of_least_squares(off_m):
     # a pair inside the gate is false with a small probability
     np.testing.assert_allclose(found.covariance, least_squares, rtol=0.02)
     assert found.drift_sigma_m < 1e-3
+
+
+def test_labels_with_covariances_larger_than_the_gate_all_count():
+    """An uncertain start turns a map as a whole: covariances are large, residuals are small."""
+    rng = np.random.default_rng(3)
+    pair = given_pairs(rng, 15, 1.0, 0.04, 0.0, planar=True)
+    names = np.arange(15, dtype=np.int32)
+    a, b = (
+        replace(each, label=names, covariance_m2=each.covariance_m2 + s**2 * np.eye(3))
+        for each, s in ((pair.map_a, 0.8), (pair.map_b, 0.3))
+    )
+    refined = Refinement().refine(Pairs(a, b, pair.correspondences), pair.T_a_b)
+    assert refined.inlier.all()
+    assert error(refined.T_a_b, pair.T_a_b)[0] < 0.1
