@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 
 from mapfusion.align.alignment import Alignment, Pairs, Status
+from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.covariance import residual_scale, with_common_motion
 from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.refinement import Refinement
@@ -31,9 +32,11 @@ from mapfusion.verification.regions import (
 from mapfusion.verification.rivals import (
     BETWEEN,
     RepeatedLandmarks,
+    SupportedMotion,
     distinct_motions,
     explained_landmarks,
     longest_patch_side_m,
+    mirror_image_motion,
     repeated_under_others,
     self_motions,
 )
@@ -316,7 +319,9 @@ class PairVerifier:
                 status, reason = Status.AMBIGUOUS, doubt.format(told=counts)
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
-            if rival := self._equal_rival(alignment):
+            if image := self._equal_mirror_image(by_chance.log10_false_alarms):
+                status, reason = Status.AMBIGUOUS, image
+            elif rival := self._equal_rival(alignment):
                 status, reason = Status.AMBIGUOUS, f"{rival}; nothing tells which is right: {why}"
             elif self._pairs.by_geometry:
                 reason = "matched by geometry alone"
@@ -391,6 +396,36 @@ class PairVerifier:
                     f"{maps[1].name}, {self._motion_text(T_a_b)} explains {of_rival}"
                 )
         return ""
+
+    @cached_property
+    def _mirror_image_motion(self) -> SupportedMotion | None:
+        """Best motion of the mirror image of map b, found at first use."""
+        own, tolerance = self._settings, self._pairs.correspondences.size_tolerance
+        matching = (
+            MatchParameters() if tolerance is None else MatchParameters(size_tolerance=tolerance)
+        )
+        return mirror_image_motion(self._pairs, own.acceptance, own.refinement, matching)
+
+    def _equal_mirror_image(self, log10_false_alarms: float) -> str:
+        """Say that the mirror image of map b fits as well as an alignment; empty if it does not.
+
+        Landmarks near a line agree with their mirror images about it. That is no chance, and passes
+        the test against chance. The mirror image of a right map has the support of such landmarks
+        alone. The alignment outdoes it if the ratio of both NFAs is at most `false_alarms`.
+
+        Args:
+            log10_false_alarms: log10 of the NFA of the alignment.
+        """
+        image = self._mirror_image_motion
+        if image is None or not image.log10_false_alarms <= self._bound:
+            return ""
+        if log10_false_alarms - image.log10_false_alarms <= self._bound:
+            return ""
+        a, b = self._pairs.map_a.name, self._pairs.map_b.name
+        fits = (
+            f"the mirror image of map {b} fits map {a} with {np.count_nonzero(image.inlier)} pairs"
+        )
+        return f"{fits}, no worse than map {b} itself: check the sign of y and theta of both maps"
 
     def regions(self, alignment: Alignment, evidence: PairEvidence, side_m: float) -> Regions:
         """Return the regions of a side that both robots must have seen under an alignment."""
