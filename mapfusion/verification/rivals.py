@@ -187,10 +187,11 @@ def distinct_motions(
 
 def mirror_image_motion(
     pairs: Pairs, acceptance: Acceptance, refinement: Refinement, matching: MatchParameters
-) -> SupportedMotion | None:
-    """Return the best motion of the mirror image of map b onto map a; None without one.
+) -> tuple[SupportedMotion, Float] | None:
+    """Return the best motion of the mirror image of map b onto map a, and its supporters.
 
-    Pairs by geometry alone belong to a motion, so that the mirror image is matched again.
+    Pairs by geometry alone belong to a motion, so that the mirror image is matched again. The
+    supporters are places in the plane of map b, shape (K, 2). Returns None if there is no motion.
     """
     flip = np.array([1.0, -1.0, 1.0])
     own = pairs.map_b
@@ -207,8 +208,11 @@ def mirror_image_motion(
         category=own.category,
     )
     found = match(pairs.map_a, image, matching) if pairs.by_geometry else pairs.correspondences
-    motions = distinct_motions(Pairs(pairs.map_a, image, found), 1, acceptance, refinement)
-    return motions[0] if motions else None
+    of_image = Pairs(pairs.map_a, image, found)
+    motions = distinct_motions(of_image, 1, acceptance, refinement)
+    if not motions:
+        return None
+    return motions[0], (of_image.p_b[motions[0].inlier] * flip)[:, :2]
 
 
 def is_mirrored(
@@ -219,8 +223,8 @@ def is_mirrored(
     Maps are mirror images of each other if one of them has y to the right.
     """
     bound = math.log10(acceptance.false_alarms)
-    of_image = mirror_image_motion(pairs, acceptance, refinement, matching)
-    if of_image is None or not of_image.log10_false_alarms <= bound:
+    found = mirror_image_motion(pairs, acceptance, refinement, matching)
+    if found is None or not found[0].log10_false_alarms <= bound:
         return False
     own = distinct_motions(pairs, 1, acceptance, refinement)
     return not any(each.log10_false_alarms <= bound for each in own)

@@ -319,7 +319,7 @@ class PairVerifier:
                 status, reason = Status.AMBIGUOUS, doubt.format(told=counts)
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
-            if image := self._equal_mirror_image(by_chance.log10_false_alarms):
+            if image := self._equal_mirror_image(alignment, by_chance.log10_false_alarms):
                 status, reason = Status.AMBIGUOUS, image
             elif rival := self._equal_rival(alignment):
                 status, reason = Status.AMBIGUOUS, f"{rival}; nothing tells which is right: {why}"
@@ -398,33 +398,38 @@ class PairVerifier:
         return ""
 
     @cached_property
-    def _mirror_image_motion(self) -> SupportedMotion | None:
-        """Best motion of the mirror image of map b, found at first use."""
+    def _mirror_image_motion(self) -> tuple[SupportedMotion, Float] | None:
+        """Best motion of the mirror image of map b and its supporters, found at first use."""
         own, tolerance = self._settings, self._pairs.correspondences.size_tolerance
-        matching = (
-            MatchParameters() if tolerance is None else MatchParameters(size_tolerance=tolerance)
-        )
+        usual = MatchParameters()
+        matching = usual if tolerance is None else replace(usual, size_tolerance=tolerance)
         return mirror_image_motion(self._pairs, own.acceptance, own.refinement, matching)
 
-    def _equal_mirror_image(self, log10_false_alarms: float) -> str:
+    def _equal_mirror_image(self, alignment: Alignment, log10_false_alarms: float) -> str:
         """Say that the mirror image of map b fits as well as an alignment; empty if it does not.
 
         Landmarks near a line agree with their mirror images about it. That is no chance, and passes
         the test against chance. The mirror image of a right map has the support of such landmarks
-        alone. The alignment outdoes it if the ratio of both NFAs is at most `false_alarms`.
+        alone. The alignment outdoes it if the ratio of both NFAs is at most `false_alarms`. If all
+        landmarks lie on one line, the image has the same landmarks in the same places, and is no
+        rival.
 
         Args:
-            log10_false_alarms: log10 of the NFA of the alignment.
+            alignment: the alignment.
+            log10_false_alarms: log10 of its NFA.
         """
-        image = self._mirror_image_motion
-        if image is None or not image.log10_false_alarms <= self._bound:
+        if self._mirror_image_motion is None:
             return ""
-        if log10_false_alarms - image.log10_false_alarms <= self._bound:
+        image, p_b = self._mirror_image_motion
+        beyond_chance = image.log10_false_alarms <= self._bound
+        if not beyond_chance or log10_false_alarms - image.log10_false_alarms <= self._bound:
+            return ""
+        by_image = transform_points(image.T_a_b, p_b * [1, -1])
+        apart_m = np.linalg.norm(transform_points(alignment.T_a_b, p_b) - by_image, axis=1)
+        if np.sqrt(np.mean(apart_m**2)) <= max(self._settings.acceptance.gates_m):
             return ""
         a, b = self._pairs.map_a.name, self._pairs.map_b.name
-        fits = (
-            f"the mirror image of map {b} fits map {a} with {np.count_nonzero(image.inlier)} pairs"
-        )
+        fits = f"the mirror image of map {b} fits map {a} with {len(p_b)} pairs"
         return f"{fits}, no worse than map {b} itself: check the sign of y and theta of both maps"
 
     def regions(self, alignment: Alignment, evidence: PairEvidence, side_m: float) -> Regions:

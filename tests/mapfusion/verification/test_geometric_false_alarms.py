@@ -81,6 +81,17 @@ def test_landmarks_near_the_axis_of_a_mirror_are_not_enough(described, seeds):
         assert image.verdict.reason.startswith("the mirror image of map b fits map a with ")
 
 
+def test_landmarks_on_one_line_are_accepted():
+    """A line is its own mirror image, which lays every landmark on the same place."""
+    rng = np.random.default_rng(0)
+    p = np.column_stack([rng.uniform(0, 30, 80), np.zeros((80, 2))])
+    look = unit_vectors(rng, 80)
+    for _ in range(5):
+        noisy = [p + rng.normal(0, 0.1, p.shape) * [1, 1, 0] for _ in "ab"]
+        maps = [landmarks(each, 0.1, look, planar=True) for each in noisy]
+        assert registered(*maps).verdict.accepted
+
+
 def test_number_of_false_alarms_on_random_maps():
     """At most epsilon of pairs without common ground reach an NFA of epsilon, at the best motion.
 
