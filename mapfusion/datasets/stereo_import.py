@@ -139,6 +139,10 @@ def front_end_for_recording(
     vision, noise = front_end_for_camera(camera), None
     if depth is None:
         noise = estimate_noise(samples, camera, vision.harris, vision.stereo)
+    else:  # the noise of a depth does not depend on the focal length of the camera
+        usual = FrontEndParameters()
+        limits = {"max_depth_m": usual.max_depth_m, "max_sigma_depth_m": usual.max_sigma_depth_m}
+        vision = replace(vision, **limits)
     if noise is not None:
         stereo = parameters_for_noise(vision.stereo, noise, _TRUE_SHARE)
         tracks = replace(

@@ -80,10 +80,11 @@ def match_depth(
     # Disparities of the windows' pixels, and their places relative to the corners.
     around = np.arange(-half, half + 1)
     columns = np.broadcast_to(
-        pixel[inside, 0, None, None] + around, (len(inside), *2 * (2 * half + 1,))
+        pixel[inside, 0, None, None] + around, (len(inside), len(around), len(around))
     )
     rows = np.broadcast_to(pixel[inside, 1, None, None] + around[:, None], columns.shape)
-    depth = depth_m[rows, columns].astype(np.float64).reshape(len(inside), -1)
+    n_pixels = len(around) ** 2
+    depth = depth_m[rows, columns].astype(np.float64).reshape(-1, n_pixels)
     known = np.isfinite(depth) & (depth > 0)
     focal_baseline = camera.focal_px * camera.baseline_m
     disparity = np.where(known, focal_baseline / np.where(known, depth, 1.0), 0.0)
@@ -95,8 +96,8 @@ def match_depth(
         ],
         -1,
     )
-    place = place.reshape(len(inside), -1, 3)
-    enough = np.count_nonzero(known, axis=1) >= (1 - parameters.most_missing) * known.shape[1]
+    place = place.reshape(-1, n_pixels, 3)
+    enough = np.count_nonzero(known, axis=1) >= (1 - parameters.most_missing) * n_pixels
     status[inside[~enough]] = MatchStatus.MISSING
 
     # Least squares of a plane, and the largest deviation from it.
@@ -106,7 +107,7 @@ def match_depth(
     plane = np.linalg.solve(normal, np.swapaxes(place, 1, 2) @ disparity[:, :, None])[:, :, 0]
     off = np.abs(np.einsum("nkj,nj->nk", place, plane) - disparity).max(axis=1, initial=0.0)
     sigma_px = focal_baseline * parameters.sigma_per_m
-    each = parameters.probability ** (1 / place.shape[1])  # of the pixels, if independent
+    each = parameters.probability ** (1 / n_pixels)  # of the pixels, if independent
     one_plane = off <= np.sqrt(chi_square_bound(each, 1)) * sigma_px
     one_plane &= plane[:, 0] > 0
     status[kept] = np.where(one_plane, MatchStatus.MATCHED, MatchStatus.SILHOUETTE)
