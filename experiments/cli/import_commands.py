@@ -55,9 +55,9 @@ CalibrationOverrides = Annotated[
     typer.Option(
         "--calibration",
         metavar="FILE|KEY=VALUE",
-        help="A calibration file (rosbag, images; Kalibr's or OpenCV's layout), or a standard "
-        "deviation of what is left open of camera and mount: heading_rad=0.001, scale=0.002; 0 of "
-        "both: it is known exactly.",
+        help="A calibration file (rosbag, images, tum_rgbd; layout of Kalibr or OpenCV), or a "
+        "standard deviation of what is left open of camera and mount: heading_rad=0.001, "
+        "scale=0.002; 0 of both: it is known exactly.",
     ),
 ]
 LevelOf = Annotated[

@@ -140,7 +140,7 @@ Format = Annotated[
         "--format",
         metavar="FORMAT",
         help="tum, kitti (paths), g2o (graph), ply (maps), rerun of results; "
-        "log, euroc, kitti, rosbag, rosbag2 of runs.",
+        "log, euroc, kitti, tum_rgbd, rosbag, rosbag2 of runs.",
         autocompletion=complete_format,
     ),
 ]

@@ -77,6 +77,18 @@ class RunPlan:
     n_earlier: int
 
 
+def require_drive_of(run: EvaluatedRun) -> None:
+    """Raise InputError if the robots of a simulation cannot drive as the scenario says."""
+    for robot in run.pipeline.simulated[:1]:  # all robots have the same drive
+        driven = robot.features.before["drive"]
+        assert isinstance(driven, Stage)
+        assert isinstance(driven.settings, DriveSettings)
+        try:
+            require_drive(driven.settings)
+        except InputError as error:
+            raise InputError(f"scenario {run.scenario.name}: {error}") from error
+
+
 def plan_run(scenario: AnyScenario, results: Path, jobs: int, fresh: bool = False) -> RunPlan:
     """Plan a run; nothing is computed.
 
@@ -91,14 +103,7 @@ def plan_run(scenario: AnyScenario, results: Path, jobs: int, fresh: bool = Fals
             the machine has too little memory.
     """
     run = EvaluatedRun.of(scenario, Store.of(results))
-    for robot in run.pipeline.simulated[:1]:  # all robots have the same drive
-        driven = robot.features.before["drive"]
-        assert isinstance(driven, Stage)
-        assert isinstance(driven.settings, DriveSettings)
-        try:
-            require_drive(driven.settings)
-        except InputError as error:
-            raise InputError(f"scenario {run.scenario.name}: {error}") from error
+    require_drive_of(run)
     require_memory(run.pipeline, jobs)
     rates, n_earlier = _rates_of_earlier_runs(results)
     rates, amounts = dict(_TYPICAL_S) | rates, _amounts(run)

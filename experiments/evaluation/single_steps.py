@@ -46,7 +46,9 @@ from mapfusion.smoother.odometry_calibration import Calibration, calibrate
 from mapfusion.smoother.smooth import SmootherParameters, with_path_errors
 from mapfusion.tables import NO_LABEL
 from mapfusion.verification.registration import Registration
+from mapfusion.vision.depth import DepthParameters, add_noise
 from sim.rendering.frame_source import FrameSource
+from sim.stereo_head import StereoFrame
 from sim.trajectory import Trajectory, read_trajectory
 
 
@@ -312,9 +314,13 @@ def write_drives(
 def _stereo_drive(
     robot: SimulatedRobotStages, trajectory: Trajectory, source: FrameSource
 ) -> StereoDrive:
-    def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
-        frame = render_frame(robot.features.settings, source, trajectory.bodies(k), k)
-        return frame.left, frame.right
+    @functools.lru_cache(maxsize=1)  # some formats write pictures and depths
+    def frame(k: int) -> StereoFrame:
+        return render_frame(robot.features.settings, source, trajectory.bodies(k), k)
+
+    def depth_m(k: int) -> np.ndarray:
+        rng = generator(robot.features.settings.seed, "depth", robot.name, k)
+        return add_noise(frame(k).depth_m, DepthParameters().sigma_per_m, rng)
 
     index, tilts = trajectory.index(robot.name), trajectory.tilt_rad
     return StereoDrive(
@@ -323,9 +329,10 @@ def _stereo_drive(
         trajectory.time_s,
         trajectory.T_world_robot[index],
         measured_odometry(robot.log.settings, trajectory),
-        pair,
+        lambda k: (frame(k).left, frame(k).right),
         None if tilts is None else tilts[index],
         measured_tilt(robot.observed.settings, trajectory),
+        depth_m,
     )
 
 

@@ -110,7 +110,8 @@ def shown_by(show: Callable[[str, int, int], None]) -> Callable[[SweepProgress],
 def print_survey(found: Survey) -> None:
     """Print the numbers of runs, and of tasks by stage."""
     refused = f", {found.runs_refused} that cannot be run" if found.runs_refused else ""
-    print_lines([f"{found.runs} runs, {found.runs_finished} of them finished{refused}"])
+    lines = [f"{found.runs} runs, {found.runs_finished} of them finished{refused}"]
+    print_lines([*lines, *filter(None, [found.why_refused])])
     headings = [("stage", ""), *((name, "d") for name in ("wanted", "shared", "finished", "to do"))]
     rows = []
     for label, wanted in found.wanted.items():

@@ -21,6 +21,7 @@ from distributed.scheduler import KilledWorker
 
 from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.result import all_tables, measure_aligners, renderer
+from experiments.evaluation.run_plan import require_drive_of
 from experiments.pipeline import cluster
 from experiments.pipeline.cluster import dask_client
 from experiments.pipeline.stages.pipeline import require_memory
@@ -227,6 +228,7 @@ class Survey:
         runs: number of all runs.
         runs_finished: number of runs that the tables hold.
         runs_refused: number of runs that are impossible.
+        why_refused: reason of the first of these runs.
         wanted: tasks summed over all runs, without sharing.
         finished: different tasks that are done.
         left: different tasks to be done.
@@ -235,6 +237,7 @@ class Survey:
     runs: int
     runs_finished: int = 0
     runs_refused: int = 0
+    why_refused: str = ""
     wanted: Counter[str] = field(default_factory=Counter)
     finished: Counter[str] = field(default_factory=Counter)
     left: Counter[str] = field(default_factory=Counter)
@@ -246,9 +249,11 @@ def survey(sweep: Sweep) -> Survey:
     known: set[str] = set()
     for run in sweep.runs:
         try:
+            require_drive_of(EvaluatedRun.of(run.load(), sweep.store))
             plan = plan_run(run, sweep.store, tables)
-        except InputError:
+        except InputError as error:
             found.runs_refused += 1
+            found.why_refused = found.why_refused or f"{run.run_id}: {error}"
             continue
         found.runs_finished += not plan.left
         left = {task.name for task in plan.left}

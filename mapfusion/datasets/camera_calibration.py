@@ -410,7 +410,9 @@ class Rectification:
         )
 
     def apply(self, raw: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Rectify a pair of raw images (H, W) uint8.
+        """Rectify a pair of raw images (H, W) uint8, or float32 for depths.
+
+        Depths are those of the nearest pixel, since a mean over an edge is on neither side.
 
         Raises:
             InputError: the size of an image differs from that of the calibration.
@@ -427,7 +429,9 @@ class Rectification:
             return np.ascontiguousarray(left), np.ascontiguousarray(right)
         assert self.maps is not None
         left, right = (
-            cv2.remap(image, *maps, cv2.INTER_LINEAR)
+            cv2.remap(
+                image, *maps, cv2.INTER_LINEAR if image.dtype == np.uint8 else cv2.INTER_NEAREST
+            )
             for image, maps in zip(raw, self.maps, strict=True)
         )
         return left, right

@@ -31,6 +31,8 @@ class StereoDrive:
         tilt_rad: true roll and pitch of the body, shape (T, 2); None for a level body.
         measured_tilt_rad: measured roll and pitch, shape (T, 2); None if the robot assumes that it
             is level.
+        depth_m: function that returns the depths (H, W) of a frame's left picture, NaN where
+            unknown; None without a depth sensor.
     """
 
     robot: str
@@ -41,6 +43,7 @@ class StereoDrive:
     pair: Callable[[int], tuple[np.ndarray, np.ndarray]]
     tilt_rad: Float | None = None
     measured_tilt_rad: Float | None = None
+    depth_m: Callable[[int], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         for name in ("tilt_rad", "measured_tilt_rad"):
@@ -99,6 +102,6 @@ def write_text(path: Path, lines: list[str]) -> None:
 
 
 def write_picture(path: Path, image: np.ndarray) -> None:
-    """Write a picture (H, W) uint8 as PNG atomically."""
+    """Write a picture (H, W) uint8 or uint16 as PNG atomically."""
     data = cv2.imencode(".png", image)[1].tobytes()
     write_whole(path, lambda temporary: temporary.write_bytes(data))

@@ -91,6 +91,13 @@ IMPORTERS = {
         "drive1",
         stereo=True,
     ),
+    "tum_rgbd": Importer(
+        "mapfusion.datasets.tum_rgbd:read_tum_rgbd",
+        "TumRgbdSettings",
+        "Pictures with depths in the TUM RGB-D benchmark's layout",
+        "rgbd_dataset_freiburg3_long_office_household",
+        stereo=True,
+    ),
     "rosbag": Importer(
         "mapfusion.datasets.rosbag:read_rosbag",
         "RosbagSettings",
@@ -112,6 +119,7 @@ IMPORTERS = {
 EXPORTERS = {
     "euroc": "mapfusion.datasets.euroc:write_euroc",
     "kitti": "mapfusion.datasets.kitti:write_kitti",
+    "tum_rgbd": "mapfusion.datasets.tum_rgbd:write_tum_rgbd",
     "rosbag": "mapfusion.datasets.rosbag:write_rosbag",
     "rosbag2": "mapfusion.datasets.rosbag:write_rosbag2",
 }

@@ -160,18 +160,19 @@ def decode_image(message: Any) -> np.ndarray:
     if not hasattr(message, "encoding"):
         # The format begins with the encoding before compression: "bayer_rggb8; jpeg compressed".
         stated = str(message.format).partition(";")[0].strip()
-        is_mosaic = stated.startswith(_MOSAIC) and stated in _ENCODINGS
+        is_mosaic = stated.startswith(_MOSAIC)
+        if is_mosaic and stated not in _ENCODINGS:
+            raise _unknown_encoding(stated)
         flags = cv2.IMREAD_UNCHANGED if is_mosaic else cv2.IMREAD_ANYDEPTH
         image = cv2.imdecode(np.asarray(message.data, np.uint8), flags)
         if image is None:
-            raise InputError("compressed picture: cannot be decoded")
+            raise InputError(f"compressed picture of format {message.format!r}: cannot be decoded")
         if image.ndim > 2:  # the colours were interpolated before compression
             return cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
         conversion = _ENCODINGS[stated][2] if is_mosaic else None
         return image if conversion is None else cv2.cvtColor(image, conversion)
     if message.encoding not in _ENCODINGS:
-        known = ", ".join(_ENCODINGS)
-        raise InputError(f"encoding {message.encoding!r}: is not read; known: {known}")
+        raise _unknown_encoding(message.encoding)
     kind, channels, conversion = _ENCODINGS[message.encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     own = width * channels * np.dtype(kind).itemsize
@@ -183,6 +184,10 @@ def decode_image(message: Any) -> np.ndarray:
     levels = rows.view(np.dtype(kind).newbyteorder(order)).astype(kind)
     levels = levels.reshape((height, width, channels) if channels > 1 else (height, width))
     return levels if conversion is None else cv2.cvtColor(levels, conversion)
+
+
+def _unknown_encoding(encoding: str) -> InputError:
+    return InputError(f"encoding {encoding!r}: is not read; known: {', '.join(_ENCODINGS)}")
 
 
 def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibration:

@@ -38,6 +38,7 @@ from mapfusion.robot_log import (
     write_odometry_covariance,
     write_truth_poses,
 )
+from mapfusion.vision.depth import DepthParameters
 from mapfusion.vision.front_end import (
     FrontEnd,
     FrontEndParameters,
@@ -122,7 +123,10 @@ def front_end_for_camera(camera: StereoCamera) -> FrontEndParameters:
 
 
 def front_end_for_recording(
-    camera: StereoCamera, samples: Sequence[Pair], run: Sequence[Pair]
+    camera: StereoCamera,
+    samples: Sequence[Pair],
+    run: Sequence[Pair],
+    depth: DepthParameters | None = None,
 ) -> FrontEndParameters:
     """Return settings for a camera and the pictures of a recording.
 
@@ -130,9 +134,15 @@ def front_end_for_recording(
         camera: the rectified pair.
         samples: pairs (H, W) uint8 from the whole recording.
         run: consecutive pairs, for estimates from tracks.
+        depth: noise and tests of depth images; None for stereo pairs.
     """
-    vision = front_end_for_camera(camera)
-    noise = estimate_noise(samples, camera, vision.harris, vision.stereo)
+    vision, noise = front_end_for_camera(camera), None
+    if depth is None:
+        noise = estimate_noise(samples, camera, vision.harris, vision.stereo)
+    else:  # the noise of a depth does not depend on the focal length of the camera
+        usual = FrontEndParameters()
+        limits = {"max_depth_m": usual.max_depth_m, "max_sigma_depth_m": usual.max_sigma_depth_m}
+        vision = replace(vision, **limits)
     if noise is not None:
         stereo = parameters_for_noise(vision.stereo, noise, _TRUE_SHARE)
         tracks = replace(
@@ -141,13 +151,13 @@ def front_end_for_recording(
             max_misfit_px=max(vision.tracks.max_misfit_px, noise.misfit_px),
         )
         vision = replace(vision, stereo=stereo, tracks=tracks)
-    front_end = FrontEnd(camera, vision)
+    front_end = FrontEnd(camera, vision, depth)
     depth_m = [
         camera.focal_px * camera.baseline_m / front_end.extract(*pair).disparity_px
         for pair in samples
     ]
     vision = scale_descriptor_window(vision, camera, np.concatenate([*depth_m, np.empty(0)]))
-    front_end = FrontEnd(camera, vision)
+    front_end = FrontEnd(camera, vision, depth)
     frames = [front_end.extract(*pair) for pair in run]
 
     # The pixel noise follows from reprojection errors, the number of corners from observations.
@@ -290,10 +300,12 @@ class StereoImport:
             raise InputError(f"{calibrated_by}: {pair}; {beyond}") from error
         self.calibration_error = calibration(default_calibration_error(self.camera))
         samples = [self.rectified(k) for k in sample_indices(len(recording))]
-        self._require_row_alignment(samples, scaled)
+        if recording.depth is None:
+            self._require_row_alignment(samples, scaled)
         middle = max((len(recording) - _RUN) // 2, 0)
         run = [self.rectified(k) for k in range(len(recording))[middle : middle + _RUN]]
-        self.vision = adjust(front_end_for_recording(self.camera, samples, run))
+        derived = front_end_for_recording(self.camera, samples, run, recording.depth)
+        self.vision = adjust(derived)
         turn = se3.pose(self._rectification.R_left_rectified, np.zeros(3))
         self.T_robot_camera: Float = recording.T_robot_left @ turn
 
@@ -366,7 +378,7 @@ class StereoImport:
         # Features, tracks and levelled observations of each frame.
         usual_ns = np.median(np.diff(recording.time_ns))
         steps = np.diff(time_ns, prepend=time_ns[0]) / usual_ns
-        front_end = FrontEnd(self.camera, self.vision)
+        front_end = FrontEnd(self.camera, self.vision, recording.depth)
         frames = LevelledFrames(self.vision, measurements)
         for n, k in enumerate(rows):
             frames.add(front_end.extract(*self.rectified(k)), float(steps[n]))

@@ -13,6 +13,7 @@ from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.text_files import TimedPoses
 from mapfusion.errors import InputError
 from mapfusion.geometry.numerics import Float
+from mapfusion.vision.depth import DepthParameters
 
 _BITS = 8
 _SILENT = 0  # log level of OpenCV
@@ -110,6 +111,9 @@ class StereoRecording:
         dropped: one line for each picture without a partner.
         inertial: IMU measurements, or None.
         calibrated_by: source of the calibration, for messages.
+        depth: noise and tests of depth images; None for stereo pairs. Depth images are loaded in
+            the place of right pictures, as metres, shape (H, W) float32. They are registered to the
+            left pictures, and the calibration is that of a virtual pair.
     """
 
     name: str
@@ -122,6 +126,7 @@ class StereoRecording:
     dropped: tuple[str, ...] = ()
     inertial: ImuData | None = None
     calibrated_by: str = ""
+    depth: DepthParameters | None = None
     _shift: list[int] = field(default_factory=list, repr=False)
 
     def __len__(self) -> int:
@@ -129,11 +134,16 @@ class StereoRecording:
         return len(self.pictures)
 
     def pair(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the raw pictures (H, W) uint8 of pair k; an InputError names the file."""
+        """Return the raw pictures (H, W) uint8 of pair k; an InputError names the file.
+
+        A depth image in the place of the right picture is float32.
+        """
+        of_light = slice(None) if self.depth is None else slice(1)
         if not self._shift:  # one shift for all pictures keeps brightness comparable
-            both = [load for n in sample_indices(len(self)) for load in self.pictures[n]]
-            self._shift.append(unused_bits(both))
-        left, right = (to_eight_bits(load(), self._shift[0]) for load in self.pictures[k])
+            loads = [load for n in sample_indices(len(self)) for load in self.pictures[n][of_light]]
+            self._shift.append(unused_bits(loads))
+        pictures = [to_eight_bits(load(), self._shift[0]) for load in self.pictures[k][of_light]]
+        left, right = pictures if self.depth is None else (*pictures, self.pictures[k][1]())
         return left, right
 
     def __iter__(self) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
@@ -143,7 +153,11 @@ class StereoRecording:
 
 
 def pair_shots(
-    source: Path, left: Sequence[Shot], right: Sequence[Shot], max_offset_ns: int = MAX_OFFSET_NS
+    source: Path,
+    left: Sequence[Shot],
+    right: Sequence[Shot],
+    max_offset_ns: int = MAX_OFFSET_NS,
+    cameras: tuple[str, str] = ("the left camera", "the right one"),
 ) -> tuple[np.ndarray, list[tuple[Load, Load]], tuple[str, ...]]:
     """Pair the pictures of two cameras that were taken at the same time.
 
@@ -152,6 +166,7 @@ def pair_shots(
         left: pictures of the left camera in the order of time.
         right: pictures of the right camera in the order of time.
         max_offset_ns: largest time difference of a pair.
+        cameras: names of both cameras, for messages.
 
     Returns:
         Times of the left pictures, shape (T,), the pairs, and a line for each dropped picture.
@@ -172,7 +187,7 @@ def pair_shots(
         if back[j] == i and abs(int(right_ns[j]) - int(left_ns[i])) <= max_offset_ns
     ]
     if len(both) < 2:
-        found = f"{len(left)} pictures of the left camera and {len(right)} of the right one"
+        found = f"{len(left)} pictures of {cameras[0]} and {len(right)} of {cameras[1]}"
         made = f"{len(both)} pairs within {max_offset_ns / 1e6:g} ms; 2 are the least"
         if len(left) > 1 and len(right) > 1:
             apart_s = float(np.abs(right_ns[partner] - left_ns).min()) / 1e9

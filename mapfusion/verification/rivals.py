@@ -185,20 +185,19 @@ def distinct_motions(
     return found
 
 
-def is_mirrored(
+def mirror_image_motion(
     pairs: Pairs, acceptance: Acceptance, refinement: Refinement, matching: MatchParameters
-) -> bool:
-    """Return True if the mirror image of map b fits map a beyond chance, and map b does not.
+) -> tuple[SupportedMotion, Float] | None:
+    """Return the best motion of the mirror image of map b onto map a, and its supporters.
 
-    Maps are mirror images of each other if one of them has y to the right. Pairs by geometry alone
-    belong to a motion, so that the mirror image is matched again.
+    Pairs by geometry alone belong to a motion, so that the mirror image is matched again. The
+    supporters are places in the plane of map b, shape (K, 2). Returns None if there is no motion.
     """
     flip = np.array([1.0, -1.0, 1.0])
-    own, bound = pairs.map_b, math.log10(acceptance.false_alarms)
-    position, covariance = own.position_m * flip, own.covariance_m2 * np.outer(flip, flip)
+    own = pairs.map_b
     image = LandmarkMap(
-        position,
-        covariance,
+        own.position_m * flip,
+        own.covariance_m2 * np.outer(flip, flip),
         own.count,
         own.source_observation,
         own.descriptor,
@@ -208,16 +207,27 @@ def is_mirrored(
         size_m=own.size_m,
         category=own.category,
     )
+    found = match(pairs.map_a, image, matching) if pairs.by_geometry else pairs.correspondences
+    of_image = Pairs(pairs.map_a, image, found)
+    motions = distinct_motions(of_image, 1, acceptance, refinement)
+    if not motions:
+        return None
+    return motions[0], (of_image.p_b[motions[0].inlier] * flip)[:, :2]
 
-    def fits(map_b: LandmarkMap) -> bool:
-        found = pairs.correspondences
-        if pairs.by_geometry and map_b is image:
-            found = match(pairs.map_a, image, matching)
-        given = Pairs(pairs.map_a, map_b, found)
-        motions = distinct_motions(given, 1, acceptance, refinement)
-        return any(each.log10_false_alarms <= bound for each in motions)
 
-    return fits(image) and not fits(own)
+def is_mirrored(
+    pairs: Pairs, acceptance: Acceptance, refinement: Refinement, matching: MatchParameters
+) -> bool:
+    """Return True if the mirror image of map b fits map a beyond chance, and map b does not.
+
+    Maps are mirror images of each other if one of them has y to the right.
+    """
+    bound = math.log10(acceptance.false_alarms)
+    found = mirror_image_motion(pairs, acceptance, refinement, matching)
+    if found is None or not found[0].log10_false_alarms <= bound:
+        return False
+    own = distinct_motions(pairs, 1, acceptance, refinement)
+    return not any(each.log10_false_alarms <= bound for each in own)
 
 
 def self_motions(

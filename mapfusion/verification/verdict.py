@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 
 from mapfusion.align.alignment import Alignment, Pairs, Status
+from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.covariance import residual_scale, with_common_motion
 from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.refinement import Refinement
@@ -31,9 +32,11 @@ from mapfusion.verification.regions import (
 from mapfusion.verification.rivals import (
     BETWEEN,
     RepeatedLandmarks,
+    SupportedMotion,
     distinct_motions,
     explained_landmarks,
     longest_patch_side_m,
+    mirror_image_motion,
     repeated_under_others,
     self_motions,
 )
@@ -316,7 +319,9 @@ class PairVerifier:
                 status, reason = Status.AMBIGUOUS, doubt.format(told=counts)
         elif not self._pairs.by_name:
             why = why_not_sought(self._pairs.map_a, self._pairs.map_b)
-            if rival := self._equal_rival(alignment):
+            if image := self._equal_mirror_image(alignment, by_chance.log10_false_alarms):
+                status, reason = Status.AMBIGUOUS, image
+            elif rival := self._equal_rival(alignment):
                 status, reason = Status.AMBIGUOUS, f"{rival}; nothing tells which is right: {why}"
             elif self._pairs.by_geometry:
                 reason = "matched by geometry alone"
@@ -391,6 +396,41 @@ class PairVerifier:
                     f"{maps[1].name}, {self._motion_text(T_a_b)} explains {of_rival}"
                 )
         return ""
+
+    @cached_property
+    def _mirror_image_motion(self) -> tuple[SupportedMotion, Float] | None:
+        """Best motion of the mirror image of map b and its supporters, found at first use."""
+        own, tolerance = self._settings, self._pairs.correspondences.size_tolerance
+        usual = MatchParameters()
+        matching = usual if tolerance is None else replace(usual, size_tolerance=tolerance)
+        return mirror_image_motion(self._pairs, own.acceptance, own.refinement, matching)
+
+    def _equal_mirror_image(self, alignment: Alignment, log10_false_alarms: float) -> str:
+        """Say that the mirror image of map b fits as well as an alignment; empty if it does not.
+
+        Landmarks near a line agree with their mirror images about it. That is no chance, and passes
+        the test against chance. The mirror image of a right map has the support of such landmarks
+        alone. The alignment outdoes it if the ratio of both NFAs is at most `false_alarms`. If all
+        landmarks lie on one line, the image has the same landmarks in the same places, and is no
+        rival.
+
+        Args:
+            alignment: the alignment.
+            log10_false_alarms: log10 of its NFA.
+        """
+        if self._mirror_image_motion is None:
+            return ""
+        image, p_b = self._mirror_image_motion
+        beyond_chance = image.log10_false_alarms <= self._bound
+        if not beyond_chance or log10_false_alarms - image.log10_false_alarms <= self._bound:
+            return ""
+        by_image = transform_points(image.T_a_b, p_b * [1, -1])
+        apart_m = np.linalg.norm(transform_points(alignment.T_a_b, p_b) - by_image, axis=1)
+        if np.sqrt(np.mean(apart_m**2)) <= max(self._settings.acceptance.gates_m):
+            return ""
+        a, b = self._pairs.map_a.name, self._pairs.map_b.name
+        fits = f"the mirror image of map {b} fits map {a} with {len(p_b)} pairs"
+        return f"{fits}, no worse than map {b} itself: check the sign of y and theta of both maps"
 
     def regions(self, alignment: Alignment, evidence: PairEvidence, side_m: float) -> Regions:
         """Return the regions of a side that both robots must have seen under an alignment."""

@@ -1,4 +1,4 @@
-"""Visual front end: landmark observations from stereo pairs."""
+"""Visual front end: landmark observations from stereo pairs, or from images with depths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,6 +10,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import Observations
+from mapfusion.vision.depth import DepthParameters, match_depth
 from mapfusion.vision.harris import HarrisParameters, detect
 from mapfusion.vision.stereo import MatchStatus, StereoParameters, match
 from mapfusion.vision.surf import USurfParameters, describe
@@ -43,25 +44,39 @@ class FrontEndParameters:
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """Feature extraction from single stereo pairs, without state: frames may come in any order."""
+    """Feature extraction from single pairs, without state: frames may come in any order.
+
+    Attributes:
+        camera: the rectified pair.
+        parameters: parameters of the parts.
+        depth: noise and tests of depth images, which take the place of the right images; None for
+            stereo pairs.
+    """
 
     camera: StereoCamera
     parameters: FrontEndParameters = field(default_factory=FrontEndParameters)
+    depth: DepthParameters | None = None
 
     def extract(self, left: np.ndarray, right: np.ndarray) -> Features:
         """Detect corners of the left image, match them in the right image and describe them.
 
-        Images are (H, W) uint8, rectified, of the camera's size.
+        Images are (H, W) uint8, rectified, of the camera's size. Depth images in the place of right
+        ones are float32, in metres.
 
         Raises:
             ValueError: wrong shape or type; names the argument.
         """
         size = (self.camera.height_px, self.camera.width_px)
         for name, image in (("left", left), ("right", right)):
-            if image.shape != size or image.dtype != np.uint8:
-                raise ValueError(f"{name}: is {image.dtype} {image.shape}, expected uint8 {size}")
+            kind = np.float32 if name == "right" and self.depth is not None else np.uint8
+            if image.shape != size or image.dtype != kind:
+                found = f"is {image.dtype} {image.shape}"
+                raise ValueError(f"{name}: {found}, expected {np.dtype(kind)} {size}")
         corners = detect(left, self.parameters.harris)
-        matches = match(left, right, corners, self.camera, self.parameters.stereo)
+        if self.depth is None:
+            matches = match(left, right, corners, self.camera, self.parameters.stereo)
+        else:
+            matches = match_depth(right, corners, self.camera, self.depth)
         matched = matches.status == MatchStatus.MATCHED
         uv, disparity = corners[matched], matches.disparity_px[matched]
         depth = self.camera.focal_px * self.camera.baseline_m / disparity

@@ -46,6 +46,7 @@ class MatchStatus(IntEnum):
     DIVERGED = 6  # the refinement left the pixel of the search
     SILHOUETTE = 7  # half of the window lies on another surface
     BENT = 8  # the window shows more than one plane, or a curved surface
+    MISSING = 9  # a depth image has too few depths in the window
 
 
 _PEAK_HALF_WIDTH_PX = 2  # the search for a second peak leaves out the slopes of the best one

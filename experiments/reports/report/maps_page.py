@@ -127,12 +127,17 @@ def _row(found: MapAlignment) -> dict[str, Any]:
         "aligner": found.aligner,
         "accepted": found.accepted,
         "verdict": str(found.status).replace("_", " "),
-        "motion": motion_text(found.T_a_b) if known else "–",
-        "sigma": sigma.removeprefix("sigma ") if known else "–",
+        "motion": _kept_together(motion_text(found.T_a_b)) if known else "–",
+        "sigma": _kept_together(sigma.removeprefix("sigma ")) if known else "–",
         "pairs": f"{np.count_nonzero(found.inlier)} of {len(found.inlier)}",
         "chance": found.registered.verdict.log10_false_alarms,
         "reason": found.reason,
     }
+
+
+def _kept_together(text: str) -> str:
+    """Return text that may be broken after commas alone, so that numbers keep their units."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
 
 
 def plans_figure(plans: Sequence[Plan]) -> go.Figure:

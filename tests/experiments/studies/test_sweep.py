@@ -194,6 +194,19 @@ def test_a_run_that_collides_is_a_row(
     assert set(timings["seed"]) == {0}
 
 
+def test_a_dry_run_counts_starts_inside_walls_and_names_one(
+    short_path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    starts = "robots.0.start=[1.2, 1.2, 0.6],[0.02, 1.2, 0.0]"
+    arguments = ("sweep", short_path, "--set", starts, "--results", tmp_path, "--dry-run")
+    reply = command(capsys, *arguments)
+    assert reply.code == 0
+    first, second, *_ = reply.out.splitlines()
+    assert first == "2 runs, 0 of them finished, 1 that cannot be run"
+    assert "scenario short: " in second
+    assert "R1" in second
+
+
 def test_a_run_that_needs_more_memory_than_there_is_is_a_row(
     short_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

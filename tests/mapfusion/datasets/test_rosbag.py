@@ -237,6 +237,16 @@ def test_the_format_of_a_compressed_picture_tells_a_mosaic(colours: bool) -> Non
     np.testing.assert_allclose(found[2:-2, 2:-2], luma[2:-2, 2:-2], atol=2)
 
 
+def test_compressed_pictures_that_are_not_read_name_their_format() -> None:
+    """A mosaic of an unknown order is no grey picture."""
+    kind = T["sensor_msgs/msg/CompressedImage"]
+    data = cv2.imencode(".jpg", np.zeros((20, 30), np.uint8))[1].ravel()
+    with pytest.raises(InputError, match=r"encoding 'bayer_rggb12': is not read; known: mono8"):
+        decode_image(kind(header(0, "c"), "bayer_rggb12; jpeg compressed", data))
+    with pytest.raises(InputError, match=r"format 'h264': cannot be decoded"):
+        decode_image(kind(header(0, "c"), "h264", data[2:]))
+
+
 def test_eight_coefficients_are_the_rational_model(tmp_path: Path) -> None:
     """The raw lens bends points as the published formula does."""
     coefficients = np.array([0.3, -0.05, 1e-4, -2e-4, 0.01, 0.6, 0.02, 0.005])

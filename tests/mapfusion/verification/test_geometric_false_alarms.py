@@ -13,13 +13,13 @@ from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.align.geometric_matching import Site
 from mapfusion.align.refinement import Refinement
-from mapfusion.geometry.se2 import rms_distance_m
+from mapfusion.geometry.se2 import inverse, rms_distance_m, transform_points
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.geometric_false_alarms import RandomPlacement
 from mapfusion.verification.registration import Registration
 from mapfusion.verification.rivals import is_mirrored
 from tests.mapfusion.align.made_fields import made_field, mirrored
-from tests.mapfusion.align.map_pairs import landmarks
+from tests.mapfusion.align.map_pairs import landmarks, motion, unit_vectors
 
 REGISTRATION = Registration(make_aligner("clique"))
 
@@ -51,6 +51,45 @@ def test_a_mirrored_field_is_refused_and_named(seed):
     assert not done.verdict.accepted
     pairs = Pairs(field.map_a, image, match(field.map_a, image))
     assert is_mirrored(pairs, Acceptance(), Refinement(), MatchParameters())
+
+
+def narrow_maps(rng, described):
+    """Maps of landmarks along a corridor: two walls without descriptors, or a strip with them."""
+    n, n_common, own = 80, 40, 20
+    x, wall = rng.uniform(0, 40, n), np.where(rng.random(n) < 0.5, 0.0, 2.5)
+    y = rng.uniform(0, 4, n) if described else wall + rng.normal(0, 0.05, n)
+    look, T_a_b = unit_vectors(rng, n), motion(rng)
+    maps = []
+    rows_of_b = [*range(n_common), *range(n - own, n)]
+    for name, rows, T in (("a", range(n - own), np.zeros(3)), ("b", rows_of_b, T_a_b)):
+        seen = transform_points(inverse(T), np.column_stack([x, y])[rows])
+        p = np.column_stack([seen + rng.normal(0, 0.02, seen.shape), np.zeros(len(seen))])
+        maps.append(landmarks(p, 0.02, look[rows] if described else None, planar=True, name=name))
+    return maps[0], maps[1], T_a_b
+
+
+@pytest.mark.parametrize(("described", "seeds"), [(True, (3, 5, 12, 22)), (False, (1, 10, 15))])
+def test_landmarks_near_the_axis_of_a_mirror_are_not_enough(described, seeds):
+    """The mirror images of these maps are beyond chance."""
+    for seed in seeds:
+        map_a, map_b, T_a_b = narrow_maps(np.random.default_rng(seed), described)
+        right, image = (registered(map_a, each) for each in (map_b, mirrored(map_b)))
+        assert right.verdict.accepted
+        assert rms_distance_m(right.refined.T_a_b, T_a_b, map_b.position_m[:, :2]) < 0.1
+        assert image.verdict.log10_false_alarms <= math.log10(Acceptance().false_alarms)
+        assert image.verdict.status is Status.AMBIGUOUS
+        assert image.verdict.reason.startswith("the mirror image of map b fits map a with ")
+
+
+def test_landmarks_on_one_line_are_accepted():
+    """A line is its own mirror image, which lays every landmark on the same place."""
+    rng = np.random.default_rng(0)
+    p = np.column_stack([rng.uniform(0, 30, 80), np.zeros((80, 2))])
+    look = unit_vectors(rng, 80)
+    for _ in range(5):
+        noisy = [p + rng.normal(0, 0.1, p.shape) * [1, 1, 0] for _ in "ab"]
+        maps = [landmarks(each, 0.1, look, planar=True) for each in noisy]
+        assert registered(*maps).verdict.accepted
 
 
 def test_number_of_false_alarms_on_random_maps():
