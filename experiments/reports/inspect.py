@@ -183,6 +183,8 @@ def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
         known["matched by"] = (
             " and ".join(there) or "geometry alone: neither descriptors nor labels"
         )
+        if landmarks.descriptor_kind is not None:
+            known["descriptors"] = str(landmarks.descriptor_kind)
     return _columns_of(path, kind, table, known)
 
 

@@ -19,6 +19,7 @@ from mapfusion.align.correspondences import (
 from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
+from mapfusion.descriptors import common_reference
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import rms_distance_m, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -207,6 +208,7 @@ def is_mirrored(
         own.name,
         size_m=own.size_m,
         category=own.category,
+        descriptor_kind=own.descriptor_kind,
     )
 
     def fits(map_b: LandmarkMap) -> bool:
@@ -259,7 +261,8 @@ def explained_landmarks(
     row_a, row_b = near["i"], near["j"]
     if map_a.descriptor is not None and map_b.descriptor is not None:
         off = map_a.descriptor[row_a] - map_b.descriptor[row_b]
-        row_b = row_b[np.linalg.norm(off, axis=1) <= _UNLIKE]
+        unlike = _UNLIKE * common_reference(map_a.descriptor_kind, map_b.descriptor_kind)
+        row_b = row_b[np.linalg.norm(off, axis=1) <= unlike]
     explained = np.zeros(len(map_b), np.bool_)
     explained[row_b] = True
     return explained
