@@ -16,7 +16,7 @@ from mapfusion.align.geometric_matching import (
     attributes_of_pairs_agree,
     match_by_geometry,
 )
-from mapfusion.descriptors import USURF, common_reference, require_one_kind
+from mapfusion.descriptors import USURF, relative, require_one_kind
 from mapfusion.geometry.numerics import (
     WORD,
     Float,
@@ -64,23 +64,21 @@ def nearest_descriptors(
 
     Returns:
         Nearest b of each a, its squared distance (infinite without a compatible landmark), and
-        nearest a of each b. Distances are shares of the maps' reference distance.
+        nearest a of each b. Distances are those of the descriptors' vectors.
 
     Raises:
         InputError: the descriptors are of different kinds.
     """
-    kinds = map_a.descriptor_kind, map_b.descriptor_kind
     require_one_kind([(f"map {each.name}", each.descriptor_kind) for each in (map_a, map_b)])
-    reference = common_reference(*kinds)
-    # distances of vectors far from the origin lose digits; unit vectors are not
-    centre = None if kinds[0] == kinds[1] == USURF else _centre(map_a)
-    a = _Side.of(map_a, _ABSENT * reference, 0.0, centre)
-    b = _Side.of(map_b, -_ABSENT * reference, floor_m2, centre)
+    # distances of vectors far from the origin would lose digits
+    are_usurf = map_a.descriptor_kind == map_b.descriptor_kind == USURF
+    centre = None if are_usurf else _centre(map_a)
+    a, b = _Side.of(map_a, _ABSENT, 0.0, centre), _Side.of(map_b, -_ABSENT, floor_m2, centre)
     for rows in a.blocks(height_bound):
         columns = b.of_heights(*a.interval(rows, height_bound), height_bound)
         product = a.descriptor[rows] @ b.descriptor[columns].T
         _take_nearer(product, rows, columns, a, b, height_bound, elsewhere_m)
-    return a.nearest, a.distance2 / reference**2, b.nearest
+    return a.nearest, a.distance2, b.nearest
 
 
 def _centre(landmarks: LandmarkMap) -> np.ndarray:
@@ -275,8 +273,8 @@ class Correspondences:
     Attributes:
         index_a: rows of map a, shape (N,).
         index_b: rows of map b, shape (N,).
-        distance: distances of the descriptors as shares of the reference distance of their kind,
-            shape (N,); 0 for pairs of labels.
+        distance: distances of the descriptors, shape (N,); 0 for pairs of labels. Two different
+            landmarks have a median distance of 0.8.
         shortage: why `match` found fewer than three pairs; empty otherwise.
         size_tolerance: largest relative difference of two sizes, if landmarks were matched by
             geometry alone; None otherwise.
@@ -357,10 +355,9 @@ class MatchParameters:
     """Parameters of the matching of landmarks.
 
     Attributes:
-        max_descriptor_distance: largest distance of two descriptors, as a share of the reference
-            distance of their kind: 0 is equal, 1 as unlike as two landmarks are on average. The
-            default keeps almost every mutual nearest neighbour, as in the paper; the aligner
-            rejects the false ones.
+        max_descriptor_distance: largest distance of two descriptors of any kind: 0 is equal, 0.8
+            the median of different landmarks. The default keeps almost every mutual nearest
+            neighbour, as in the paper; the aligner rejects the false ones.
         height: test of compatible heights.
         size_tolerance: largest difference of two sizes, as a share of the larger one. Landmarks
             without a size match any size.
@@ -526,7 +523,8 @@ def _mutually_nearest(
     """Return rows (N,) of both maps, each the other's nearest, and their descriptors' distances."""
     nearest_b, distance2, nearest_a = nearest_descriptors(map_a, map_b, height_bound, floor_m2)
     rows = np.flatnonzero(nearest_a[nearest_b] == np.arange(len(map_a)))
-    return rows, nearest_b[rows], np.sqrt(np.maximum(distance2[rows], 0.0))
+    apart = np.sqrt(np.maximum(distance2[rows], 0.0))
+    return rows, nearest_b[rows], relative(apart, map_a.descriptor_kind, map_b.descriptor_kind)
 
 
 def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters) -> str:

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.descriptors import DescriptorKind, common_reference
+from mapfusion.descriptors import DescriptorKind, reach
 from mapfusion.fastslam.association import (
     Association,
     associate,
@@ -58,8 +58,8 @@ class FastSlamParameters:
         gate_probability: share of true matches inside the gate (chi-square quantile). Close to 1,
             since a landmark's covariance omits the drift since it was last seen; inside the gate
             the descriptors decide.
-        descriptor_threshold: largest distance of matching descriptors, as a share of the reference
-            distance of their kind: 0 is equal, 1 as unlike as two landmarks are on average.
+        descriptor_threshold: largest distance of matching descriptors of any kind: 0 is equal, 0.8
+            the median of different landmarks.
         resample_fraction: resample when the effective sample size is at most this share of M;
             0 never, 1 in every step.
         stray_m: standard deviation, per axis, of the offset between the landmark and the point that
@@ -383,7 +383,7 @@ class FastSlam:
                 seen,
                 settings.gate,
                 observations.descriptor,
-                settings.descriptor_threshold * common_reference(observations.descriptor_kind),
+                reach(settings.descriptor_threshold, observations.descriptor_kind),
             )
         else:
             pairs = candidate_pairs(self._maps, seen, settings.gate)

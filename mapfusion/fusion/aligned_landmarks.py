@@ -10,7 +10,7 @@ import scipy
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.rigid_motion import motion_jacobian
-from mapfusion.descriptors import USURF, DescriptorKind, common_reference, merged_kind
+from mapfusion.descriptors import USURF, DescriptorKind, merged_kind, relative
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import transform_covariances, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -164,8 +164,8 @@ class AssociationTest:
     """Test if two landmarks in a common frame can be the same point.
 
     Attributes:
-        max_descriptor_distance: largest descriptor distance, as a share of the reference distance
-            of the kind; not used if both landmarks have labels.
+        max_descriptor_distance: largest descriptor distance; not used if both landmarks have
+            labels.
         gate_probability: probability that landmarks of the same point pass the gate (chi-square, 2
             degrees of freedom, drift included); not used for labels.
         height: test of the heights.
@@ -190,8 +190,8 @@ class AssociationTest:
         same_a, same_b = np.nonzero(a.label[labelled_a][:, None] == b.label[labelled_b])
         i, j = self._gated(a, b)
         both_labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
-        distance = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
-        distance /= np.float32(common_reference(a.kind, b.kind))
+        apart = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
+        distance = relative(apart, a.kind, b.kind)
         passes = ~both_labelled & (distance <= self.max_descriptor_distance)  # False for NaN
         return (
             np.concatenate([labelled_a[same_a], i[passes]]),

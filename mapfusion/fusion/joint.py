@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from mapfusion.align.alignment import MIN_PAIRS
-from mapfusion.descriptors import USURF, common_reference, merged_kind
+from mapfusion.descriptors import USURF, merged_kind, relative
 from mapfusion.fusion.aligned_landmarks import (
     ABSENT,
     AlignedLandmarks,
@@ -271,8 +271,8 @@ def _candidates(
             i, j = _neighbours(placed[a], placed[b], bound)
             unlabelled = (labels[a][i] == NO_LABEL) | (labels[b][j] == NO_LABEL)
             i, j = i[unlabelled], j[unlabelled]
-            distance = np.linalg.norm(first[i] - second[j], axis=1).astype(np.float64)
-            distance /= common_reference(given[a].descriptor_kind, given[b].descriptor_kind)
+            apart = np.linalg.norm(first[i] - second[j], axis=1).astype(np.float64)
+            distance = relative(apart, given[a].descriptor_kind, given[b].descriptor_kind)
             similar = distance <= parameters.max_descriptor_distance
             i, j, distance = i[similar], j[similar], distance[similar]
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
-from mapfusion.descriptors import common_reference
+from mapfusion.descriptors import reach
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import inverse, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -338,8 +338,8 @@ class ViewedMapPair:
         height = HeightGate()
         planar = a.landmarks.planar or b.landmarks.planar
         bound = np.inf if planar else height.bound
-        reference = common_reference(a.landmarks.descriptor_kind, b.landmarks.descriptor_kind)
-        unlike = parameters.max_descriptor_distance * reference
+        kinds = a.landmarks.descriptor_kind, b.landmarks.descriptor_kind
+        unlike = reach(parameters.max_descriptor_distance, *kinds)
         self._gates = MatchGates(parameters.gate_m, bound, height.floor_m**2, unlike)
         # matches and visibility of all landmarks of a map (first key: True for map a) by motion
         self._found: dict[tuple[bool, bytes], np.ndarray] = {}

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from mapfusion.camera import StereoCamera
-from mapfusion.descriptors import USURF, DescriptorKind, common_reference
+from mapfusion.descriptors import USURF, DescriptorKind, reach
 from mapfusion.geometry.numerics import Float, kernel, require_finite, require_shape
 from mapfusion.parameters import Probability, Range, require_in_range
 from mapfusion.vision.patch_alignment import Templates, fit_patches
@@ -232,8 +232,8 @@ class TrackParameters:
         max_shift_v_px: largest motion across rows; driving moves near points outwards.
         max_disparity_ratio: largest ratio of two disparities, by the robot's step at the smallest
             depth and by noise at the largest.
-        max_descriptor_distance: largest distance of two descriptors, as a share of the reference
-            distance of their kind.
+        max_descriptor_distance: largest distance of two descriptors of any kind; 0.8 is the median
+            of different points.
         noise_grey: standard deviation of the noise of one image, grey levels.
         max_misfit_px: error of the point's position that the fit of its patch tolerates besides
             noise. A larger difference of the patches ends the track.
@@ -391,7 +391,7 @@ def link(
         Row in `previous` of each feature of `current`, or -1, shape (N,).
     """
     steps = min(steps, _LONGEST_PAUSE)
-    unlike = parameters.max_descriptor_distance * common_reference(previous.kind, current.kind)
+    unlike = reach(parameters.max_descriptor_distance, previous.kind, current.kind)
     return _link_mutually(
         previous.uv_px,
         previous.disparity_px,
