@@ -128,11 +128,11 @@ def stated_metric(attributes: Mapping[str, str]) -> str:
 def guessed_kind(vectors: np.ndarray) -> DescriptorKind:
     """Return the kind of vectors (N, D) of which only the numbers are known.
 
-    It is U-SURF for 64 numbers of norm 1, else `euclidean`.
+    It is U-SURF for 64 numbers of norm 1, or 0 where a window is flat; else `euclidean`.
     """
     if vectors.shape[1] == USURF.length:
         norms = np.linalg.norm(vectors, axis=1)
-        norms = norms[~np.isnan(norms)]
+        norms = norms[norms > 0]  # not NaN
         if np.all((norms > 1 / _NORM_FACTOR) & (norms < _NORM_FACTOR)):
             return USURF
     return DescriptorKind("euclidean", vectors.shape[1])

@@ -316,8 +316,8 @@ APPEARANCE_FIELDS = [
     ),
     described(
         pa.field("descriptor", pa.list_(pa.float32(), USURF.length)),
-        "descriptor of its appearance, of any length (64 is that of U-SURF); NaN for none; packed "
-        "bits (Hamming) are `uint8`",
+        "descriptor of its appearance, of any length (64 is that of U-SURF), NaN for none; packed "
+        "bits of the metric hamming are uint8",
         np.nan,
     ),
 ]
@@ -493,7 +493,10 @@ def appearance_from(
         text = f"{path}: descriptors taken as {kind}"
         whole = descriptor[np.isfinite(descriptor)]
         if np.all((whole >= 0) & (whole <= 255) & (whole == np.floor(whole))):
-            text += "; if they are packed bits, name the column descriptor_hamming"
+            text += (
+                "; if they are packed bits, name the column descriptor_hamming (or give `align` "
+            )
+            text += "and `merge` --descriptor-metric hamming)"
         warnings.warn(text, TellingWarning, stacklevel=3)
     return descriptor, label, kind
 

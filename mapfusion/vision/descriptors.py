@@ -163,11 +163,13 @@ class NamedDescriber:
     """Descriptor by name, whose answers are checked.
 
     Raises:
-        ValueError: the name is unknown, or a plug-in cannot be made.
+        ValueError: the name is unknown.
+        InputError: a plug-in cannot be made.
     """
 
     def __init__(self, name: str) -> None:
-        self._name = name
+        self._name, own = name, _OWN_FILE.fullmatch(name)
+        self._method = own[2] if own else name  # in files: the folder does not matter
         target = target_of(name)
         place, _, attribute = target.rpartition(":")
         try:
@@ -175,7 +177,7 @@ class NamedDescriber:
             require_metric(made.metric)
         except Exception as error:
             told = f"{error}{moved_module_note(error)}"
-            raise ValueError(f"descriptor {name}: {target} cannot be made: {told}") from error
+            raise InputError(f"descriptor {name}: {target} cannot be made: {told}") from error
         self._made: Describer = made
 
     def describe(
@@ -201,7 +203,7 @@ class NamedDescriber:
         if not is_array or found.shape[1] < 1 or found.dtype != number:
             got = f"{found.dtype} {found.shape}" if isinstance(found, np.ndarray) else type(found)
             raise InputError(f"descriptor {name}: gave {got}, expected {number} ({n}, D)")
-        kind = DescriptorKind(metric, found.shape[1] * (8 if packed else 1), name)
+        kind = DescriptorKind(metric, found.shape[1] * (8 if packed else 1), self._method)
         if not np.all(np.isfinite(found)):
             raise InputError(f"descriptor {name}: gave a number that is not finite")
         try:

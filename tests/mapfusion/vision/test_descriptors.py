@@ -146,7 +146,7 @@ def test_plug_ins_are_found_by_file_and_by_entry_point(
     uv, scale = corners(rng)
     name = plug_in(tmp_path)
     found, kind = NamedDescriber(name).describe(image, uv, scale)
-    assert (kind.metric, kind.length, kind.name) == ("euclidean", 16, name)
+    assert (kind.metric, kind.length, kind.name) == ("euclidean", 16, "Brightness")
     monkeypatch.syspath_prepend(tmp_path)
     declared = EntryPoints([EntryPoint("bright", "bright:Brightness", descriptors.GROUP)])
     monkeypatch.setattr(descriptors, "entry_points", lambda group: declared.select(group=group))
@@ -183,7 +183,7 @@ def test_wrong_answers_of_plug_ins_are_told_in_one_line(
 
 
 def test_plug_ins_that_cannot_be_made_are_told(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="cannot be made: descriptor_metric: is 'manhattan'"):
+    with pytest.raises(InputError, match="cannot be made: descriptor_metric: is 'manhattan'"):
         NamedDescriber(plug_in(tmp_path, "manhattan"))
-    with pytest.raises(ValueError, match=r"cannot be made: .* no attribute 'Dark'"):
+    with pytest.raises(InputError, match=r"cannot be made: .* no attribute 'Dark'"):
         NamedDescriber(plug_in(tmp_path).replace("Brightness", "Dark"))
