@@ -132,7 +132,9 @@ def read_open_table(
         table = _read_csv(path, table_schema)
     else:
         table = read_parquet(path, f"{kind} table")
-    attributes = text_attributes(path, table)
+    attributes, given = text_attributes(path, table), table.column_names
+    if twice := sorted({name for name in given if given.count(name) > 1}):
+        raise InputError(f"{path}: has two columns {', '.join(twice)}")
     if "descriptor" in table_schema.names:
         table, table_schema, metric = _with_vectors(
             path, table, table_schema, stated_metric(attributes), descriptor_metric
@@ -146,8 +148,6 @@ def read_open_table(
         if not (earlier and attributes["kind"] == kind):
             require_kind(path, table, attributes, table_schema)
     names = table.column_names
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"{path}: has two columns {', '.join(twice)}")
     similar = _similar_names(names, table_schema)
     planar = not set(HEIGHT) & set(names)
     found = {field.name: _column(path, table, field, planar) for field in table_schema}
@@ -354,73 +354,78 @@ def _with_vectors(
             require_metric(asked)
         except ValueError as error:
             raise InputError(str(error)) from error
-    lists, numbered, short = list[str](), dict[int, str](), dict[int, str]()
-    metrics = {stated} if stated else set[str]()
+    renamed, metrics = _descriptor_names(path, table)
+    if not renamed:
+        return table, table_schema, ""
+    first = next(iter(renamed))
+    cells = table.column(first).type
+    is_list = renamed[first] == "descriptor"
+    width = _length_of_lists(path, first, table) if is_list else len(renamed)
+    number = getattr(cells, "value_type", None) if is_list else cells
+    metrics |= {"hamming"} if number == pa.uint8() else set()
+    metrics |= {stated} if stated else set()
+    if asked and metrics - {asked}:
+        found = f"has descriptors of metric {' and '.join(sorted(metrics))}"
+        raise InputError(f"{path}: {found}, not {asked}; leave --descriptor-metric out")
+    if len(metrics) > 1:
+        raise InputError(f"{path}: has descriptors of metrics {' and '.join(sorted(metrics))}")
+    metric = asked or next(iter(metrics), "")
+    own = table.rename_columns([renamed.get(name, name) for name in table.column_names])
+    try:
+        field = pa.field("descriptor", pa.list_(pa.float32(), width))
+        vectors = _rows_of_numbers(path, own, field)
+    except pa.ArrowException as error:
+        reason = f"{' '.join(str(error).split())} (expected numbers)"
+        raise InputError(f"{path}: column {first}: {reason}") from error
+    if metric == "hamming":
+        vectors = _unpacked(path, first, vectors, width)
+    vectors = vectors.cast(pa.list_(pa.float32(), vectors.type.list_size))
+    place = min(map(own.column_names.index, renamed.values()))
+    joined = own.drop_columns(list(renamed.values())).add_column(place, "descriptor", vectors)
+    at = table_schema.get_field_index("descriptor")
+    known = table_schema.field(at).with_type(vectors.type)
+    return joined, table_schema.set(at, known), metric
+
+
+def _descriptor_names(path: Path, table: pa.Table) -> tuple[dict[str, str], set[str]]:
+    """Return the columns of descriptors with their plain names, and the metrics in their names.
+
+    Plain names are `descriptor` of a column of lists, or `descriptor_0` and so on.
+    """
+    lists, numbered, short = dict[str, str](), dict[str, str](), dict[str, str]()
+    metrics = set[str]()
     for name in table.column_names:
         match = _DESCRIPTOR_COLUMN.fullmatch(name)
         if match is None:
             continue
         if match["short"]:
-            short[int(match["short"])] = name
+            short[name] = f"descriptor_{int(match['short'])}"
             continue
         metrics |= {match["metric"].lower()} if match["metric"] else set()
         if match["number"] is None:
-            lists.append(name)
+            lists[name] = "descriptor"
         else:
-            numbered[int(match["number"])] = name
+            numbered[name] = f"descriptor_{int(match['number'])}"
     if not lists and not numbered and len(short) > 1:  # a single column d0 has another meaning
         numbered = short
     if len(lists) > 1 or (lists and numbered):
-        both = [*lists, *numbered.values()]
+        both = [*lists, *numbered]
         raise InputError(f"{path}: has two columns of descriptors, {both[0]} and {both[1]}")
-    names = lists or list(numbered.values())
-    if not names:
-        return table, table_schema, ""
-    width = len(numbered)
-    cells = None
-    if lists:
-        cells = table.column(lists[0]).combine_chunks()
-        kind = cells.type
-        if pa.types.is_fixed_size_list(kind):
-            width = kind.list_size
-        elif pa.types.is_list(kind) or pa.types.is_large_list(kind):
-            lengths = pc.call_function("list_value_length", [cells]).drop_null().unique()
-            if len(lengths) > 1:
-                found = f"lists of {' and '.join(map(str, sorted(lengths.to_pylist())[:2]))}"
-                raise InputError(f"{path}: column {lists[0]}: {found} numbers, expected one length")
-            width = lengths[0].as_py() if len(lengths) else USURF.length
-        else:
-            width = USURF.length  # empty cells; `_rows_of_numbers` rejects others
-        if getattr(kind, "value_type", None) == pa.uint8():
-            metrics.add("hamming")
-    if asked:
-        if metrics and metrics != {asked}:
-            found = f"has descriptors of metric {' and '.join(sorted(metrics))}"
-            raise InputError(f"{path}: {found}, not {asked}; leave --descriptor-metric out")
-        metrics = {asked}
-    if len(metrics) > 1:
-        raise InputError(f"{path}: has descriptors of metrics {' and '.join(sorted(metrics))}")
-    metric = next(iter(metrics), "")
-    field = pa.field("descriptor", pa.list_(pa.float32(), width))
-    if width == 0:
-        raise InputError(f"{path}: column {lists[0]}: lists of 0 numbers")
-    renamed = {name: f"descriptor_{k}" for k, name in numbered.items()}
-    renamed |= dict.fromkeys(lists, "descriptor")
-    own = table.rename_columns([renamed.get(name, name) for name in table.column_names])
-    try:
-        vectors = _rows_of_numbers(path, own, field)
-    except pa.ArrowException as error:
-        reason = f"{' '.join(str(error).split())} (expected numbers)"
-        raise InputError(f"{path}: column {names[0]}: {reason}") from error
-    if metric == "hamming":
-        vectors = _unpacked(path, names[0], vectors, width)
-    vectors = vectors.cast(pa.list_(pa.float32(), vectors.type.list_size))
-    place = own.column_names.index(renamed[names[0]])
-    kept = own.drop_columns(list(renamed.values()))
-    joined = kept.add_column(min(place, kept.num_columns), "descriptor", vectors)
-    at = table_schema.get_field_index("descriptor")
-    known = table_schema.field(at).with_type(vectors.type)
-    return joined, table_schema.set(at, known), metric
+    return lists or numbered, metrics
+
+
+def _length_of_lists(path: Path, name: str, table: pa.Table) -> int:
+    """Return the length of the lists of a column; that of U-SURF if all are empty cells."""
+    cells = table.column(name).combine_chunks()
+    if pa.types.is_fixed_size_list(cells.type):
+        return cells.type.list_size
+    if not (pa.types.is_list(cells.type) or pa.types.is_large_list(cells.type)):
+        return USURF.length
+    lengths = pc.call_function("list_value_length", [cells]).drop_null().unique().to_pylist()
+    if len(lengths) > 1 or 0 in lengths:
+        found = f"lists of {' and '.join(map(str, sorted(lengths)[:2]))} numbers"
+        raise InputError(f"{path}: column {name}: {found}, expected one length")
+    return lengths[0] if lengths else USURF.length
 
 
 def _unpacked(path: Path, name: str, packed: pa.Array, width: int) -> pa.Array:
@@ -452,9 +457,9 @@ def appearance_columns(
     if label is None:
         label = np.full(n, NO_LABEL)
     if kind is not None and kind.metric == "hamming":
-        absent = np.isnan(descriptor).any(axis=1)
+        absent = np.any(np.isnan(descriptor), axis=1, keepdims=True)
         packed = pack_bits(descriptor)
-        looks = np.ma.MaskedArray(packed, np.broadcast_to(absent[:, None], packed.shape))
+        looks = np.ma.MaskedArray(packed, np.broadcast_to(absent, packed.shape))
     else:
         looks = descriptor.astype(np.float32)
     return {"label": label.astype(np.int32), "descriptor": looks}

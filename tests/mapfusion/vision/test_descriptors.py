@@ -28,7 +28,7 @@ OPENCV = ("sift", "orb")
 def image() -> np.ndarray:
     noise = np.random.default_rng(0).uniform(0, 255, (240, 320)).astype(np.float32)
     smooth = cv2.GaussianBlur(noise, (0, 0), 2)
-    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    return cv2.normalize(smooth, smooth, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 @pytest.fixture
