@@ -114,7 +114,12 @@ def test_kinds_are_compared_by_metric_length_and_name() -> None:
     unnamed = replace(SIFT, name="")
     assert not SIFT.differs_from(unnamed)
     assert not SIFT.differs_from(replace(SIFT, reference=3.0))
-    others = [replace(SIFT, name="root_sift"), replace(SIFT, length=64), KINDS["orb"]]
+    others = [
+        replace(SIFT, name="root_sift"),
+        replace(unnamed, metric="cosine"),
+        replace(SIFT, length=64),
+        KINDS["orb"],
+    ]
     assert all(SIFT.differs_from(other) and other.differs_from(SIFT) for other in others)
     two, eight = replace(SIFT, reference=2.0), replace(unnamed, reference=8.0)
     assert merged_kind(USURF, USURF) == USURF
