@@ -35,6 +35,9 @@ _UNIT_TOLERANCE = 1e-3  # error of a norm after rounding to single precision, wi
 _MOST_COMPARED = 384
 # Median distance of two landmarks by U-SURF, 0.80 to 0.86 in maps of three scenarios of the suite.
 USURF_MEDIAN = 0.8
+# Ratio of the references of two maps from which on their numbers have different units. Maps of one
+# method differ by a few percent.
+_OTHER_UNIT = 4.0
 _METRIC, _NAME, _REFERENCE = "descriptor_metric", "descriptor_name", "descriptor_reference"
 
 
@@ -230,7 +233,7 @@ def relative(apart: Any, *kinds: DescriptorKind | None) -> Any:
 
 
 def require_one_kind(named: Sequence[tuple[str, DescriptorKind | None]]) -> None:
-    """Raise InputError, naming both, if descriptors of two maps cannot be compared.
+    """Raise InputError, naming both, if descriptors of two maps differ in kind or in unit.
 
     Args:
         named: name or file of each map, and the kind of its descriptors; None for none.
@@ -242,4 +245,10 @@ def require_one_kind(named: Sequence[tuple[str, DescriptorKind | None]]) -> None
                 raise InputError(
                     f"{name} has descriptors of another kind ({kind}) than {before} ({known}); "
                     "compute both by one method, or remove the column `descriptor`"
+                )
+            ratio = (kind.reference or 1.0) / (known.reference or 1.0)
+            if kind.reference and known.reference and not 1 / _OTHER_UNIT < ratio < _OTHER_UNIT:
+                raise InputError(
+                    f"descriptors of {name} are {ratio:.2g} times as far apart as those of "
+                    f"{before}: scale both alike"
                 )

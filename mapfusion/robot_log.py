@@ -185,7 +185,9 @@ class Observations:
         for name, shape in optional.items():
             if getattr(self, name) is not None:
                 require_shape(name, getattr(self, name), (n, *shape))
-        if self.descriptor is not None:
+        if self.descriptor is None:
+            object.__setattr__(self, "descriptor_kind", None)
+        else:
             descriptor, kind = as_vectors(self.descriptor, self.descriptor_kind)
             object.__setattr__(self, "descriptor", descriptor)
             object.__setattr__(self, "descriptor_kind", kind)
