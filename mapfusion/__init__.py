@@ -17,6 +17,7 @@ _NAMES_OF = {
     "align.correspondences": ("Correspondences", "MatchParameters", "match"),
     "align.refinement": ("Refinement",),
     "datasets.formats": ("import_recording", "read_recording"),
+    "descriptors": ("DescriptorKind",),
     "errors": ("InputError",),
     "fastslam.association": ("Association",),
     "fastslam.filter": ("FastSlam", "FastSlamParameters", "StepResult"),

@@ -8,6 +8,7 @@ from mapfusion.align.correspondences import match as match
 from mapfusion.align.refinement import Refinement as Refinement
 from mapfusion.datasets.formats import import_recording as import_recording
 from mapfusion.datasets.formats import read_recording as read_recording
+from mapfusion.descriptors import DescriptorKind as DescriptorKind
 from mapfusion.errors import InputError as InputError
 from mapfusion.fastslam.association import Association as Association
 from mapfusion.fastslam.filter import FastSlam as FastSlam

@@ -252,11 +252,17 @@ def table_write(
 
 
 def _to_arrow(values: Any, kind: pa.DataType) -> pa.Array:
-    """Return values as an Arrow array; lists and bytes of fixed size are rows of a matrix."""
+    """Return values as an Arrow array; lists and bytes of fixed size are rows of a matrix.
+
+    Masked rows of lists are null.
+    """
     if pa.types.is_fixed_size_list(kind):
         matrix = np.ascontiguousarray(values).reshape(-1, kind.list_size)
+        mask = None
+        if np.ma.is_masked(values):
+            mask = pa.array(np.ma.getmaskarray(values).reshape(matrix.shape).any(axis=1))
         return pa.FixedSizeListArray.from_arrays(
-            pa.array(matrix.ravel(), kind.value_type), kind.list_size
+            pa.array(matrix.ravel(), kind.value_type), kind.list_size, mask=mask
         )
     if pa.types.is_fixed_size_binary(kind):
         matrix = np.ascontiguousarray(values, np.uint8)

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from mapfusion.camera import EXACT, CalibrationError, calibration_from
+from mapfusion.descriptors import USURF, DescriptorKind, as_vectors
 from mapfusion.errors import InputError, TellingWarning
 from mapfusion.exchange import g2o_text, ply_text
 from mapfusion.files import (
@@ -52,11 +53,11 @@ from mapfusion.geometry.numerics import (
 from mapfusion.robot_log import with_rows
 from mapfusion.tables import (
     APPEARANCE_FIELDS,
-    DESCRIPTOR_LENGTH,
     HEIGHT,
     NO_LABEL,
     appearance_columns,
     appearance_from,
+    appearance_schema,
     csv_bytes,
     described,
     is_alone,
@@ -155,7 +156,7 @@ ATTRIBUTE_FIELDS = [
 ]
 LANDMARKS = schema(
     "landmark_map",
-    2,
+    3,  # 2 had descriptors of 64 numbers only
     [
         *(described(field, "in the map frame") for field in point_fields()),
         described(pa.field("count", pa.int32()), "number of observations of the landmark", 1),
@@ -179,7 +180,8 @@ class LandmarkMap:
         covariance_m2: (N, 3, 3).
         count: (N,) int32 number of observations of each landmark.
         source_observation: (N,) int64 row in the robot's log of the observation that created it.
-        descriptor: (N, 64) float32, or None.
+        descriptor: (N, D) float32 vectors, NaN for none; or None. Packed bits (N, B) uint8 become
+            vectors of bits.
         label: (N,) int32, or None.
         size_m: (N,) size of each landmark, such as a diameter, NaN for none; or None.
         category: (N,) int32 class of each landmark, -1 for none; or None.
@@ -190,6 +192,7 @@ class LandmarkMap:
         viewing: viewing evidence, or None.
         calibration: error of the camera calibration, which all landmarks share; neither covariance
             includes it.
+        descriptor_kind: kind of the descriptors; None: that of the numbers (see `as_vectors`).
     """
 
     position_m: Float
@@ -205,6 +208,7 @@ class LandmarkMap:
     calibration: CalibrationError = EXACT
     size_m: Float | None = None
     category: np.ndarray | None = None
+    descriptor_kind: DescriptorKind | None = None
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -214,8 +218,13 @@ class LandmarkMap:
         require_shape("source_observation", self.source_observation, (n,))
         require_finite("position_m", self.position_m)
         require_finite("covariance_m2", self.covariance_m2)
-        if self.descriptor is not None:
-            require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
+        if self.descriptor is None:
+            object.__setattr__(self, "descriptor_kind", None)
+        else:
+            require_shape("descriptor", self.descriptor, (n, None))
+            descriptor, kind = as_vectors(self.descriptor, self.descriptor_kind)
+            object.__setattr__(self, "descriptor", descriptor)
+            object.__setattr__(self, "descriptor_kind", kind)
         for name in ("label", "size_m", "category"):
             if getattr(self, name) is not None:
                 require_shape(name, getattr(self, name), (n,))
@@ -250,17 +259,22 @@ class LandmarkMap:
 
     @classmethod
     def from_pandas(
-        cls, table: "pd.DataFrame", name: str = "map", sigma_m: float | None = None
+        cls,
+        table: "pd.DataFrame",
+        name: str = "map",
+        sigma_m: float | None = None,
+        descriptor_metric: str = "",
     ) -> "LandmarkMap":
         """Return the map of a table with the columns of a map's file.
 
-        `sigma_m` is the standard deviation per axis of landmarks without columns of covariances.
+        `sigma_m` is the standard deviation per axis of landmarks without columns of covariances,
+        `descriptor_metric` the metric of descriptors that are neither Euclidean nor of type uint8.
 
         Raises:
             InputError: the table is not as documented.
         """
         content = pa.Table.from_pandas(table, preserve_index=False)
-        return replace(_map_from(Path(name), content, sigma_m), name=name)
+        return replace(_map_from(Path(name), content, sigma_m, descriptor_metric), name=name)
 
 
 MAP_ENDINGS = (".parquet", ".csv", ".ply", ".g2o")  # of the files that `write_map` writes
@@ -305,13 +319,14 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
         except ValueError as error:
             raise InputError(f"{path}: {error}") from error
         return {path: lambda temporary: temporary.write_bytes(text)}
-    columns = _columns(landmarks) | appearance_columns(
-        len(landmarks), landmarks.descriptor, landmarks.label
-    )
+    kind_of, n = landmarks.descriptor_kind, len(landmarks)
+    looks = appearance_columns(n, landmarks.descriptor, landmarks.label, kind_of)
+    columns = _columns(landmarks) | looks
     attributes = {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
     attributes |= landmarks.calibration.attributes()
+    attributes |= {} if kind_of is None else kind_of.attributes()
     return {
-        path: table_write(columns, LANDMARKS, attributes),
+        path: table_write(columns, appearance_schema(LANDMARKS, looks), attributes),
         **joint_writes(path, landmarks.joint, landmarks.covariance_m2),
         **viewing_writes(path, landmarks.viewing),
     }
@@ -331,11 +346,21 @@ def _columns(landmarks: LandmarkMap) -> dict[str, np.ndarray]:
 
 
 def _known_columns(landmarks: LandmarkMap) -> dict[str, np.ndarray]:
-    """Return the columns of a map without those that hold nothing."""
-    given = appearance_columns(len(landmarks), landmarks.descriptor, landmarks.label)
+    """Return the columns of a map without those that hold nothing.
+
+    Without metadata, the name of the descriptors' column states their metric, unless they are those
+    of U-SURF. Packed bits with gaps are floats, NaN for none.
+    """
+    kind = landmarks.descriptor_kind
+    given = appearance_columns(len(landmarks), landmarks.descriptor, landmarks.label, kind)
     appearance = {
         name: each for name, each in given.items() if getattr(landmarks, name) is not None
     }
+    if kind is not None and kind != USURF:
+        looks = appearance.pop("descriptor")
+        if np.ma.is_masked(looks):
+            looks = np.ma.MaskedArray(looks, dtype=np.float32).filled(np.nan)
+        appearance[f"descriptor_{kind.metric}"] = np.asarray(looks)
     absent = set(HEIGHT) if landmarks.planar else set()
     absent |= {name for name in ("size_m", "category") if getattr(landmarks, name) is None}
     kept = {name: each for name, each in _columns(landmarks).items() if name not in absent}
@@ -378,28 +403,36 @@ def _with_sigma(sigma_m: float) -> pa.Schema:
     return pa.schema(fields, LANDMARKS.metadata)
 
 
-def read_map(path: str | Path, alone: bool = False, sigma_m: float | None = None) -> LandmarkMap:
+def read_map(
+    path: str | Path,
+    alone: bool = False,
+    sigma_m: float | None = None,
+    descriptor_metric: str = "",
+) -> LandmarkMap:
     """Read a map.
 
     The files beside a Parquet map are read, too, unless `alone` is True. Files beside a map of
     another kind are not read, since they belong to the Parquet map of the same name. `sigma_m` is
-    the standard deviation per axis of the landmarks of a map without columns of covariances.
+    the standard deviation per axis of the landmarks of a map without columns of covariances,
+    `descriptor_metric` the metric of descriptors whose file states none.
 
     Raises:
         InputError: a file is missing, damaged or not as documented.
     """
     path = Path(path)
-    found = _map_from(path, None, sigma_m)
+    found = _map_from(path, None, sigma_m, descriptor_metric)
     if alone or is_alone(path):
         return found
     viewing = read_viewing(path, len(found))
     return replace(found, joint=read_joint(path, found.covariance_m2), viewing=viewing)
 
 
-def _map_from(path: Path, table: pa.Table | None, sigma_m: float | None) -> LandmarkMap:
+def _map_from(
+    path: Path, table: pa.Table | None, sigma_m: float | None, descriptor_metric: str
+) -> LandmarkMap:
     """Return the map of a table, or of a file if the table is None; raises InputError."""
     known = LANDMARKS if sigma_m is None else _with_sigma(sigma_m)
-    table, attributes = read_open_table(path, known, table)
+    table, attributes = read_open_table(path, known, table, descriptor_metric)
     finite = "give a finite number, or remove the row"
     require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)
     counted = "a landmark has at least one observation"
@@ -414,18 +447,21 @@ def _map_from(path: Path, table: pa.Table | None, sigma_m: float | None) -> Land
     size_m, category = column(table, "size_m"), column(table, "category")
     position, covariance = points_from(table)
     planar = attributes.get("planar") == "true"
+    descriptor, label, kind = appearance_from(path, table, attributes)
     try:
         found = LandmarkMap(
             position,
             covariance,
             column(table, "count"),
             column(table, "source_observation"),
-            *appearance_from(table),
+            descriptor,
+            label,
             planar,
             attributes.get("name", name_in_text(path.stem)),
             calibration=calibration_from(attributes, path),
             size_m=None if np.isnan(size_m).all() else size_m,
             category=None if np.all(category == NO_LABEL) else category,
+            descriptor_kind=kind,
         )
         require_points(position, covariance, planar)
         require_no_twins("landmarks", position, covariance.reshape(-1, 9))

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from mapfusion.camera import EXACT, CalibrationError, calibration_from
+from mapfusion.descriptors import DescriptorKind, as_vectors
 from mapfusion.errors import InputError
 from mapfusion.files import (
     COVARIANCE_FIELDS,
@@ -51,9 +52,9 @@ from mapfusion.geometry.numerics import (
 )
 from mapfusion.tables import (
     APPEARANCE_FIELDS,
-    DESCRIPTOR_LENGTH,
     appearance_columns,
     appearance_from,
+    appearance_schema,
     described,
     read_open_table,
     require_appearance,
@@ -95,7 +96,7 @@ FRAMES = schema(
 )
 OBSERVATIONS = schema(
     "robot_log.observations",
-    2,  # 1 had no tracks
+    3,  # 1 had no tracks, 2 descriptors of 64 numbers only
     [
         described(_ITERATION, "number of the frame; rows are ordered by frame"),
         *(
@@ -156,12 +157,14 @@ class Observations:
     Attributes:
         position_m: (N, 3) in the robot frame.
         covariance_m2: (N, 3, 3), R_t of eq. 6 in Cartesian coordinates.
-        descriptor: (N, 64) float32, or None.
+        descriptor: (N, D) float32 vectors, NaN for none; or None. Packed bits (N, B) uint8 become
+            vectors of bits.
         label: (N,) int32 known identities, or None.
         uvd_px: (N, 3) float32 u, v, disparity in the left image, or None.
         track: (N,) int32 number of the track, NO_TRACK for none; None without tracks. All
             observations of a track show the same point; other observations of the landmark show
             points close to it.
+        descriptor_kind: kind of the descriptors; None: that of the numbers (see `as_vectors`).
     """
 
     position_m: Float
@@ -170,6 +173,7 @@ class Observations:
     label: np.ndarray | None = None
     uvd_px: np.ndarray | None = None
     track: np.ndarray | None = None
+    descriptor_kind: DescriptorKind | None = None
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -177,10 +181,16 @@ class Observations:
         require_shape("covariance_m2", self.covariance_m2, (n, 3, 3))
         require_finite("position_m", self.position_m)
         require_finite("covariance_m2", self.covariance_m2)
-        optional = {"descriptor": (DESCRIPTOR_LENGTH,), "label": (), "uvd_px": (3,), "track": ()}
+        optional = {"descriptor": (None,), "label": (), "uvd_px": (3,), "track": ()}
         for name, shape in optional.items():
             if getattr(self, name) is not None:
                 require_shape(name, getattr(self, name), (n, *shape))
+        if self.descriptor is None:
+            object.__setattr__(self, "descriptor_kind", None)
+        else:
+            descriptor, kind = as_vectors(self.descriptor, self.descriptor_kind)
+            object.__setattr__(self, "descriptor", descriptor)
+            object.__setattr__(self, "descriptor_kind", kind)
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -242,16 +252,19 @@ def write_observations(folder: Path, iteration: np.ndarray, observations: Observ
     n = len(observations)
     uvd = observations.uvd_px if observations.uvd_px is not None else np.full((n, 3), np.nan)
     track = np.full(n, NO_TRACK) if observations.track is None else observations.track
+    kind = observations.descriptor_kind
+    looks = appearance_columns(n, observations.descriptor, observations.label, kind)
     write_table(
         folder / "observations.parquet",
         {
             "iteration": iteration.astype(np.int32),
             **point_columns(observations.position_m, observations.covariance_m2),
             **named_columns(_PIXEL_FIELDS, uvd.astype(np.float32)),
-            **appearance_columns(n, observations.descriptor, observations.label),
+            **looks,
             "track": track.astype(np.int32),
         },
-        OBSERVATIONS,
+        appearance_schema(OBSERVATIONS, looks),
+        None if kind is None else kind.attributes(),
     )
 
 
@@ -275,13 +288,16 @@ def _observations(folder: Path) -> tuple[np.ndarray, Observations, bool]:
     require_appearance(path, table)
     position, covariance = points_from(table)
     uvd, track = columns(table, _PIXEL_FIELDS), column(table, "track")
+    descriptor, label, kind = appearance_from(path, table, attributes)
     try:
         observations = Observations(
             position,
             covariance,
-            *appearance_from(table),
+            descriptor,
+            label,
             None if np.isnan(uvd).all() else uvd,
             None if np.all(track == NO_TRACK) else track,
+            kind,
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error

@@ -8,6 +8,7 @@ data. `mapfusion docs formats` lists all columns.
 """
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +17,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv
 
-from mapfusion.errors import InputError
+from mapfusion.descriptors import (
+    METRICS,
+    USURF,
+    DescriptorKind,
+    as_vectors,
+    kind_from,
+    pack_bits,
+    require_metric,
+    stated_metric,
+    unpack_bits,
+)
+from mapfusion.errors import InputError, TellingWarning
 from mapfusion.exchange import read_g2o, read_ply
 from mapfusion.files import (
     UNREADABLE,
@@ -89,7 +101,10 @@ def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
 
 
 def read_open_table(
-    path: Path, table_schema: pa.Schema, content: pa.Table | None = None
+    path: Path,
+    table_schema: pa.Schema,
+    content: pa.Table | None = None,
+    descriptor_metric: str = "",
 ) -> tuple[pa.Table, dict[str, str]]:
     """Read a table written by this or another program.
 
@@ -97,10 +112,12 @@ def read_open_table(
         path: path of the file; its suffix is that of CSV, PLY or g2o, or it is Parquet.
         table_schema: required and optional columns.
         content: table that is not in a file; `path` is then its name in messages.
+        descriptor_metric: metric of descriptors whose table states none; empty if unknown.
 
     Returns:
         The table with the columns of the schema, and its text attributes. The attribute `planar` is
-        added for a table without heights.
+        added for a table without heights, and `descriptor_metric` where a column's name or type
+        tells it. Descriptors are vectors of any length, NaN for none.
 
     Raises:
         InputError: the file is missing, damaged, or of another kind; it lacks a column, has a
@@ -115,7 +132,14 @@ def read_open_table(
         table = _read_csv(path, table_schema)
     else:
         table = read_parquet(path, f"{kind} table")
-    attributes = text_attributes(path, table)
+    attributes, given = text_attributes(path, table), table.column_names
+    if twice := sorted({name for name in given if given.count(name) > 1}):
+        raise InputError(f"{path}: has two columns {', '.join(twice)}")
+    if "descriptor" in table_schema.names:
+        table, table_schema, metric = _with_vectors(
+            path, table, table_schema, stated_metric(attributes), descriptor_metric
+        )
+        attributes |= {"descriptor_metric": metric} if metric else {}
     if "kind" in attributes:
         # Files of earlier versions are read, too: later columns have defaults.
         known = int(table_schema.metadata[b"mapfusion.schema_version"])
@@ -124,8 +148,6 @@ def read_open_table(
         if not (earlier and attributes["kind"] == kind):
             require_kind(path, table, attributes, table_schema)
     names = table.column_names
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"{path}: has two columns {', '.join(twice)}")
     similar = _similar_names(names, table_schema)
     planar = not set(HEIGHT) & set(names)
     found = {field.name: _column(path, table, field, planar) for field in table_schema}
@@ -287,38 +309,201 @@ def _rows_of_numbers(path: Path, table: pa.Table, field: pa.Field) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(flat, type=field.type)
 
 
-DESCRIPTOR_LENGTH = 64
 NO_LABEL = -1
 APPEARANCE_FIELDS = [
     described(
         pa.field("label", pa.int32()), "known identity of the landmark, -1 for none", NO_LABEL
     ),
     described(
-        pa.field("descriptor", pa.list_(pa.float32(), DESCRIPTOR_LENGTH)),
-        "descriptor of its appearance (U-SURF or another), of norm 1; NaN for none",
+        pa.field("descriptor", pa.list_(pa.float32(), USURF.length)),
+        "descriptor of its appearance, of any length (64 is that of U-SURF), NaN for none; packed "
+        "bits of the metric hamming are uint8",
         np.nan,
     ),
 ]
+# Names of columns of descriptors: one column of lists, or one column for each number. A metric
+# other than the Euclidean one is part of the name where a file has no metadata.
+_DESCRIPTOR_COLUMN = re.compile(
+    rf"descriptor(?:_(?P<metric>{'|'.join(METRICS)}))?(?:_?(?P<number>\d{{1,9}}))?"
+    r"|d_?(?P<short>\d{1,9})",
+    re.IGNORECASE,
+)
+
+
+def _with_vectors(
+    path: Path, table: pa.Table, table_schema: pa.Schema, stated: str, asked: str
+) -> tuple[pa.Table, pa.Schema, str]:
+    """Replace the columns of descriptors by one column of vectors.
+
+    Args:
+        path: of the table, for messages.
+        table: table with any columns.
+        table_schema: its schema, with 64 numbers in a descriptor.
+        stated: metric that the metadata state; empty if they state none.
+        asked: metric that the caller states; empty if he states none.
+
+    Returns:
+        The table, the schema with the length of its descriptors, and their metric; empty if
+        unknown.
+
+    Raises:
+        InputError: metrics contradict each other, or a cell holds no descriptor.
+    """
+    if asked:
+        try:
+            require_metric(asked)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+    renamed, metrics = _descriptor_names(path, table)
+    if not renamed:
+        return table, table_schema, ""
+    first = next(iter(renamed))
+    cells = table.column(first).type
+    is_list = renamed[first] == "descriptor"
+    width = _length_of_lists(path, first, table) if is_list else len(renamed)
+    number = getattr(cells, "value_type", None) if is_list else cells
+    metrics |= {"hamming"} if number == pa.uint8() else set()
+    metrics |= {stated} if stated else set()
+    if asked and metrics - {asked}:
+        found = f"has descriptors of metric {' and '.join(sorted(metrics))}"
+        raise InputError(f"{path}: {found}, not {asked}; leave --descriptor-metric out")
+    if len(metrics) > 1:
+        raise InputError(f"{path}: has descriptors of metrics {' and '.join(sorted(metrics))}")
+    metric = asked or next(iter(metrics), "")
+    own = table.rename_columns([renamed.get(name, name) for name in table.column_names])
+    try:
+        field = pa.field("descriptor", pa.list_(pa.float32(), width))
+        vectors = _rows_of_numbers(path, own, field)
+    except pa.ArrowException as error:
+        reason = f"{' '.join(str(error).split())} (expected numbers)"
+        raise InputError(f"{path}: column {first}: {reason}") from error
+    if metric == "hamming":
+        vectors = _unpacked(path, first, vectors, width)
+    vectors = vectors.cast(pa.list_(pa.float32(), vectors.type.list_size))
+    place = min(map(own.column_names.index, renamed.values()))
+    joined = own.drop_columns(list(renamed.values())).add_column(place, "descriptor", vectors)
+    at = table_schema.get_field_index("descriptor")
+    known = table_schema.field(at).with_type(vectors.type)
+    return joined, table_schema.set(at, known), metric
+
+
+def _descriptor_names(path: Path, table: pa.Table) -> tuple[dict[str, str], set[str]]:
+    """Return the columns of descriptors with their plain names, and the metrics in their names.
+
+    Plain names are `descriptor` of a column of lists, or `descriptor_0` and so on.
+    """
+    lists, numbered, short = dict[str, str](), dict[str, str](), dict[str, str]()
+    metrics = set[str]()
+    for name in table.column_names:
+        match = _DESCRIPTOR_COLUMN.fullmatch(name)
+        if match is None:
+            continue
+        if match["short"]:
+            short[name] = f"descriptor_{int(match['short'])}"
+            continue
+        metrics |= {match["metric"].lower()} if match["metric"] else set()
+        if match["number"] is None:
+            lists[name] = "descriptor"
+        else:
+            numbered[name] = f"descriptor_{int(match['number'])}"
+    if not lists and not numbered and len(short) > 1:  # a single column d0 has another meaning
+        numbered = short
+    if len(lists) > 1 or (lists and numbered):
+        both = [*lists, *numbered]
+        raise InputError(f"{path}: has two columns of descriptors, {both[0]} and {both[1]}")
+    return lists or numbered, metrics
+
+
+def _length_of_lists(path: Path, name: str, table: pa.Table) -> int:
+    """Return the length of the lists of a column; that of U-SURF if all are empty cells."""
+    cells = table.column(name).combine_chunks()
+    if pa.types.is_fixed_size_list(cells.type):
+        return cells.type.list_size
+    if not (pa.types.is_list(cells.type) or pa.types.is_large_list(cells.type)):
+        return USURF.length
+    lengths = pc.call_function("list_value_length", [cells]).drop_null().unique().to_pylist()
+    if len(lengths) > 1 or 0 in lengths:
+        found = f"lists of {' and '.join(map(str, sorted(lengths)[:2]))} numbers"
+        raise InputError(f"{path}: column {name}: {found}, expected one length")
+    return lengths[0] if lengths else USURF.length
+
+
+def _unpacked(path: Path, name: str, packed: pa.Array, width: int) -> pa.Array:
+    """Return bytes (N, width) of bits as vectors of bits (N, 8 width), NaN for none."""
+    matrix = packed.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
+    known = np.logical_not(np.all(np.isnan(matrix), axis=1))
+    given = matrix[known]
+    if not np.all((given >= 0) & (given <= 255) & (given == np.floor(given))):
+        needed = "packed bits are whole numbers from 0 to 255"
+        raise InputError(f"{path}: column {name}: holds other numbers than bytes; {needed}")
+    bits = np.full((len(matrix), 8 * width), np.nan, np.float32)
+    bits[known] = unpack_bits(given.astype(np.uint8))
+    return pa.FixedSizeListArray.from_arrays(pa.array(bits.ravel()), 8 * width)
 
 
 def appearance_columns(
-    n: int, descriptor: np.ndarray | None, label: np.ndarray | None
+    n: int,
+    descriptor: np.ndarray | None,
+    label: np.ndarray | None,
+    kind: DescriptorKind | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return descriptors and labels of n points as the columns of `APPEARANCE_FIELDS`."""
+    """Return descriptors and labels of n points as columns, the inverse of `appearance_from`.
+
+    The column of descriptors is `descriptor`, also for packed bits, of which those without a
+    descriptor are masked.
+    """
     if descriptor is None:
-        descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan)
+        descriptor = np.full((n, USURF.length), np.nan)
     if label is None:
         label = np.full(n, NO_LABEL)
-    return {"label": label.astype(np.int32), "descriptor": descriptor.astype(np.float32)}
+    if kind is not None and kind.metric == "hamming":
+        absent = np.any(np.isnan(descriptor), axis=1, keepdims=True)
+        packed = pack_bits(descriptor)
+        looks = np.ma.MaskedArray(packed, np.broadcast_to(absent, packed.shape))
+    else:
+        looks = descriptor.astype(np.float32)
+    return {"label": label.astype(np.int32), "descriptor": looks}
 
 
-def appearance_from(table: pa.Table) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return descriptors and labels of a table; None if no row has any."""
+def appearance_schema(table_schema: pa.Schema, columns: Mapping[str, np.ndarray]) -> pa.Schema:
+    """Return a schema with the type of the descriptors among some columns."""
+    looks = columns["descriptor"]
+    number = pa.uint8() if looks.dtype == np.uint8 else pa.float32()
+    at = table_schema.get_field_index("descriptor")
+    field = table_schema.field(at).with_type(pa.list_(number, looks.shape[1]))
+    return table_schema.set(at, field)
+
+
+def appearance_from(
+    path: Path, table: pa.Table, attributes: Mapping[str, str]
+) -> tuple[np.ndarray | None, np.ndarray | None, DescriptorKind | None]:
+    """Return descriptors and labels of a table, None if no row has any, and the descriptors' kind.
+
+    A TellingWarning names the kind of descriptors that the table does not tell, unless they are
+    those of U-SURF.
+
+    Raises:
+        InputError: the kind is not as documented, or a descriptor is not of the kind.
+    """
     descriptor, label = column(table, "descriptor"), column(table, "label")
-    return (
-        None if np.isnan(descriptor).all() else descriptor,
-        None if np.all(label == NO_LABEL) else label,
-    )
+    label = None if np.all(label == NO_LABEL) else label
+    if np.isnan(descriptor).all():
+        return None, label, None
+    try:
+        stated = kind_from(attributes, descriptor.shape[1])
+        descriptor, kind = as_vectors(descriptor, stated)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+    if stated is None and kind.differs_from(USURF):
+        text = f"{path}: descriptors taken as {kind}"
+        whole = descriptor[np.isfinite(descriptor)]
+        if np.all((whole >= 0) & (whole <= 255) & (whole == np.floor(whole))):
+            text += (
+                "; if they are packed bits, name the column descriptor_hamming (or give `align` "
+            )
+            text += "and `merge` --descriptor-metric hamming)"
+        warnings.warn(text, TellingWarning, stacklevel=3)
+    return descriptor, label, kind
 
 
 def require_appearance(path: Path, table: pa.Table) -> None:

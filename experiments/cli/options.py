@@ -168,6 +168,14 @@ SigmaM = Annotated[
         help="Standard deviation per axis of the landmarks of maps without covariances.",
     ),
 ]
+DescriptorMetric = Annotated[
+    str,
+    typer.Option(
+        "--descriptor-metric",
+        metavar="METRIC",
+        help="Metric of descriptors that state none: euclidean, cosine or hamming (packed bits).",
+    ),
+]
 DocumentFile = Annotated[
     Path | None, typer.Option("--output", "-o", help="File for what --json prints.")
 ]

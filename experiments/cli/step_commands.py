@@ -113,6 +113,7 @@ def align(
     overrides: options.Overrides,
     seed: options.Seed = None,
     sigma_m: options.SigmaM = None,
+    descriptor_metric: options.DescriptorMetric = "",
     require_accepted: Annotated[
         bool, typer.Option("--require-accepted", help="Exit code 1 if no estimate is accepted.")
     ] = False,
@@ -138,7 +139,7 @@ def align(
     settings = settings_of(scenario, overrides, seed)
     found, n_aligners = [], len(settings.align.aligners)
     with progress(quiet=as_json) as show:
-        for each in single.align(map_a, map_b, settings, sigma_m):
+        for each in single.align(map_a, map_b, settings, sigma_m, descriptor_metric):
             found.append(each)
             show("align", len(found), n_aligners)
     document = export.alignment_document((map_a, map_b), settings.seed, found)
@@ -163,6 +164,7 @@ def merge(
     overrides: options.Overrides,
     seed: options.Seed = None,
     sigma_m: options.SigmaM = None,
+    descriptor_metric: options.DescriptorMetric = "",
     as_json: options.AsJson = False,
 ) -> None:
     """Fuse maps that alignments connect: `mapfusion merge A.parquet B.parquet -o F.parquet`.
@@ -182,7 +184,7 @@ def merge(
     options.announce_compilation(as_json)
     overrides = with_aligners(scenario, overrides, aligners)
     settings = settings_of(scenario, overrides, seed)
-    merged = single.merge(maps, settings, sigma_m)
+    merged = single.merge(maps, settings, sigma_m, descriptor_metric)
     paths = single.save_fused(output, merged)
     found = export.fusion_document(paths, settings.seed, merged, maps)
     export.publish_json("merge", found, as_json)

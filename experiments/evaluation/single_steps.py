@@ -31,7 +31,7 @@ from mapfusion.datasets.log_consistency import Finding, gate_finding
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import Write, write_together
-from mapfusion.fusion.map_merging import MapAlignment, MergedMaps, align_maps, load_map, merge_maps
+from mapfusion.fusion.map_merging import MapAlignment, MergedMaps, align_maps, load_maps, merge_maps
 from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap, map_writes
 from mapfusion.robot_log import (
@@ -197,11 +197,16 @@ def _registration(entry: AlignerEntry, settings: Align) -> Registration:
 
 
 def align(
-    path_a: Path, path_b: Path, settings: Scenario, sigma_m: float | None = None
+    path_a: Path,
+    path_b: Path,
+    settings: Scenario,
+    sigma_m: float | None = None,
+    descriptor_metric: str = "",
 ) -> Iterator[MapAlignment]:
     """Yield for each aligner the alignment of two maps.
 
-    `sigma_m` is the standard deviation of landmarks of maps without covariances.
+    `sigma_m` is the standard deviation of landmarks of maps without covariances,
+    `descriptor_metric` the metric of descriptors that state none.
 
     Each aligner is called twice with the same random numbers, and the second call is timed. The
     first call compiles kernels and starts processes.
@@ -209,7 +214,7 @@ def align(
     Raises:
         InputError: a map cannot be read.
     """
-    map_a, map_b = load_map(path_a, sigma_m=sigma_m), load_map(path_b, sigma_m=sigma_m)
+    map_a, map_b = load_maps({"a": path_a, "b": path_b}, sigma_m, descriptor_metric)
     pairs = match(map_a, map_b, settings.align.match)
     evidence = None
     for entry in settings.align.aligners:
@@ -241,10 +246,16 @@ def alignment_row(found: MapAlignment) -> dict[str, Any]:
     return row | {"overlap": refined.overlap, "heights": refined.heights}
 
 
-def merge(paths: Sequence[Path], settings: Scenario, sigma_m: float | None = None) -> MergedMaps:
+def merge(
+    paths: Sequence[Path],
+    settings: Scenario,
+    sigma_m: float | None = None,
+    descriptor_metric: str = "",
+) -> MergedMaps:
     """Align all pairs of maps and fuse the maps.
 
-    `sigma_m` is the standard deviation of landmarks of maps without covariances.
+    `sigma_m` is the standard deviation of landmarks of maps without covariances,
+    `descriptor_metric` the metric of descriptors that state none.
 
     Raises:
         InputError: there are fewer than two maps, a map cannot be read, or the aligner is unknown.
@@ -260,6 +271,7 @@ def merge(paths: Sequence[Path], settings: Scenario, sigma_m: float | None = Non
         fuser=settings.merge.fuser,
         parameters=settings.merge.parameters,
         sigma_m=sigma_m,
+        descriptor_metric=descriptor_metric,
         rng=lambda a, b: generator(settings.seed, "align", name, a.name, b.name),
     )
 

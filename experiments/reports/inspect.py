@@ -174,7 +174,11 @@ def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
     """Describe a table of any program as `align`, `merge` and `slam` read it."""
     table, facts = read_open_table(path, table_schema)
     kind = table_schema.metadata[f"{_PREFIX}{_KIND}".encode()].decode()
-    known: dict[str, Any] = {name: value for name, value in facts.items() if name != _KIND}
+    known: dict[str, Any] = {
+        name: value
+        for name, value in facts.items()
+        if name != _KIND and not name.startswith("descriptor_")  # said in words below
+    }
     if table_schema is landmark_map.LANDMARKS:
         landmarks = landmark_map.read_map(path)
         known |= {"name": landmarks.name, "planar": str(landmarks.planar).lower()}
@@ -183,6 +187,8 @@ def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
         known["matched by"] = (
             " and ".join(there) or "geometry alone: neither descriptors nor labels"
         )
+        if landmarks.descriptor_kind is not None:
+            known["descriptors"] = str(landmarks.descriptor_kind)
     return _columns_of(path, kind, table, known)
 
 

@@ -16,6 +16,7 @@ from mapfusion.align.geometric_matching import (
     attributes_of_pairs_agree,
     match_by_geometry,
 )
+from mapfusion.descriptors import USURF, relative, require_one_kind
 from mapfusion.geometry.numerics import (
     WORD,
     Float,
@@ -63,14 +64,30 @@ def nearest_descriptors(
 
     Returns:
         Nearest b of each a, its squared distance (infinite without a compatible landmark), and
-        nearest a of each b.
+        nearest a of each b. Distances are those of the descriptors' vectors.
+
+    Raises:
+        InputError: the descriptors are of different kinds.
     """
-    a, b = _Side.of(map_a, _ABSENT, 0.0), _Side.of(map_b, -_ABSENT, floor_m2)
+    require_one_kind([(f"map {each.name}", each.descriptor_kind) for each in (map_a, map_b)])
+    # distances of vectors far from the origin would lose digits
+    are_usurf = map_a.descriptor_kind == map_b.descriptor_kind == USURF
+    centre = None if are_usurf else _centre(map_a)
+    a, b = _Side.of(map_a, _ABSENT, 0.0, centre), _Side.of(map_b, -_ABSENT, floor_m2, centre)
     for rows in a.blocks(height_bound):
         columns = b.of_heights(*a.interval(rows, height_bound), height_bound)
         product = a.descriptor[rows] @ b.descriptor[columns].T
         _take_nearer(product, rows, columns, a, b, height_bound, elsewhere_m)
     return a.nearest, a.distance2, b.nearest
+
+
+def _centre(landmarks: LandmarkMap) -> np.ndarray:
+    """Return the mean descriptor (D,) of a map; zero if it has none."""
+    assert landmarks.descriptor is not None
+    known = ~np.isnan(landmarks.descriptor).any(axis=1)
+    if not known.any():
+        return np.zeros(landmarks.descriptor.shape[1], np.float32)
+    return landmarks.descriptor[known].mean(axis=0, dtype=np.float64).astype(np.float32)
 
 
 class _Side(NamedTuple):
@@ -85,10 +102,19 @@ class _Side(NamedTuple):
     distance2: Float  # (N,) squared distance to the nearest
 
     @classmethod
-    def of(cls, landmarks: LandmarkMap, absent: float, floor_m2: float) -> "_Side":
+    def of(
+        cls,
+        landmarks: LandmarkMap,
+        absent: float,
+        floor_m2: float,
+        centre: np.ndarray | None,
+    ) -> "_Side":
         assert landmarks.descriptor is not None
         n = len(landmarks)
-        descriptor = np.nan_to_num(landmarks.descriptor.astype(np.float32), nan=absent)
+        descriptor = landmarks.descriptor.astype(np.float32)
+        if centre is not None:
+            descriptor = descriptor - centre
+        descriptor = np.nan_to_num(descriptor, nan=absent)
         return cls(
             descriptor,
             np.einsum("ij,ij->i", descriptor, descriptor),
@@ -228,9 +254,6 @@ def _take(side: _Side, i: int, j: int, distance2: float) -> None:
 
 
 FEW = 3  # correspondences; fewer cannot contradict a motion, and `match` explains the shortage
-# `why_not_unit_vectors` reports norms of this size or more, and of its inverse or less. Rounding
-# to integers changes norms less.
-_NORM_FACTOR = 2.0
 # Constants of `scale_note`. Lengths of two maps differ by a few percent (calibration, drift). An
 # interval of this width contains about 5 % of the ratios of false pairs, whose logarithms have a
 # spread of 0.7; a quarter of the ratios in it cannot be chance.
@@ -250,7 +273,8 @@ class Correspondences:
     Attributes:
         index_a: rows of map a, shape (N,).
         index_b: rows of map b, shape (N,).
-        distance: Euclidean distances of the descriptors, shape (N,); 0 for pairs of labels.
+        distance: distances of the descriptors, shape (N,); 0 for pairs of labels. Two different
+            landmarks have a median distance of 0.8.
         shortage: why `match` found fewer than three pairs; empty otherwise.
         size_tolerance: largest relative difference of two sizes, if landmarks were matched by
             geometry alone; None otherwise.
@@ -331,9 +355,9 @@ class MatchParameters:
     """Parameters of the matching of landmarks.
 
     Attributes:
-        max_descriptor_distance: largest distance of two unit vectors; 0 is equal, sqrt(2)
-            orthogonal. The default keeps almost every mutual nearest neighbour, as in the paper;
-            the aligner rejects the false ones.
+        max_descriptor_distance: largest distance of two descriptors of any kind: 0 is equal, 0.8
+            the median of different landmarks. The default keeps almost every mutual nearest
+            neighbour, as in the paper; the aligner rejects the false ones.
         height: test of compatible heights.
         size_tolerance: largest difference of two sizes, as a share of the larger one. Landmarks
             without a size match any size.
@@ -499,7 +523,8 @@ def _mutually_nearest(
     """Return rows (N,) of both maps, each the other's nearest, and their descriptors' distances."""
     nearest_b, distance2, nearest_a = nearest_descriptors(map_a, map_b, height_bound, floor_m2)
     rows = np.flatnonzero(nearest_a[nearest_b] == np.arange(len(map_a)))
-    return rows, nearest_b[rows], np.sqrt(np.maximum(distance2[rows], 0.0))
+    apart = np.sqrt(np.maximum(distance2[rows], 0.0))
+    return rows, nearest_b[rows], relative(apart, map_a.descriptor_kind, map_b.descriptor_kind)
 
 
 def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters) -> str:
@@ -526,9 +551,6 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
             f", {n_alike} at most {parameters.max_descriptor_distance:g} apart "
             f"(median {_short(np.median(distance))})"
         )
-        for landmarks, some in ((map_a, rows), (map_b, nearest)):
-            if why := why_not_unit_vectors(landmarks, some):
-                return f"{said}: map {landmarks.name}: {why}"
         return f"{said}: the maps show other things, or their descriptors are of different kinds"
     if n_alike < len(rows):
         said += f", {n_alike} at most {parameters.max_descriptor_distance:g} apart"
@@ -544,28 +566,6 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
     )
     scale = scale_note(map_a, map_b, rows, nearest)
     return f"{said}; {scale}" if scale else said
-
-
-def why_not_unit_vectors(landmarks: LandmarkMap, rows: np.ndarray | None = None) -> str:
-    """Return which descriptor of a map has a norm far from 1, with a remedy; empty if none has.
-
-    Args:
-        landmarks: the map.
-        rows: landmarks to test, shape (N,); None: all. Landmarks without a descriptor pass.
-    """
-    if landmarks.descriptor is None:
-        return ""
-    rows = np.arange(len(landmarks)) if rows is None else rows
-    norms = np.linalg.norm(landmarks.descriptor[rows].astype(np.float64), axis=1)
-    wrong = np.flatnonzero((norms <= 1 / _NORM_FACTOR) | (norms >= _NORM_FACTOR))
-    if not len(wrong):
-        return ""
-    zero = norms[wrong[0]] == 0
-    remedy = "give NaN where there is none" if zero else "divide each descriptor by its norm"
-    return (
-        f"descriptor: row {rows[wrong[0]]} has norm {_short(norms[wrong[0]])}, expected 1 "
-        f"({len(wrong)} of {len(rows)} rows); {remedy}"
-    )
 
 
 def scale_note(

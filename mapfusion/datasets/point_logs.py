@@ -16,7 +16,7 @@ A folder without odometry holds one such folder for each robot. Their landmarks 
 above.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -276,13 +276,13 @@ def _read_points(robot: Path, settings: PointsSettings) -> Measurements:
     else:
         require_cells(path, table, COVARIANCE_FIELDS, np.isfinite, "give a finite number")
         position, covariance = points_from(table)
-    return _measured(path, table, position, covariance, planar, settings)
+    return _measured(path, table, attributes, position, covariance, planar, settings)
 
 
 def _read_ranges(robot: Path, settings: RangesSettings) -> Measurements:
     """Read the table `ranges` of a robot."""
     path = table_path(robot, "ranges")
-    table, _ = _read_timed(path, RANGES)
+    table, attributes = _read_timed(path, RANGES)
     positive = "ranges are positive, in metres; remove rows without a return"
     require_cells(path, table, ["range_m"], lambda r: np.isfinite(r) & (r > 0), positive)
     limit = "bearings are in radians, -pi to pi or 0 to 2 pi; are they degrees?"
@@ -295,18 +295,26 @@ def _read_ranges(robot: Path, settings: RangesSettings) -> Measurements:
     range_m, bearing_rad = columns(table, _POLAR_FIELDS).T
     range_sigma_m = np.hypot(settings.range_sigma_m, settings.range_sigma_ratio * range_m)
     points = points_of_ranges(range_m, bearing_rad, range_sigma_m, settings.bearing_sigma_rad)
-    return _measured(path, table, *points, True, settings)
+    return _measured(path, table, attributes, *points, True, settings)
 
 
 def _measured(
-    path: Path, table: pa.Table, position: Float, covariance: Float, planar: bool, settings: _Frames
+    path: Path,
+    table: pa.Table,
+    attributes: Mapping[str, str],
+    position: Float,
+    covariance: Float,
+    planar: bool,
+    settings: _Frames,
 ) -> Measurements:
     """Return measurements in the robot frame, given those in the sensor frame."""
     require_appearance(path, table)
     R = np.eye(3)
     R[:2, :2] = rotation(np.array(settings.sensor_theta_rad))
     moved = position @ R.T + [settings.sensor_x_m, settings.sensor_y_m, 0.0]
-    observations = Observations(moved, R @ covariance @ R.T, *appearance_from(table))
+    descriptor, label, kind = appearance_from(path, table, attributes)
+    covariance = R @ covariance @ R.T
+    observations = Observations(moved, covariance, descriptor, label, descriptor_kind=kind)
     return Measurements(column(table, "time_s"), observations, planar)
 
 
@@ -375,7 +383,8 @@ def log_on_clock(
 
     increments = np.zeros((len(clock_s), 3))
     increments[1:] = between(T_start_frame[:-1], T_start_frame[1:])
-    observations = Observations(position, covariance, seen.descriptor, seen.label)
+    looks = seen.descriptor, seen.label
+    observations = Observations(position, covariance, *looks, descriptor_kind=seen.descriptor_kind)
     times = clock_s - clock_s[0]
     return RobotLog(robot, measured.planar, times, increments, frame, observations, **extras)
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mapfusion.descriptors import USURF, reach
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float, chi_square_bound
@@ -20,7 +21,7 @@ from mapfusion.vision.visual_odometry import MIN_LINKS, RigidMotion, estimate_ri
 PLANAR = [0, 1, 5]  # x, y and the rotation about z, within shifts and rotation vectors in space
 MIN_MOTIONS = 4  # of which a median is computed
 _LINK_PROBABILITY = 0.999  # that a true link of consecutive frames lies inside the gate
-_MAX_DESCRIPTOR_DISTANCE = 0.5  # of unit vectors, as `FastSlamParameters.descriptor_threshold`
+_MAX_DESCRIPTOR_DISTANCE = 0.5  # as `FastSlamParameters.descriptor_threshold`
 # Tolerances added to the covariances of a planar fit, relative to the extent of the points.
 _TOLERANCES = (1.0, 0.25, 0.06, 0.015, 0.0)
 # Condition number of links at a single place, which leave the rotation undetermined.
@@ -93,9 +94,14 @@ def links(
             return a[own], b[other]
     if seen.descriptor is None or not len(a) or not len(b):
         return a[:0], b[:0]
-    similarity = seen.descriptor[a] @ seen.descriptor[b].T
+    one, two = seen.descriptor[a], seen.descriptor[b]
+    similarity = one @ two.T  # 1 - d^2 / 2 of unit vectors with the distance d
+    if seen.descriptor_kind != USURF:
+        squares = (np.einsum("ij,ij->i", each, each) for each in (one, two))
+        similarity += 1 - np.add.outer(*squares) / 2
     other, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    similar = similarity.max(axis=1) > 1 - _MAX_DESCRIPTOR_DISTANCE**2 / 2
+    most = reach(_MAX_DESCRIPTOR_DISTANCE, seen.descriptor_kind)
+    similar = similarity.max(axis=1) > 1 - most**2 / 2
     mutual = similar & (back[other] == np.arange(len(a)))
     return a[mutual], b[other[mutual]]
 

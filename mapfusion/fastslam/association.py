@@ -42,7 +42,7 @@ def candidate_pairs(
 ) -> Pairs:
     """Return pairs whose gates can overlap in some particle.
 
-    With descriptors (K, 64) of the observations, only pairs with a descriptor distance below the
+    With descriptors (K, D) of the observations, only pairs with a descriptor distance below the
     threshold are returned, sorted by distance. Equal distances are ordered by observation and by
     the age of the landmark.
     """

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
+from mapfusion.descriptors import DescriptorKind, reach
 from mapfusion.fastslam.association import (
     Association,
     associate,
@@ -57,7 +58,8 @@ class FastSlamParameters:
         gate_probability: share of true matches inside the gate (chi-square quantile). Close to 1,
             since a landmark's covariance omits the drift since it was last seen; inside the gate
             the descriptors decide.
-        descriptor_threshold: largest Euclidean distance of matching descriptors (unit vectors).
+        descriptor_threshold: largest distance of matching descriptors of any kind: 0 is equal, 0.8
+            the median of different landmarks.
         resample_fraction: resample when the effective sample size is at most this share of M;
             0 never, 1 in every step.
         stray_m: standard deviation, per axis, of the offset between the landmark and the point that
@@ -150,7 +152,8 @@ class FastSlam:
         self._best = 0
         self._n_observations = 0
         self._slot_of_label: dict[int, int] = {}
-        self._has_descriptors = self._has_labels = False
+        self._descriptor_kind: DescriptorKind | None = None
+        self._has_labels = False
         self._history = PathHistory() if keep_history else None
         self._drift_model = DriftModel()
 
@@ -179,8 +182,8 @@ class FastSlam:
 
         Raises:
             ValueError: odometry is not three finite numbers, a covariance is not positive definite,
-                or descriptors or labels that the association needs are missing. The filter is then
-                unchanged.
+                descriptors or labels that the association needs are missing, or descriptors are of
+                another kind than before. The filter is then unchanged.
         """
         odometry = np.asarray(odometry, dtype=np.float64)
         require_shape("odometry", odometry, (3,))
@@ -192,6 +195,9 @@ class FastSlam:
             values = getattr(observations, name)
             if values is None or (name == "label" and np.any(values == NO_LABEL)):
                 raise ValueError(f"{name}: observations have none, and the association needs it")
+        kind, known = observations.descriptor_kind, self._descriptor_kind
+        if kind is not None and known is not None and kind.differs_from(known):
+            raise ValueError(f"descriptor: is {kind}, earlier ones were {known}")
 
         # R_t (K, 3, 3) and log p_new (K,). A landmark seen once has lost its track. Without the
         # offset of its track, every match would be less likely than a new landmark where R is
@@ -220,7 +226,8 @@ class FastSlam:
                 assert observations.label is not None
                 labels = observations.label[rows].tolist()
                 self._slot_of_label.update(zip(labels, created.tolist(), strict=True))
-            self._has_descriptors |= observations.descriptor is not None
+            if self._descriptor_kind is None:
+                self._descriptor_kind = observations.descriptor_kind
             self._has_labels |= observations.label is not None
         maps.slots.last_frame[np.concatenate([changed, created])] = self._drift_model.frame
         pairs = np.stack([rows, created], axis=1)
@@ -268,9 +275,10 @@ class FastSlam:
             covariance_m2=covariance,
             count=known.count,
             source_observation=slots.source[which],
-            descriptor=slots.descriptor[which] if self._has_descriptors else None,
+            descriptor=None if self._descriptor_kind is None else slots.descriptor[which],
             label=slots.label[which] if self._has_labels else None,
             planar=self._planar,
+            descriptor_kind=self._descriptor_kind,
         )
 
     def best_path(self) -> Float:
@@ -375,7 +383,7 @@ class FastSlam:
                 seen,
                 settings.gate,
                 observations.descriptor,
-                settings.descriptor_threshold,
+                reach(settings.descriptor_threshold, observations.descriptor_kind),
             )
         else:
             pairs = candidate_pairs(self._maps, seen, settings.gate)

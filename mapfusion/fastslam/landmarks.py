@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.geometry.numerics import Float, kernel
-from mapfusion.tables import DESCRIPTOR_LENGTH, NO_LABEL
+from mapfusion.tables import NO_LABEL
 
 FREE = -1  # generation of an unused slot, and slot of an unused row
 COMMON = -2  # generation of a slot without a row: all particles share its common estimate
@@ -48,12 +48,15 @@ class Slots(NamedTuple):
     last_frame: np.ndarray  # (S,) last frame that showed it in any particle
     box_m: np.ndarray  # (S, 4) min_x, min_y, max_x, max_y of mean and gate over all particles
     block_box_m: np.ndarray  # (S / BLOCK, 4) around the boxes of BLOCK slots
-    descriptor: np.ndarray  # (S, 64) float32
+    descriptor: np.ndarray  # (S, D) float32; (S, 0) without descriptors
     label: np.ndarray  # (S,) int32
 
 
-def allocate(capacity: int, n_rows: int, n_particles: int) -> Slots:
-    """Return free slots (their number is a multiple of BLOCK) and free rows."""
+def allocate(capacity: int, n_rows: int, n_particles: int, length: int = 0) -> Slots:
+    """Return free slots (their number is a multiple of BLOCK) and free rows.
+
+    `length` is that of the descriptors; 0 without any.
+    """
     return Slots(
         _estimates(n_rows, n_particles),
         np.full(n_rows, FREE, dtype=np.int64),
@@ -64,7 +67,7 @@ def allocate(capacity: int, n_rows: int, n_particles: int) -> Slots:
         np.zeros(capacity, dtype=np.int64),
         np.tile(NOWHERE, (capacity, 1)),
         np.tile(NOWHERE, (capacity // BLOCK, 1)),
-        np.full((capacity, DESCRIPTOR_LENGTH), np.nan, dtype=np.float32),
+        np.full((capacity, length), np.nan, dtype=np.float32),
         np.full(capacity, NO_LABEL, dtype=np.int32),
     )
 
@@ -73,7 +76,8 @@ def grow(slots: Slots, n_slots: int, n_rows: int) -> Slots:
     """Return the slots with room for at least `n_slots` and `n_rows`; full arrays are doubled."""
     n_particles = slots.own.count.shape[1]
     if n_slots > len(slots.label):
-        wider = allocate(_doubled(len(slots.label), n_slots), 0, n_particles)
+        length = slots.descriptor.shape[1]
+        wider = allocate(_doubled(len(slots.label), n_slots), 0, n_particles, length)
         for new, old in zip([*wider.common, *wider[3:]], [*slots.common, *slots[3:]], strict=True):
             new[: len(old)] = old
         slots = wider._replace(own=slots.own, slot_of_row=slots.slot_of_row)

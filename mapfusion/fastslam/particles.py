@@ -147,6 +147,10 @@ class ParticleMaps:
         slots.generation[created] = self._genealogy.generation
         slots.source[created] = first_source + rows
         if observations.descriptor is not None:
+            length = observations.descriptor.shape[1]
+            if slots.descriptor.shape[1] != length:  # the first descriptors
+                looks = np.full((len(slots.label), length), np.nan, dtype=np.float32)
+                slots = self.slots = slots._replace(descriptor=looks)
             slots.descriptor[created] = observations.descriptor[rows]
         if observations.label is not None:
             slots.label[created] = observations.label[rows]

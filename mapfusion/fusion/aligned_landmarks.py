@@ -3,18 +3,19 @@
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.rigid_motion import motion_jacobian
+from mapfusion.descriptors import USURF, DescriptorKind, merged_kind, relative
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import transform_covariances, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import with_rows
-from mapfusion.tables import DESCRIPTOR_LENGTH, NO_LABEL
+from mapfusion.tables import NO_LABEL
 
 ABSENT = -1
 
@@ -33,10 +34,11 @@ class AlignedLandmarks:
         drift_m2: variance per axis of the map drift that is not part of `covariance_m2`, shape
             (N,).
         count: numbers of observations, shape (N,).
-        descriptor: descriptors, shape (N, 64); NaN if absent.
+        descriptor: vectors of the descriptors, shape (N, D); NaN if absent.
         label: labels, shape (N,); NO_LABEL if absent.
         parents: row of the landmark in each map, shape (N, M); ABSENT if the map lacks the
             landmark.
+        kind: kind of the descriptors; None without any.
     """
 
     position_m: Float
@@ -46,6 +48,7 @@ class AlignedLandmarks:
     descriptor: np.ndarray
     label: np.ndarray
     parents: np.ndarray
+    kind: DescriptorKind | None = None
 
     @classmethod
     def of(
@@ -80,14 +83,15 @@ class AlignedLandmarks:
             drift_m2 = np.zeros(n)
         parents = np.full((n, len(maps)), ABSENT, dtype=np.int64)
         parents[:, k] = np.arange(n)
-        descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan, np.float32)
+        kind = merged_kind(*(each.descriptor_kind for each in maps))
+        descriptor = np.full((n, USURF.length if kind is None else kind.length), np.nan, np.float32)
         if source.descriptor is not None:
             descriptor[:] = source.descriptor
         label = np.full(n, NO_LABEL, np.int32)
         if source.label is not None:
             label[:] = source.label
         position = transform_points(T_first_map, source.position_m)
-        return cls(position, covariance, drift_m2, source.count, descriptor, label, parents)
+        return cls(position, covariance, drift_m2, source.count, descriptor, label, parents, kind)
 
     def __len__(self) -> int:
         return len(self.position_m)
@@ -129,14 +133,16 @@ class AlignedLandmarks:
             np.where(b_observed_more[:, None] | np.isnan(a.descriptor), b.descriptor, a.descriptor),
             np.where(a.label == NO_LABEL, b.label, a.label),
             np.maximum(a.parents, b.parents),
+            self.kind,
         )
         unmatched = other[np.setdiff1d(np.arange(len(other)), others)]
-        columns = []
-        for name in AlignedLandmarks.__dataclass_fields__:
-            values = getattr(self, name).copy()
-            values[rows] = getattr(fused, name)
-            columns.append(np.concatenate([values, getattr(unmatched, name)]))
-        return AlignedLandmarks(*columns)
+        columns = dict[str, Any]()
+        for name, values in vars(self).items():
+            if isinstance(values, np.ndarray):
+                both = values.copy()
+                both[rows] = getattr(fused, name)
+                columns[name] = np.concatenate([both, getattr(unmatched, name)])
+        return AlignedLandmarks(**columns, kind=self.kind)
 
     def landmark_map(self, planar: bool, name: str) -> LandmarkMap:
         """Return the landmarks as a map without source observations."""
@@ -149,6 +155,7 @@ class AlignedLandmarks:
             None if np.all(self.label == NO_LABEL) else self.label,
             planar,
             name,
+            descriptor_kind=self.kind,
         )
 
 
@@ -183,7 +190,8 @@ class AssociationTest:
         same_a, same_b = np.nonzero(a.label[labelled_a][:, None] == b.label[labelled_b])
         i, j = self._gated(a, b)
         both_labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
-        distance = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
+        apart = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
+        distance = relative(apart, a.kind, b.kind)
         passes = ~both_labelled & (distance <= self.max_descriptor_distance)  # False for NaN
         return (
             np.concatenate([labelled_a[same_a], i[passes]]),

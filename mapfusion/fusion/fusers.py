@@ -129,7 +129,8 @@ class MergeParameters:
     Attributes:
         team: selection of consistent alignments between more than two maps.
         max_descriptor_distance: largest descriptor distance of landmarks that are associated
-            without an alignment; not used if both have labels.
+            without an alignment, 0.8 is the median of different landmarks; not used if both have
+            labels.
         gate_probability: probability that landmarks of the same point pass the gate (chi-square, 2
             degrees of freedom, drift included; joint fusion: fitted Student-t distribution).
         height: test of the heights; not used for planar maps and joint covariances.

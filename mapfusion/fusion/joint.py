@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 
 from mapfusion.align.alignment import MIN_PAIRS
+from mapfusion.descriptors import USURF, merged_kind, relative
 from mapfusion.fusion.aligned_landmarks import (
     ABSENT,
     AlignedLandmarks,
@@ -32,7 +33,7 @@ from mapfusion.geometry.numerics import Float, inverses, one_blas_thread
 from mapfusion.geometry.se2 import IDENTITY
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.robust_loss import student_bound
-from mapfusion.tables import DESCRIPTOR_LENGTH, NO_LABEL
+from mapfusion.tables import NO_LABEL
 
 _SOURCE_UNKNOWN = -1  # a fused landmark has no source observation
 
@@ -61,7 +62,8 @@ class JointlyFused:
         given = [self.component.maps[k] for k in members]
         n, has = len(self.points), self.points != ABSENT
         count, largest_count = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        descriptor = np.full((n, DESCRIPTOR_LENGTH), np.nan, np.float32)
+        kind = merged_kind(*(own.descriptor_kind for own in given))
+        descriptor = np.full((n, USURF.length if kind is None else kind.length), np.nan, np.float32)
         label = np.full(n, NO_LABEL, np.int32)
         for k, own in enumerate(given):
             rows, landmarks = np.flatnonzero(has[:, k]), self.points[has[:, k], k]
@@ -83,6 +85,7 @@ class JointlyFused:
             self.component.planar,
             given[0].name,
             joint,
+            descriptor_kind=kind,
         )
 
         # duplicates are found by the independent errors, because shared errors move both landmarks
@@ -268,7 +271,8 @@ def _candidates(
             i, j = _neighbours(placed[a], placed[b], bound)
             unlabelled = (labels[a][i] == NO_LABEL) | (labels[b][j] == NO_LABEL)
             i, j = i[unlabelled], j[unlabelled]
-            distance = np.linalg.norm(first[i] - second[j], axis=1).astype(np.float64)
+            apart = np.linalg.norm(first[i] - second[j], axis=1).astype(np.float64)
+            distance = relative(apart, given[a].descriptor_kind, given[b].descriptor_kind)
             similar = distance <= parameters.max_descriptor_distance
             i, j, distance = i[similar], j[similar], distance[similar]
 

@@ -21,9 +21,9 @@ from mapfusion.align.correspondences import (
     Correspondences,
     MatchParameters,
     match,
-    why_not_unit_vectors,
 )
 from mapfusion.align.rigid_motion import residuals
+from mapfusion.descriptors import DescriptorKind, require_one_kind
 from mapfusion.errors import InputError
 from mapfusion.files import Write, write_together
 from mapfusion.fusion.fusers import (
@@ -510,23 +510,32 @@ def numbered_path(path: Path, k: int) -> Path:
     return path if k == 1 else path.with_stem(f"{path.stem}.{k}")
 
 
-def load_map(given: "MapLike", name: str = "map", sigma_m: float | None = None) -> LandmarkMap:
-    """Return a map given as such, by path or as a table, which is then named `name`.
+def load_maps(
+    given: Mapping[str, "MapLike"], sigma_m: float | None = None, descriptor_metric: str = ""
+) -> list[LandmarkMap]:
+    """Return maps given as such, by path or as tables.
 
-    `sigma_m` is the standard deviation per axis of landmarks without columns of covariances.
+    Args:
+        given: the maps by the names of those that are tables.
+        sigma_m: standard deviation per axis of landmarks without covariances.
+        descriptor_metric: metric of descriptors that state none.
 
     Raises:
-        InputError: a file or a table is not as documented, or descriptors are no unit vectors.
+        InputError: a file or a table is not as documented, or descriptors are of different kinds.
     """
-    if isinstance(given, LandmarkMap):
-        landmarks, place = given, given.name
-    elif isinstance(given, str | os.PathLike):
-        landmarks, place = read_map(Path(given), sigma_m=sigma_m), os.fspath(given)
-    else:
-        landmarks, place = LandmarkMap.from_pandas(given, name, sigma_m), name
-    if why := why_not_unit_vectors(landmarks):
-        raise InputError(f"{place}: {why}")
-    return landmarks
+    loaded, kinds = list[LandmarkMap](), list[tuple[str, DescriptorKind | None]]()
+    for name, each in given.items():
+        if isinstance(each, LandmarkMap):
+            landmarks, place = each, f"map {each.name}"
+        elif isinstance(each, str | os.PathLike):
+            landmarks, place = read_map(Path(each), False, sigma_m, descriptor_metric), str(each)
+        else:
+            own = LandmarkMap.from_pandas(each, name, sigma_m, descriptor_metric)
+            landmarks, place = own, name
+        loaded.append(landmarks)
+        kinds.append((place, landmarks.descriptor_kind))
+    require_one_kind(kinds)
+    return loaded
 
 
 def _registration(aligner: "str | Method | Aligner | Registration") -> Registration:
@@ -549,6 +558,7 @@ def align_maps(
     correspondences: Correspondences | None = None,
     evidence: PairEvidence | None = None,
     sigma_m: float | None = None,
+    descriptor_metric: str = "",
     rng: np.random.Generator | int = 0,
 ) -> MapAlignment:
     """Align two maps: match their landmarks, estimate T_a_b, refine and verify it.
@@ -563,13 +573,15 @@ def align_maps(
         correspondences: correspondences found earlier for these maps; None to match them.
         evidence: evidence found earlier for these maps; None to compute it.
         sigma_m: standard deviation per axis of landmarks without covariances.
+        descriptor_metric: metric of descriptors that state none: `euclidean`, `cosine` or
+            `hamming`; empty: that of their type and length.
         rng: generator, or its seed.
 
     Raises:
-        InputError: a map cannot be read.
+        InputError: a map cannot be read, or the descriptors are of different kinds.
         ValueError: the aligner is unknown.
     """
-    a, b = load_map(map_a, "a", sigma_m), load_map(map_b, "b", sigma_m)
+    a, b = load_maps({"a": map_a, "b": map_b}, sigma_m, descriptor_metric)
     registration = _registration(aligner)
     pairs = match(a, b, matching) if correspondences is None else correspondences
     ready = registration.on(a, b, pairs, evidence)
@@ -587,6 +599,7 @@ def merge_maps(
     fuser: str | Fuser = USUAL,
     parameters: MergeParameters = MergeParameters(),  # noqa: B008  # frozen
     sigma_m: float | None = None,
+    descriptor_metric: str = "",
     rng: "int | Callable[[LandmarkMap, LandmarkMap], np.random.Generator]" = 0,
 ) -> MergedMaps:
     """Align all pairs of maps, and fuse the maps that accepted alignments connect.
@@ -601,15 +614,18 @@ def merge_maps(
         fuser: name of a fuser, or a fuser.
         parameters: parameters of the merge.
         sigma_m: standard deviation per axis of landmarks without covariances.
+        descriptor_metric: metric of descriptors that state none.
         rng: seed of the generator of each pair, or a function that returns this generator.
 
     Raises:
-        InputError: there are fewer than two maps, or a map cannot be read.
+        InputError: there are fewer than two maps, a map cannot be read, or the descriptors are of
+            different kinds.
         ValueError: the aligner or the fuser is unknown.
     """
     if len(maps) < 2:
         raise InputError("merge: give two maps or more")
-    loaded = tuple(load_map(each, f"map {k}", sigma_m) for k, each in enumerate(maps, start=1))
+    named = {f"map {k}": each for k, each in enumerate(maps, start=1)}
+    loaded = tuple(load_maps(named, sigma_m, descriptor_metric))
     places = [os.fspath(each) if isinstance(each, str | os.PathLike) else "" for each in maps]
     order = sorted(range(len(maps)), key=lambda k: (name_order(loaded[k].name), places[k]))
     alignments, pairs = dict[tuple[int, int], MapAlignment](), list[AlignedPair]()

@@ -14,6 +14,7 @@ from mapfusion.align.frames import (
     moved_motion,
     origin_of,
 )
+from mapfusion.descriptors import require_one_kind
 from mapfusion.fusion.fusers import (
     AlignedPair,
     Component,
@@ -87,8 +88,10 @@ def merge(
 
     Raises:
         ValueError: the pairs do not fit the maps, or there are fewer than two maps.
+        InputError: the descriptors are of different kinds.
     """
     _require_valid_pairs(maps, pairs)
+    require_one_kind([(f"map {each.name}", each.descriptor_kind) for each in maps])
     origins, height = [origin_of(each) for each in maps], _heights(len(maps), pairs)
     local = [in_local_frame(*each) for each in zip(maps, origins, height.tolist(), strict=True)]
     pairs = [_in_local_frames(pair, origins) for pair in pairs]
@@ -159,8 +162,10 @@ def connect(
 
     Raises:
         ValueError: the pairs do not fit the maps, or there are fewer than two maps.
+        InputError: the descriptors are of different kinds.
     """
     _require_valid_pairs(maps, pairs)
+    require_one_kind([(f"map {each.name}", each.descriptor_kind) for each in maps])
     # Sort maps by name, so that the result does not depend on their order.
     rank = np.empty(len(maps), dtype=np.int64)
     by_rank = np.array(sorted(range(len(maps)), key=lambda k: name_order(maps[k].name)))

@@ -442,7 +442,9 @@ def smoothed_map(
         log.robot,
     )
     viewing = viewing_of_log(log, landmark, smoothed.estimate.path, source)
-    return LandmarkMap(point, joint.marginal_m2, *about, joint, viewing, log.calibration)
+    kind = source_observation.descriptor_kind
+    more = joint, viewing, log.calibration
+    return LandmarkMap(point, joint.marginal_m2, *about, *more, descriptor_kind=kind)
 
 
 def with_path_errors(

@@ -9,6 +9,7 @@ import numpy as np
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
+from mapfusion.descriptors import reach
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import inverse, rotation, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -105,7 +106,7 @@ class MatchGates(NamedTuple):
         distance_m: distance in the plane.
         height_bound: squared difference of heights over its variance; infinite for planar maps.
         height_floor_m2: variance of a height difference beyond the landmarks' own variances.
-        unlike: descriptor distance.
+        unlike: Euclidean distance of the descriptors' vectors.
     """
 
     distance_m: float
@@ -342,7 +343,8 @@ class ViewedMapPair:
         height = HeightGate()
         planar = a.landmarks.planar or b.landmarks.planar
         bound = np.inf if planar else height.bound
-        unlike = parameters.max_descriptor_distance
+        kinds = a.landmarks.descriptor_kind, b.landmarks.descriptor_kind
+        unlike = reach(parameters.max_descriptor_distance, *kinds)
         self._gates = MatchGates(parameters.gate_m, bound, height.floor_m**2, unlike)
         # matches and visibility of all landmarks of a map (first key: True for map a) by motion
         self._found: dict[tuple[bool, bytes], np.ndarray] = {}

@@ -310,8 +310,9 @@ def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
     square = np.vecdot(e, np.linalg.solve(S + 1e-18 * np.eye(2), e[..., None])[..., 0])
     coincide = square <= chi_square_bound(_COPY_CHANCE, 2)
     copied = coincide.copy()
-    a, b = pairs.map_a.descriptor, pairs.map_b.descriptor
-    if a is not None and b is not None:
+    a, b, kind = pairs.map_a.descriptor, pairs.map_b.descriptor, pairs.map_a.descriptor_kind
+    # bits that do not differ may be those of another observation
+    if a is not None and b is not None and kind is not None and kind.metric != "hamming":
         copied |= np.all(a[used.index_a] == b[used.index_b], axis=1)
     n, of = int(np.count_nonzero(copied)), len(used)
     if n < MIN_PAIRS:

@@ -19,6 +19,7 @@ from mapfusion.align.correspondences import (
 from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
+from mapfusion.descriptors import reach, relative
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import rms_distance_m, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -107,7 +108,7 @@ def similar_landmarks(landmarks: LandmarkMap) -> Correspondences:
     gates = bound, height.floor_m**2, _ELSEWHERE_M
     nearest, distance2, _ = nearest_descriptors(landmarks, landmarks, *gates)
     rows = np.arange(n)
-    unlike = np.sqrt(np.maximum(distance2, 0.0))
+    unlike = relative(np.sqrt(np.maximum(distance2, 0.0)), landmarks.descriptor_kind)
     kept = (nearest >= 0) & (nearest[nearest] == rows) & (unlike <= _UNLIKE)
     return Correspondences(rows[kept], nearest[kept], unlike[kept])
 
@@ -206,6 +207,7 @@ def mirror_image_motion(
         own.name,
         size_m=own.size_m,
         category=own.category,
+        descriptor_kind=own.descriptor_kind,
     )
     found = match(pairs.map_a, image, matching) if pairs.by_geometry else pairs.correspondences
     of_image = Pairs(pairs.map_a, image, found)
@@ -269,7 +271,8 @@ def explained_landmarks(
     row_a, row_b = near["i"], near["j"]
     if map_a.descriptor is not None and map_b.descriptor is not None:
         off = map_a.descriptor[row_a] - map_b.descriptor[row_b]
-        row_b = row_b[np.linalg.norm(off, axis=1) <= _UNLIKE]
+        unlike = reach(_UNLIKE, map_a.descriptor_kind, map_b.descriptor_kind)
+        row_b = row_b[np.linalg.norm(off, axis=1) <= unlike]
     explained = np.zeros(len(map_b), np.bool_)
     explained[row_b] = True
     return explained

@@ -1,19 +1,22 @@
 """Visual front end: landmark observations from stereo pairs, or from images with depths."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
 
 from mapfusion.camera import StereoCamera
+from mapfusion.descriptors import USURF
 from mapfusion.geometry.numerics import Float
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import Observations
 from mapfusion.vision.depth import DepthParameters, match_depth
+from mapfusion.vision.descriptors import NamedDescriber, target_of
 from mapfusion.vision.harris import HarrisParameters, detect
 from mapfusion.vision.stereo import MatchStatus, StereoParameters, match
-from mapfusion.vision.surf import USurfParameters, describe
+from mapfusion.vision.surf import USurfParameters
 from mapfusion.vision.tracking import Features, Tracker, TrackParameters, Tracks, cut_patches
 
 
@@ -22,7 +25,10 @@ class FrontEndParameters:
     """Parameters of the front end.
 
     Attributes:
-        harris, stereo, usurf, tracks: parameters of the parts.
+        harris, stereo, tracks: parameters of the parts.
+        descriptor: name of the descriptor: `usurf` (the paper's), `sift`, `orb`, that of a plug-in,
+            or `FILE.py:CLASS`.
+        usurf: window of the descriptor, whichever it is.
         sigma_uv_px: standard deviation of the position of a track's point along each image axis.
         max_depth_m: largest depth of an observed point; farther points are tracked only. The
             default is about the length of a room, so that a robot that looks along the room still
@@ -32,6 +38,7 @@ class FrontEndParameters:
 
     harris: HarrisParameters = field(default_factory=HarrisParameters)
     stereo: StereoParameters = field(default_factory=StereoParameters)
+    descriptor: str = USURF.name
     usurf: USurfParameters = field(default_factory=USurfParameters)
     tracks: TrackParameters = field(default_factory=TrackParameters)
     sigma_uv_px: Annotated[float, Range(1e-3, 100, "px")] = 0.08
@@ -40,6 +47,7 @@ class FrontEndParameters:
 
     def __post_init__(self) -> None:
         require_in_range(self)
+        target_of(self.descriptor)
 
 
 @dataclass(frozen=True)
@@ -81,9 +89,13 @@ class FrontEnd:
         uv, disparity = corners[matched], matches.disparity_px[matched]
         depth = self.camera.focal_px * self.camera.baseline_m / disparity
         scale = self.parameters.usurf.scales_px(depth, self.camera.focal_px)
-        descriptor = describe(left, uv, scale)
+        descriptor, kind = self._describer.describe(left, uv, scale)
         sigma, slope = matches.sigma_px[matched], matches.slope[matched]
-        return Features(uv, disparity, sigma, descriptor, slope, cut_patches(left, uv))
+        return Features(uv, disparity, sigma, descriptor, slope, cut_patches(left, uv), kind)
+
+    @cached_property
+    def _describer(self) -> NamedDescriber:
+        return NamedDescriber(self.parameters.descriptor)
 
 
 def observable(
@@ -165,6 +177,7 @@ class Observer:
             found.descriptor[rows],
             uvd_px=uvd,
             track=tracks.track_id[rows],
+            descriptor_kind=found.kind,
         )
         return ObservedFrame(tracks, rows, observations)
 
@@ -173,6 +186,8 @@ def concatenate_observations(frames: Sequence[Observations]) -> tuple[np.ndarray
     """Return iterations (N,) and observations of a log from the observations of its frames."""
     iteration = np.repeat(np.arange(len(frames)), [len(own) for own in frames])
     names = ("position_m", "covariance_m2", "descriptor", "uvd_px", "track")
-    return iteration, Observations(
-        **{name: np.concatenate([getattr(own, name) for own in frames]) for name in names}
-    )
+    joined = {name: np.concatenate([getattr(own, name) for own in frames]) for name in names}
+    kind = frames[0].descriptor_kind if frames else None
+    if kind is not None and kind != USURF:
+        kind = replace(kind, reference=None)  # that of all frames
+    return iteration, Observations(**joined, descriptor_kind=kind)

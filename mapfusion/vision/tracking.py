@@ -10,9 +10,9 @@ from typing import Annotated
 import numpy as np
 
 from mapfusion.camera import StereoCamera
+from mapfusion.descriptors import USURF, DescriptorKind, reach
 from mapfusion.geometry.numerics import Float, kernel, require_finite, require_shape
 from mapfusion.parameters import Probability, Range, require_in_range
-from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.patch_alignment import Templates, fit_patches
 from mapfusion.vision.visual_odometry import RigidMotion, estimate_rigid_motion
 
@@ -36,11 +36,12 @@ class Features:
         uv_px: position in the left image, shape (N, 2).
         disparity_px: positive disparity, shape (N,).
         sigma_disparity_px: standard deviation of the disparity, shape (N,).
-        descriptor: descriptors of unit length, shape (N, 64) float32.
+        descriptor: vectors of the descriptors, shape (N, D) float32.
         slope: change of the disparity along u and v on the corner's surface, shape (N, 2); None if
             unknown.
         patch: patches of the left image from `cut_patches`, shape (N, P, P) uint8. Without patches
             the tracked points are the corners themselves.
+        kind: kind of the descriptors.
     """
 
     uv_px: Float
@@ -49,13 +50,15 @@ class Features:
     descriptor: np.ndarray
     slope: Float | None = None
     patch: np.ndarray | None = None
+    kind: DescriptorKind = USURF
 
     def __post_init__(self) -> None:
         n = len(self.uv_px)
         require_shape("uv_px", self.uv_px, (n, 2))
         require_shape("disparity_px", self.disparity_px, (n,))
         require_shape("sigma_disparity_px", self.sigma_disparity_px, (n,))
-        require_shape("descriptor", self.descriptor, (n, DESCRIPTOR_LENGTH))
+        require_shape("descriptor", self.descriptor, (n, self.kind.length))
+        object.__setattr__(self, "kind", self.kind.on(self.descriptor))
         if self.slope is not None:
             require_shape("slope", self.slope, (n, 2))
             require_finite("slope", self.slope)
@@ -229,7 +232,8 @@ class TrackParameters:
         max_shift_v_px: largest motion across rows; driving moves near points outwards.
         max_disparity_ratio: largest ratio of two disparities, by the robot's step at the smallest
             depth and by noise at the largest.
-        max_descriptor_distance: largest distance of two descriptors of unit length.
+        max_descriptor_distance: largest distance of two descriptors of any kind; 0.8 is the median
+            of different points.
         noise_grey: standard deviation of the noise of one image, grey levels.
         max_misfit_px: error of the point's position that the fit of its patch tolerates besides
             noise. A larger difference of the patches ends the track.
@@ -387,6 +391,7 @@ def link(
         Row in `previous` of each feature of `current`, or -1, shape (N,).
     """
     steps = min(steps, _LONGEST_PAUSE)
+    unlike = reach(parameters.max_descriptor_distance, previous.kind, current.kind)
     return _link_mutually(
         previous.uv_px,
         previous.disparity_px,
@@ -397,7 +402,7 @@ def link(
         steps * parameters.max_shift_u_px,
         steps * parameters.max_shift_v_px,
         parameters.max_disparity_ratio**steps,
-        parameters.max_descriptor_distance**2,
+        unlike**2,
     )
 
 

@@ -60,6 +60,12 @@ def test_the_page_s_example_gives_the_map_of_both_robots(tmp_path: Path):
     assert np.hypot(*error[:2]) < 0.15
     assert abs(wrap(error[2])) < 0.05
     assert told["common"].sum() > 30
+    orb = told["orb_merged"]
+    np.testing.assert_allclose(orb.alignments[0, 1].T_a_b, [3, -1, 0.5], atol=0.02)
+    assert (tmp_path / "orb.png").stat().st_size > 10_000
+    written = mapfusion.read_map(tmp_path / "orb.csv")
+    assert str(written.descriptor_kind) == "hamming, 256 bits"
+    assert len(written) == 80
     fused = mapfusion.read_map(tmp_path / "fused.parquet")
     assert len(fused) == len(told["map_a"]) + len(told["map_b"]) - told["common"].sum()
 

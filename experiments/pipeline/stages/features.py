@@ -7,7 +7,7 @@ are stored (for figure 1).
 import itertools
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -19,20 +19,23 @@ import pyarrow as pa
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from mapfusion.camera import StereoCamera
+from mapfusion.descriptors import USURF, kind_from, pack_bits, stated_metric, unpack_bits
 from mapfusion.files import (
     POSITION_FIELDS,
     column,
     columns,
     float_fields,
     named_columns,
+    read_parquet,
     read_table,
+    require_kind,
     schema,
+    text_attributes,
     write_table,
     write_whole,
 )
 from mapfusion.geometry.numerics import Float, generator
 from mapfusion.robot_log import with_rows
-from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
 from mapfusion.vision.tracking import PATCH_SIDE_PX, Features
 from sim.renderer import Renderer
@@ -49,12 +52,13 @@ _SLOPE = ["disparity_per_u", "disparity_per_v"]
 _NUMBER = np.dtype("<f4")  # number of a descriptor
 FEATURES = schema(
     "features",
-    3,
+    4,
     [
         pa.field("iteration", pa.int32()),
         *float_fields([*_PIXEL, "disparity_px", "sigma_disparity_px", *_SLOPE]),
         # as bytes, because lists are written and read number by number
-        pa.field("descriptor", pa.binary(_NUMBER.itemsize * DESCRIPTOR_LENGTH)),
+        # (the length is that of U-SURF; other descriptors have another one)
+        pa.field("descriptor", pa.binary(_NUMBER.itemsize * USURF.length)),
         pa.field("patch", pa.binary(PATCH_SIDE_PX**2)),
     ],
 )
@@ -77,6 +81,7 @@ class FeatureSettings:
     renderer: Renderer
     drawn_by: str  # name and version of the renderer on this machine
     vision: FrontEndParameters  # corners, stereo and descriptors; the rest has default values
+    origin: str  # code of a plug-in that describes the corners; empty for ours
     images_at: int
     images: int
 
@@ -136,12 +141,26 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
         name: np.concatenate([getattr(found, name) for found in features])
         for name in ("uv_px", "slope", "descriptor", "patch", *_ONE_EACH)
     }
-    joined["descriptor"] = joined["descriptor"].astype(_NUMBER, copy=False).view(np.uint8)
+    # bits are packed; other numbers have four bytes each
+    kind, looks = features[0].kind, joined["descriptor"]
+    if kind.metric == "hamming":
+        joined["descriptor"] = pack_bits(looks)
+    else:
+        joined["descriptor"] = looks.astype(_NUMBER, copy=False).view(np.uint8)
     joined |= named_columns(_PIXEL, joined["uv_px"]) | named_columns(_SLOPE, joined["slope"])
     joined["iteration"] = np.repeat(np.array(frames), [len(found) for found in features])
     write_table(truth_path, named_columns(TRUTH.names, np.concatenate(truth)), TRUTH)
-    write_table(features_path, joined, FEATURES)
+    if kind != USURF:  # the reference is that of each frame
+        kind = replace(kind, reference=None)
+    written = _schema(joined["descriptor"].shape[1])
+    write_table(features_path, joined, written, kind.attributes())
     return {"rendering_s": rendering_s}
+
+
+def _schema(n_bytes: int) -> pa.Schema:
+    """Return the schema of features whose descriptors have `n_bytes` bytes."""
+    at = FEATURES.get_field_index("descriptor")
+    return FEATURES.set(at, FEATURES.field(at).with_type(pa.binary(n_bytes)))
 
 
 FEATURES_STAGE = StageKind("features", "render and find features", run, WRITES)
@@ -170,11 +189,18 @@ def read_features(folder: Path, n_frames: int) -> Iterator[tuple[Features, TrueP
     """Features and what is truly behind them, frame by frame, in order."""
     for part in chunks(n_frames):
         truth_path, features_path = (folder / name.format(part=part) for name in WRITES)
-        table, _ = read_table(features_path, FEATURES)
+        table = read_parquet(features_path, "features table")
+        attributes = text_attributes(features_path, table)
+        looks = column(table, "descriptor")
+        require_kind(features_path, table, attributes, _schema(looks.shape[-1]))
+        packed = stated_metric(attributes) == "hamming"
+        looks = unpack_bits(looks) if packed else looks.view(_NUMBER)
+        kind = kind_from(attributes, looks.shape[1])
         found = Features(
             columns(table, _PIXEL),
             **{name: column(table, name) for name in _ONE_EACH},
-            descriptor=column(table, "descriptor").view(_NUMBER),
+            descriptor=looks,
+            kind=USURF if kind is None else kind,
             slope=columns(table, _SLOPE),
             patch=column(table, "patch").reshape(-1, PATCH_SIDE_PX, PATCH_SIDE_PX),
         )

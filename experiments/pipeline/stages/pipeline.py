@@ -34,6 +34,8 @@ from mapfusion.fusion.fusers import FUSERS, make_fuser, name_order, target_of
 from mapfusion.robot_log import read_log
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.tables import is_csv, table_path
+from mapfusion.vision.descriptors import DESCRIBERS
+from mapfusion.vision.descriptors import target_of as descriptor_target
 from mapfusion.vision.front_end import FrontEndParameters
 from sim.renderer import renderer_name, require_pybullet
 from sim.textures import STYLES
@@ -171,13 +173,19 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
     before = {"drive": driven, "faces": _stage(drive.FACES_STAGE, scenario, world, own=to_paint)}
     n_frames, drawn_by = scenario.drive.frames, renderer_name(render.renderer)
     vision, unread = scenario.vision, FrontEndParameters()
-    finding = replace(unread, harris=vision.harris, stereo=vision.stereo, usurf=vision.usurf)
-    tracking = replace(vision, harris=unread.harris, stereo=unread.stereo, usurf=unread.usurf)
+    found_by = ("harris", "stereo", "descriptor", "usurf")
+    finding = replace(unread, **{name: getattr(vision, name) for name in found_by})
+    tracking = replace(vision, **{name: getattr(unread, name) for name in found_by})
+    origin = ""
+    if vision.descriptor not in DESCRIBERS:
+        target = descriptor_target(vision.descriptor)
+        file, module = target.rpartition(":")[0], target.partition(".")[0]
+        origin = f"{target} {fingerprint(file if file.endswith('.py') else module)}"
     for robot in scenario.robots:
         own = {"robot": robot.name, "n_frames": n_frames, "drawn_by": drawn_by}
         own["radiometry"] = robot.radiometry or scenario.radiometry
         own["odometry"] = robot.odometry or scenario.odometry
-        chunks, to_find = features.chunks(n_frames), own | {"vision": finding}
+        chunks, to_find = features.chunks(n_frames), own | {"vision": finding, "origin": origin}
         extracted = _stage(
             features.FEATURES_STAGE,
             scenario,

@@ -339,6 +339,7 @@ class Snapshots(Mapping[int, LandmarkMap]):
             made = replace(
                 landmarks,
                 descriptor=None if seen.descriptor is None else seen.descriptor[origin],
+                descriptor_kind=seen.descriptor_kind,
                 label=None if seen.label is None else seen.label[origin],
                 planar=log.planar,
                 name=log.robot,

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from experiments.evaluation.single_steps import align, alignment_row, merge
@@ -133,21 +134,32 @@ def test_accepted_estimates_can_be_required(
         assert reply.complaints == [f"mapfusion: {a} and {c}: no estimate of T_a_b is accepted"]
 
 
-@pytest.mark.parametrize(
-    ("factor", "said"),
-    [(8.0, "norm 8"), (0.1, "norm 0.1"), (0.0, "norm 0, expected 1 (1 of 60 rows); give NaN")],
-)
-def test_descriptors_that_are_no_unit_vectors_are_refused_once(
-    described: list[Path], factor: float, said: str, capsys: pytest.CaptureFixture[str]
+def test_descriptors_of_different_kinds_are_refused_once(
+    described: list[Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     a, b, _ = described
     landmarks = read_map(b)
-    look = np.array(landmarks.descriptor)
-    rows = slice(7, 8) if factor == 0 else slice(7, None)
-    look[rows] *= factor
-    write_map(b, replace(landmarks, descriptor=look))
+    bits = np.random.default_rng(0).integers(0, 256, (len(landmarks), 32)).astype(np.uint8)
+    write_map(b, replace(landmarks, descriptor=bits, descriptor_kind=None))
+    said = (f"{b} has descriptors of another kind (hamming, 256 bits) than {a}", "(usurf)")
     for words in (("align", a, b), ("merge", a, b, "-o", b.with_name("f.parquet"))):
-        assert_refused(command(capsys, *words), f"{b}: descriptor: row 7 has", said)
+        assert_refused(command(capsys, *words), *said)
+
+
+def test_the_metric_of_a_csv_is_stated_by_an_option(
+    described: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bits = np.random.default_rng(0).integers(0, 256, (60, 32)).astype(np.uint8)
+    paths = []
+    for path in described[:2]:
+        landmarks = replace(read_map(path), descriptor=None)
+        table = landmarks.to_pandas().join(pd.DataFrame(bits, columns=[f"d{k}" for k in range(32)]))
+        paths.append(path.with_suffix(".csv"))
+        table.to_csv(paths[-1], index=False)
+    reply = command(capsys, "align", *paths, *ONE, "--descriptor-metric", "hamming", "--json")
+    assert reply.complaints == []
+    wrong = command(capsys, "align", *paths, *ONE, "--descriptor-metric", "haming")
+    assert_refused(wrong, "descriptor_metric: is 'haming'", "did you mean hamming?")
 
 
 def test_align_and_merge_state_the_same_about_exact_labelled_maps(tmp_path: Path) -> None:

@@ -71,6 +71,7 @@ TOLD = {
     "vision": "observed",
     "vision.harris": "features",
     "vision.stereo": "features",
+    "vision.descriptor": "features",
     "vision.usurf": "features",
     "slam": "slam",
     "slam.filter.motion": "slam smooth fuse",
@@ -112,7 +113,7 @@ NO_OTHER_VALUE = {
     *(f"fuse.fusers.{i}" for i in range(len(FUSERS))),
 }
 WORDS = ("motion", "informed", "label", "descriptor", "solved", "ransac", "svd")
-WORDS += ("other", "raycast", "pixels", "drop", "stated")
+WORDS += ("orb", "other", "raycast", "pixels", "drop", "stated")
 
 
 def stages_of(scenario: Simulation) -> list[Stage]:

@@ -22,8 +22,8 @@ from experiments.studies.refusal_rates import Rate, share_up_to, summary
 from experiments.studies.refusal_trial import STATED, accepted_motions, calibrate, points_on_walls
 from mapfusion.align.correspondences import MatchParameters
 from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.descriptors import USURF
 from mapfusion.geometry import se2
-from mapfusion.tables import DESCRIPTOR_LENGTH
 from mapfusion.verification.false_alarms import Acceptance, fewest_false_alarms, independent_pairs
 from tests.helpers.made_up_maps import ITERATION, robot
 from tests.helpers.tiny_scenario import command
@@ -34,7 +34,7 @@ MATCHING = MatchParameters(max_descriptor_distance=0.3)
 def described(name: str, points: np.ndarray, T_world_map: list[float], seed: int):
     """Return a robot with one map whose descriptors depend on the seed."""
     made = robot(name, points, np.array(T_world_map))
-    vectors = np.random.default_rng(seed).standard_normal((len(points), DESCRIPTOR_LENGTH))
+    vectors = np.random.default_rng(seed).standard_normal((len(points), USURF.length))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     made.maps[ITERATION] = replace(
         made.maps[ITERATION], descriptor=vectors.astype(np.float32), name=name

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapfusion.align.correspondences import Correspondences
+from mapfusion.descriptors import USURF
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.tables import DESCRIPTOR_LENGTH
 
 SIZE_M = np.array([20.0, 20.0, 2.5])
 
@@ -47,7 +47,7 @@ def motion(rng):
 
 
 def unit_vectors(rng, n):
-    vectors = rng.standard_normal((n, DESCRIPTOR_LENGTH))
+    vectors = rng.standard_normal((n, USURF.length))
     return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
 
 

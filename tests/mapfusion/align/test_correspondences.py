@@ -11,6 +11,7 @@ from mapfusion.align.correspondences import (
     match,
     scale_note,
 )
+from mapfusion.descriptors import USURF
 from mapfusion.tables import NO_LABEL
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
@@ -20,7 +21,8 @@ def two_maps(rng, n=120, noise=0.03):
     p = rng.uniform(0, 3, (n, 3))
     order = rng.permutation(n)
     other = descriptor[order] + rng.normal(0, noise, (n, 64)).astype(np.float32)
-    return landmarks(p, descriptor=descriptor), landmarks(p[order], descriptor=other), order
+    maps = landmarks(p, descriptor=descriptor), landmarks(p[order], descriptor=other)
+    return *(replace(each, descriptor_kind=USURF) for each in maps), order
 
 
 def slow_match(a, b, parameters):
@@ -193,11 +195,6 @@ def test_the_test_that_left_too_few_pairs_is_named():
     said = told_apart(a, replace(b, descriptor=off), max_descriptor_distance=0.05)
     assert "40 mutually nearest descriptors, 0 at most 0.05 apart (median 0.08" in said
     assert "different kinds" in said
-    bytes_of = [replace(m, descriptor=100 * m.descriptor) for m in (a, b)]
-    bytes_of[1] = replace(bytes_of[1], descriptor=bytes_of[1].descriptor + 1.0)
-    said = told_apart(*bytes_of)
-    assert "0 at most 0.6 apart (median 8)" in said
-    assert "norm 100" in said
     named = [replace(m, descriptor=None) for m in (a, b)]
     said = told_apart(replace(named[0], label=label), replace(named[1], label=label + 100))
     assert "none are labels of both maps" in said

@@ -8,6 +8,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from mapfusion.align.nearest_neighbours import Grid
 from mapfusion.align.refinement import Refinement
+from mapfusion.descriptors import USURF
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance
@@ -70,7 +71,8 @@ def random_map(n: int, seed: int) -> LandmarkMap:
     descriptor[3] = np.nan
     covariance = np.tile(0.01 * np.eye(3), (n, 1, 1))
     counts = np.full(n, 3, np.int32)
-    return LandmarkMap(rng.uniform(0, 4, (n, 3)), covariance, counts, np.arange(n), descriptor)
+    about = covariance, counts, np.arange(n), descriptor
+    return LandmarkMap(rng.uniform(0, 4, (n, 3)), *about, descriptor_kind=USURF)
 
 
 def test_equals_all_pairs() -> None:
