@@ -414,8 +414,7 @@ def summarise(runs: Runs) -> Summary:
     for table, (columns, name, made_of, seed) in _FURTHER.items():
         if table not in missing:
             rows = runs.read(table, columns)
-            parts = [made.get(name), _each(rows, made_of, seed)]
-            made[name] = pd.concat(parts, ignore_index=True)
+            made[name] = _joined([made.get(name, pd.DataFrame()), _each(rows, made_of, seed)])
             timings = rows if table == "aligner_timings" else timings
     made = {name: table for name, table in made.items() if len(table)}
     worlds = runs.described[["scenario", "seed"]].drop_duplicates()
@@ -485,4 +484,10 @@ def _each(
         for place, (name, value) in enumerate(labels.items()):
             part.insert(place, name, value)
         parts.append(part)
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Concatenate tables without the empty ones, whose columns would turn counts into floats."""
+    parts = [part for part in parts if len(part)]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()

@@ -11,6 +11,9 @@ from experiments.evaluation.path_errors import STATISTICS
 from experiments.studies.comparison import compare
 from experiments.studies.intervals import wilson
 from experiments.studies.statistics import (
+    ALL_SCENARIOS,
+    _each,
+    alignment_nees,
     error_bands,
     fuser_summary,
     medians_of_run,
@@ -340,3 +343,21 @@ def test_consistent_planar_maps_and_others_keep_to_the_band_together() -> None:
     table = nees_of_pairs(fusion, rng).set_index("landmarks")["nees_per_dof"]
     expected = fusion["nees_with_drift"].sum() / fusion["degrees_of_freedom"].sum()
     assert table.tolist() == pytest.approx([expected, 4 * expected])
+
+
+def test_counts_stay_integers_where_a_scenario_accepts_nothing() -> None:
+    rows = pd.DataFrame(
+        {
+            "run_id": ["x", "y"],
+            "scenario": ["apart", "quick"],
+            "aligner": "ransac",
+            "repetition": 0,
+            "accepted": [False, True],
+            "lower_bound": False,
+            "alignment_nees": [np.nan, 2.4],
+        }
+    )
+    found = _each(rows, alignment_nees, "alignment_nees")
+    assert found["scenario"].tolist() == ["quick", ALL_SCENARIOS]
+    assert found["n_maps"].dtype == np.int64
+    assert found["nees_per_dof"].tolist() == pytest.approx([0.8, 0.8])
