@@ -340,7 +340,7 @@ def _with_vectors(
         table: table with any columns.
         table_schema: its schema, with 64 numbers in a descriptor.
         stated: metric that the metadata state; empty if they state none.
-        asked: metric that the caller states; empty if he states none.
+        asked: metric that the caller states; empty if unknown.
 
     Returns:
         The table, the schema with the length of its descriptors, and their metric; empty if
