@@ -433,9 +433,13 @@ def _unpacked(path: Path, name: str, packed: pa.Array, width: int) -> pa.Array:
     matrix = packed.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
     known = np.logical_not(np.all(np.isnan(matrix), axis=1))
     given = matrix[known]
-    if not np.all((given >= 0) & (given <= 255) & (given == np.floor(given))):
+    wrong = np.argwhere(~((given >= 0) & (given <= 255) & (given == np.floor(given))))
+    if len(wrong):
+        row, number = wrong[0]
+        cell = re.sub(r"_0$", f"_{number}", name)  # the first of numbered columns, or one of lists
+        found = f"is {given[row, number]:g} in row {np.flatnonzero(known)[row]}"
         needed = "packed bits are whole numbers from 0 to 255"
-        raise InputError(f"{path}: column {name}: holds other numbers than bytes; {needed}")
+        raise InputError(f"{path}: column {cell}: {found}; {needed}")
     bits = np.full((len(matrix), 8 * width), np.nan, np.float32)
     bits[known] = unpack_bits(given.astype(np.uint8))
     return pa.FixedSizeListArray.from_arrays(pa.array(bits.ravel()), 8 * width)

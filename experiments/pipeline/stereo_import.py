@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.pipeline.workers import workers
 from experiments.scenario.loading import made_settings
 from experiments.scenario.settings import SimulatedScenario
@@ -109,6 +111,9 @@ def import_recording(
         f"{work.vision.stereo.min_depth_m:.2g} to {work.vision.max_depth_m:.2g} m; known to "
         f"{1e3 * left.heading_rad:.2g} mrad and {100 * left.scale:.2g} % of lengths"
     )
+    if recording.depth is not None:
+        median_m = float(np.nanmedian(recording.pair(0)[1]))
+        about += f"; median depth of the first picture {median_m:.2g} m"
     return ImportedRecording(about, recording.dropped, robots)
 
 

@@ -399,7 +399,9 @@ def _read_odometry(path: Path) -> PosesAt:
         found = "has both poses and velocities" if all(given) else "has no poses or velocities"
         either = f"{', '.join(POSE_FIELDS)}, or {', '.join(_VELOCITY_FIELDS)}"
         raise InputError(f"{path}: {found}; give either {either}")
-    names = POSE_FIELDS if given[0] else _VELOCITY_FIELDS
+    names, values = (POSE_FIELDS, poses) if given[0] else (_VELOCITY_FIELDS, velocities)
+    if absent := [name for name, own in zip(names, values.T, strict=True) if np.isnan(own).all()]:
+        raise InputError(f"{path}: has no column {absent[0]}; odometry needs {', '.join(names)}")
     require_cells(path, table, names, np.isfinite, "give a finite number")
     repeated = np.flatnonzero(np.diff(time_s) <= 0)
     if len(repeated):

@@ -1,5 +1,6 @@
 """Stereo recording in memory: image pairs over time, with calibration and optional data."""
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,12 +12,15 @@ import numpy as np
 from mapfusion.datasets.camera_calibration import StereoCalibration
 from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.text_files import TimedPoses
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, TellingWarning
 from mapfusion.geometry.numerics import Float
 from mapfusion.vision.depth import DepthParameters
 
 _BITS = 8
 _SILENT = 0  # log level of OpenCV
+# Pictures without a partner at opposite ends of two cameras from which on clocks may differ. A
+# camera may start one picture late.
+_SHIFTED_PICTURES = 2
 _SAMPLES = 8  # pictures that determine how many of 16 bits a camera uses
 
 Load = Callable[[], np.ndarray]
@@ -195,10 +199,32 @@ def pair_shots(
         raise InputError(f"{source}: {found} make {made}")
     reason = f"no partner within {max_offset_ns / 1e6:g} ms"
     paired_left, paired_right = (set(rows) for rows in zip(*both, strict=True))
+    _warn_of_shifted_times(source, both, (len(left), len(right)), cameras)
     dropped = [f"{s.name} ({reason})" for i, s in enumerate(left) if i not in paired_left]
     dropped += [f"{s.name} ({reason})" for j, s in enumerate(right) if j not in paired_right]
     pictures = [(left[i].load, right[j].load) for i, j in both]
     return left_ns[[i for i, _ in both]], pictures, tuple(dropped)
+
+
+def _warn_of_shifted_times(
+    source: Path,
+    pairs: Sequence[tuple[int, int]],
+    lengths: tuple[int, int],
+    cameras: tuple[str, str],
+) -> None:
+    """Warn if one camera lacks partners at its start and the other as many at its end.
+
+    So do two cameras whose clocks differ by a constant. One picture may be a late start.
+    """
+    before = pairs[0]
+    after = tuple(n - 1 - last for n, last in zip(lengths, pairs[-1], strict=True))
+    for first, last in ((0, 1), (1, 0)):
+        n = min(before[first], after[last])
+        if n >= _SHIFTED_PICTURES and not before[last] and not after[first]:
+            found = f"the first {before[first]} pictures of {cameras[first]} and the last "
+            found += f"{after[last]} of {cameras[last]} have no partner"
+            asked = "are both timed by one clock?"
+            warnings.warn(f"{source}: {found}: {asked}", TellingWarning, stacklevel=3)
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -196,7 +196,8 @@ class MapAlignment:
         reason = self.reason.removesuffix(f"; {self.hint}")
         why = _sentence(f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}")
         heights = self.registered.refined.heights
-        if heights is not None and heights.loses_pairs:  # the reason says what to do
+        asks = reason.endswith("?") and not self.hint  # for a likely cause, such as another unit
+        if asks or (heights is not None and heights.loses_pairs):  # the reason says what to do
             return why
         return f"{why} {_sentence(self.hint or _REMEDIES[self.status])}"
 

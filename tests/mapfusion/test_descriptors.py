@@ -352,3 +352,11 @@ def test_a_filter_refuses_descriptors_of_another_kind() -> None:
 
 def _metric(name: str) -> Metric:
     return name  # type: ignore[return-value]
+
+
+def test_a_wrong_cell_of_packed_bits_is_named_by_column_and_row(tmp_path: Path) -> None:
+    table = plain(9).assign(**{f"descriptor_hamming_{k}": np.arange(9.0) for k in range(4)})
+    table.loc[5, "descriptor_hamming_2"] = np.nan
+    table.to_csv(tmp_path / "m.csv", index=False)
+    with pytest.raises(InputError, match="column descriptor_hamming_2: is nan in row 5; packed"):
+        read_map(tmp_path / "m.csv")

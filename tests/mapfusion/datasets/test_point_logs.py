@@ -137,7 +137,7 @@ def test_covariances_of_the_table_are_turned_with_the_sensor(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("table", "change", "words"),
     [
-        ("odometry", lambda t: t.drop(columns="x_m"), "x_m"),
+        ("odometry", lambda t: t.drop(columns="x_m"), "has no column x_m; odometry needs x_m, y_m"),
         ("odometry", lambda t: t[["time_s"]], "no poses or velocities"),
         ("odometry", lambda t: t.assign(time_s=t["time_s"] + 1e6), "another recording's"),
         ("odometry", lambda t: t.assign(time_s=0.0), "column time_s: repeats in row 1"),

@@ -1,6 +1,7 @@
 """Four layouts of one rendered drive give the same log."""
 
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from mapfusion.datasets.formats import import_recording, read_recording, setting
 from mapfusion.datasets.levelling import MountSettings
 from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
 from mapfusion.datasets.stereo_recording import Shot, pair_shots
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, TellingWarning
 from mapfusion.geometry import se2, se3
 from mapfusion.robot_log import read_log
 from mapfusion.vision.front_end import FrontEndParameters
@@ -195,6 +196,20 @@ def test_pairs_are_each_others_nearest_in_time() -> None:
     assert [text.split(" (")[0] for text in dropped] == ["200", "300", "101", "260"]
     with pytest.raises(InputError, match="make 1 pairs"):
         pair_shots(Path("drive"), shots(0, 50), shots(0, 90))
+
+
+def test_clocks_that_differ_by_a_constant_are_told() -> None:
+    def shots(*times_ms: float) -> list[Shot]:
+        return [Shot(round(1e6 * t), f"{t}", lambda: np.zeros((1, 1))) for t in times_ms]
+
+    left, right = shots(*range(0, 500, 50)), shots(*range(150, 650, 50))
+    for shifted in ((left, right), (right, left)):
+        with pytest.warns(TellingWarning, match="the first 3 pictures of .* and the last 3 of"):
+            pair_shots(Path("drive"), *shifted)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pair_shots(Path("drive"), left, shots(*range(150, 450, 50)))  # a shorter recording
+        pair_shots(Path("drive"), left, shots(*range(50, 550, 50)))  # one picture late
 
 
 def test_a_list_of_pairs_stands_for_folders(pairs: list[Pair], tmp_path: Path) -> None:

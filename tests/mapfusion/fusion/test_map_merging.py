@@ -141,6 +141,8 @@ def test_the_advice_says_why_not_and_what_to_do(found: MapAlignment) -> None:
         assert advice([one, one]).startswith("Use no T_a_b. None of 2 methods")
         assert best_alignment([one, found]) is found
         assert "1 of 2 methods agree" in advice([one, found])
+        asked = with_status(found, status, "larger: is it in millimetres?")
+        assert asked.advice.endswith("is it in millimetres?")  # the cause is named already
     rng = np.random.default_rng(0)
     p, look = rng.uniform(-6, 6, (60, 3)) * [1, 1, 0.1], unit_vectors(rng, 60)
     image = se2.transform_points(T_A_B, p) * [1, -1, 1]
