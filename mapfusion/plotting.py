@@ -221,7 +221,7 @@ def _draw(axes: Axes, plan: Plan, scale: float, factor: int) -> None:
 
     for ends, name, colour, width, style in (
         (plan.rejected, "rejected", REJECTED_COLOUR, 0.4, "dotted"),
-        (plan.accepted, "accepted", ACCEPTED_COLOUR, 1.2, "solid"),
+        (plan.accepted, "supporting", ACCEPTED_COLOUR, 1.2, "solid"),
     ):
         if len(ends):
             label = f"{name} correspondences: {len(ends)}"

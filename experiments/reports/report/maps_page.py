@@ -172,7 +172,7 @@ def _links(plan: Plan) -> list[Attributes]:
     """Return the traces of the correspondences of a plan."""
     kinds = (
         ("rejected", plan.rejected, {"color": NEUTRAL, "width": 0.8, "dash": "dot"}),
-        ("accepted", plan.accepted, {"color": ACCEPTED_COLOUR, "width": 1.6}),
+        ("supporting", plan.accepted, {"color": ACCEPTED_COLOUR, "width": 1.6}),
     )
     traces = list[Attributes]()
     for name, ends, line in kinds:
@@ -183,7 +183,7 @@ def _links(plan: Plan) -> list[Attributes]:
         about = {"name": f"{name} correspondences: {len(ends)}", "legendgroup": name}
         look = {"type": "scatter", "mode": "lines", "line": line, "hoverinfo": "skip"}
         traces.append(look | about | _xy(points))
-        if name == "accepted":  # ends that coincide have no visible line
+        if name == "supporting":  # ends that coincide have no visible line
             ring = {"size": _RING_PX, "symbol": "circle-open", "color": ACCEPTED_COLOUR}
             look = {"type": "scatter", "mode": "markers", "marker": ring, "hoverinfo": "skip"}
             traces.append(look | about | {"showlegend": False} | _xy(ends.mean(axis=1)))

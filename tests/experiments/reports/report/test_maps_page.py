@@ -57,7 +57,7 @@ def test_align_writes_a_page_and_a_picture(
     assert reply.out.splitlines()[-1] in re.sub(r"&gt;", ">", text)  # the advice
     figure = data_of(page)["charts"]["map"]
     names = [trace["name"] for trace in figure["data"]]
-    assert "accepted correspondences: 30" in names
+    assert "supporting correspondences: 30" in names
     assert {"a: 30 landmarks", "b: 30 landmarks"} <= set(names)
     assert re.search(r"default-src &#39;none&#39;|default-src 'none'", text)
     outside = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
