@@ -243,13 +243,18 @@ class Survey:
     left: Counter[str] = field(default_factory=Counter)
 
 
+def require_robots_drive(run: SweepRun, store: Store) -> None:
+    """Raise InputError if the robots of a run cannot drive as its scenario says."""
+    require_drive_of(EvaluatedRun.of(run.load(), store))
+
+
 def survey(sweep: Sweep) -> Survey:
     """Count runs and tasks, and how many of them are done; nothing is computed."""
     found, tables = Survey(len(sweep.runs)), JoinedTables(sweep.dataset)
     known: set[str] = set()
     for run in sweep.runs:
         try:
-            require_drive_of(EvaluatedRun.of(run.load(), sweep.store))
+            require_robots_drive(run, sweep.store)
             plan = plan_run(run, sweep.store, tables)
         except InputError as error:
             found.runs_refused += 1

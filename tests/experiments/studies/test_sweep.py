@@ -554,13 +554,16 @@ def test_runs_that_cannot_be_laid_out_are_rows_too(
     assert scene.rows() == {0: ("failed", "no floor plan fits seed 0"), 1: ("finished", "")}
 
 
-def test_survey_counts_what_is_shared_and_done(scene: Scene) -> None:
+def test_survey_counts_what_is_shared_and_done(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan_module, "require_robots_drive", lambda run, store: None)
     for seed in range(4):
         scene.write(seed, "drive/0")
         scene.write(seed, f"slam/{seed}", ["drive/0"])
     acting.write(scene.folder / "slam_0", "done")
     found = plan_module.survey(scene.sweep)
-    assert found.runs == 4
+    assert (found.runs, found.runs_refused) == (4, 0)
     assert found.wanted == Counter(drive=4, slam=4, tables=4)
     assert found.left == Counter(drive=1, slam=3, tables=4)
     assert found.finished["slam"] == 1
