@@ -33,7 +33,7 @@ _UNIT_TOLERANCE = 1e-3  # error of a norm after rounding to single precision, wi
 # The median distance is that of all pairs of at most this many descriptors: its standard error is
 # then below 1 %, and the time is a millisecond.
 _MOST_COMPARED = 384
-# Median distance of two landmarks by U-SURF, 0.80 to 0.86 in maps of three scenarios of the suite.
+# Median distance of the U-SURF descriptors of two different landmarks of a map.
 USURF_MEDIAN = 0.8
 # Ratio of the references of two maps from which on their numbers have different units. Maps of one
 # method differ by a few percent.

@@ -112,8 +112,10 @@ def import_recording(
         f"{1e3 * left.heading_rad:.2g} mrad and {100 * left.scale:.2g} % of lengths"
     )
     if recording.depth is not None:
-        median_m = float(np.nanmedian(recording.pair(0)[1]))
-        about += f"; median depth of the first picture {median_m:.2g} m"
+        depth_m = recording.pair(0)[1]
+        known_m = depth_m[np.isfinite(depth_m)]
+        median = f"{np.median(known_m):.2g} m" if len(known_m) else "unknown"
+        about += f"; median depth of the first picture {median}"
     return ImportedRecording(about, recording.dropped, robots)
 
 
