@@ -146,30 +146,40 @@ def write_sweep(
     settings: Sequence[Mapping[str, str]] = ({},),
     scenarios: Sequence[str] = ("world",),
     made: Mapping[int, Mapping[str, pd.DataFrame]] | None = None,
+    file_a_run: bool = False,
 ) -> Path:
-    """A sweep folder: one file a run and table, the run's columns in front; returns it."""
+    """A sweep folder, the run's columns in front of each table; returns it.
+
+    Each table is one file of all runs, which is quicker than the file a run that `sweep` writes.
+    """
     folder.mkdir(parents=True)
     (folder / "sweep.json").write_text("{}", encoding="utf-8")
+    of_table: dict[str, list[pd.DataFrame]] = {}
     for scenario in scenarios:
         for number, setting in enumerate(settings):
             for seed in seeds:
                 run_id = f"{scenario}-{seed}-{number}"
                 keys = {"run_id": run_id, "scenario": scenario, "seed": seed} | dict(setting)
-                run = {"status": "finished", "reason": ""}
-                write_rows(folder, "runs", run_id, pd.DataFrame([keys | run]))
+                run = pd.DataFrame([{"status": "finished", "reason": ""}])
                 own = made[seed] if made and seed in made else tables_of(seed)
-                for table, frame in own.items():
-                    rows = complete(table, frame)
-                    described = rows.assign(**keys)[[*keys, *rows]]
-                    write_rows(folder, table, run_id, described)
+                for table, frame in {"runs": run, **own}.items():
+                    described = frame.assign(**keys)[[*keys, *frame]]
+                    of_table.setdefault(table, []).append(described)
+    for table, frames in of_table.items():
+        rows = pd.concat(frames, ignore_index=True)
+        if table != "runs":
+            keys = [name for name in rows if name not in tables.ALL[table].names]
+            rows = rows[keys].join(complete(table, rows))
+        for run_id, own in rows.groupby("run_id") if file_a_run else [("all", rows)]:
+            write_rows(folder, table, str(run_id), own)
     return folder
 
 
-def write_rows(sweep: Path, table: str, run_id: str, rows: pd.DataFrame) -> None:
-    """One run's file of a sweep."""
+def write_rows(sweep: Path, table: str, file: str, rows: pd.DataFrame) -> None:
+    """A file of a sweep's table."""
     (sweep / table).mkdir(exist_ok=True)
     data = pa.Table.from_pandas(rows, preserve_index=False)
-    pq.write_table(data.replace_schema_metadata(None), sweep / table / f"{run_id}.parquet")
+    pq.write_table(data.replace_schema_metadata(None), sweep / table / f"{file}.parquet")
 
 
 def two_sweeps(
@@ -178,24 +188,8 @@ def two_sweeps(
     """The same runs, and what another version makes of them."""
     made = {seed: tables_of(seed) for seed in range(seeds)}
     changed = {seed: change(seed, {k: t.copy() for k, t in made[seed].items()}) for seed in made}
-    return write_together(folder / "a", made), write_together(folder / "b", changed)
-
-
-def write_together(folder: Path, made: Mapping[int, Tables]) -> Path:
-    """A folder that is read as a sweep, with one file a table for all runs; returns it.
-
-    Quicker than the file a run that `sweep` writes, where reading is not what is tested.
-    """
-    folder.mkdir(parents=True)
-    (folder / "sweep.json").write_text("{}", encoding="utf-8")
-    for table in made[next(iter(made))]:
-        rows = []
-        for seed, own in made.items():
-            keys = {"run_id": f"world-{seed}", "scenario": "world", "seed": seed}
-            full = complete(table, own[table])
-            rows.append(full.assign(**keys)[[*keys, *full]])
-        write_rows(folder, table, "all", pd.concat(rows, ignore_index=True))
-    return folder
+    of_a = write_sweep(folder / "a", [*made], made=made)
+    return of_a, write_sweep(folder / "b", [*changed], made=changed)
 
 
 def scaled(factor: float, aligner: str, scatter: float = 0.0) -> Callable[[int, Tables], Tables]:

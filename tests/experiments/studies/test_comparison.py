@@ -31,7 +31,6 @@ from tests.helpers.made_up_runs import (
     two_sweeps,
     write_result,
     write_sweep,
-    write_together,
 )
 
 
@@ -67,10 +66,10 @@ def test_a_method_that_changed_is_found_and_no_other(
 def test_chance_alone_is_rarely_taken_for_a_change(tmp_path: Path) -> None:
     """Other random numbers in everything: of 10 comparisons at 5 %, corrected, 1 may err."""
     wrong = 0
-    a = write_together(tmp_path / "a", {seed: tables_of(seed) for seed in range(8)})
+    a = write_sweep(tmp_path / "a", range(8))
     for trial in range(10):
         redrawn = {seed: tables_of(1000 * (trial + 1) + seed) for seed in range(8)}
-        found = compare(a, write_together(tmp_path / str(trial), redrawn))
+        found = compare(a, write_sweep(tmp_path / str(trial), range(8), made=redrawn))
         wrong += found.table["verdict"].isin([BETTER, WORSE]).any()
         assert (found.table["verdict"] == NOISE).any()
         p = found.table["p"].to_numpy()
@@ -186,10 +185,10 @@ def test_two_values_within_one_sweep_are_compared_as_two_sweeps(tmp_path: Path) 
     changed = {seed: scaled(0.5, "ransac")(seed, tables_of(seed)) for seed in seeds}
     few, many = ({"drive.frames": "9", key: each} for each in ("50", "200"))
     apart = [
-        write_sweep(tmp_path / "few", seeds, [few]),
+        write_sweep(tmp_path / "few", seeds, [few], file_a_run=True),
         write_sweep(tmp_path / "many", seeds, [many], made=changed),
     ]
-    both = write_sweep(tmp_path / "both", seeds, [few, many], made=changed)
+    both = write_sweep(tmp_path / "both", seeds, [few, many], made=changed, file_a_run=True)
     for file in (tmp_path / "few").glob("*/world-*-0.parquet"):  # few particles, unchanged
         shutil.copy(file, both / file.parent.name)
     within, expected = compare_values(both, key, "50", "200"), compare(*apart, [key])
@@ -246,7 +245,7 @@ def test_nees_is_better_the_nearer_to_one(tmp_path: Path) -> None:
         {seed: fused(nees)(seed, tables_of(seed)) for seed in range(8)} for nees in (0.2, 2.0, 4.0)
     ]
     small, near, large = (
-        write_together(tmp_path / str(i), tables) for i, tables in enumerate(made)
+        write_sweep(tmp_path / str(i), range(8), made=tables) for i, tables in enumerate(made)
     )
     metric = ("fused NEES / dof", "")
     assert verdicts(compare(small, near).table)[metric] == BETTER
@@ -268,9 +267,10 @@ def test_each_fuser_is_compared_for_itself_by_its_last_map(tmp_path: Path) -> No
         return change
 
     a, b = (
-        write_together(
+        write_sweep(
             tmp_path / str(every),
-            {seed: fused(off_m, every)(seed, tables_of(seed)) for seed in range(8)},
+            range(8),
+            made={seed: fused(off_m, every)(seed, tables_of(seed)) for seed in range(8)},
         )
         for off_m, every in ((0.2, 10), (0.1, 20))
     )

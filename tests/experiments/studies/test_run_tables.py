@@ -45,7 +45,7 @@ def test_settings_come_in_front_and_only_the_wanted_columns(tmp_path: Path) -> N
 def test_runs_come_whole_in_batches(
     rows_of_runs: float, seeds: list[list[int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runs = find_runs(write_sweep(tmp_path / "sweep", range(3)))
+    runs = find_runs(write_sweep(tmp_path / "sweep", range(3), file_a_run=True))
     whole = runs.read("robots")
     monkeypatch.setattr(run_tables, "BATCH_ROWS", rows_of_runs * len(whole) / 3)
     batches = list(runs.batches("robots"))
@@ -130,7 +130,7 @@ def test_damaged_descriptions_are_named(text: str, tmp_path: Path) -> None:
 
 
 def test_sweep_rows_must_say_their_run(tmp_path: Path) -> None:
-    sweep = write_sweep(tmp_path / "sweep", (0,))
+    sweep = write_sweep(tmp_path / "sweep", (0,), file_a_run=True)
     path = sweep / "errors" / "world-0-0.parquet"
     pq.write_table(pq.read_table(path).drop_columns(["seed"]), path)
     with pytest.raises(InputError, match="has no column seed"):
