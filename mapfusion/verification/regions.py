@@ -30,7 +30,9 @@ from mapfusion.verification.rivals import (
     mark_repeated,
 )
 from mapfusion.verification.visibility import (
+    MAY,
     MUST,
+    SURE_FRAMES,
     UNSEEN,
     ObservedLandmarks,
     ViewingHistory,
@@ -320,6 +322,14 @@ class ViewedMap:
     def _walls(self) -> Float:
         return wall_directions(self.described.near)
 
+    @cached_property
+    def recognisable(self) -> np.ndarray:
+        """Landmarks on a known wall that their own robot observed often, bool (N,).
+
+        Others, such as landmarks on a ceiling, are often missed from a similar viewpoint, too.
+        """
+        return (self._viewing.n_views >= SURE_FRAMES) & self._walls.any(axis=1)
+
     def transformed(self, T: Float) -> Float:
         """Return the positions under a motion of the plane, shape (N, 3)."""
         p = self.landmarks.position_m.copy()
@@ -421,7 +431,9 @@ class ViewedMapPair:
             p = own.transformed(T)
         else:
             seen = own.observed_from(T)
-            self._how[key], p = classify_visibility(seen, other.history), seen.p
+            how, p = classify_visibility(seen, other.history), seen.p
+            how[(how == MUST) & ~own.recognisable] = MAY
+            self._how[key] = how
         how, known = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
         looks = own.described, other.described

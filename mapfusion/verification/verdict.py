@@ -66,6 +66,9 @@ N_RIVALS, N_SELF_MOTIONS = 4, 3  # motions searched between two maps, and of eac
 _EQUAL = 0.01
 # Regions of the grid that a copy of the size of one region may touch along an axis.
 _TOUCHED = 2
+# Share of the supporters that lie on one wall if a picture on a wall may be all that agrees. The
+# others may agree by chance.
+_ON_ONE_WALL = 0.9
 # Size of the residuals in stated sigmas from which on a verdict says it. Chance does not reach it
 # with the fewest pairs that pass the test against chance.
 _OVERCONFIDENT = 3.0
@@ -468,8 +471,9 @@ class PairVerifier:
         """Return log10 of the largest `least_ratio` that the regions pass; infinite without limit.
 
         Maps without repeated structure and without another motion need no evidence if no region
-        contradicts and the supporters extend over two regions or more. Less may be a copy that led
-        to the motion as a whole. It is then one region, which is no evidence.
+        contradicts and the supporters extend over two regions or more and over several walls. Less
+        may be a copy, such as a picture on a wall, that led to the motion as a whole. It is then
+        one region, which is no evidence.
         """
         ratio = regions.log10_evidence(evidence.shares)
         # the best of n wrong motions reaches the threshold n times as often (Boole)
@@ -478,7 +482,8 @@ class PairVerifier:
             return passed
         if regions.n_contradicted:
             return passed
-        if (extent_m := self._extent_m(alignment)) < _TOUCHED * evidence.region_m:
+        extent_m = self._extent_m(alignment)
+        if extent_m < _TOUCHED * evidence.region_m or self._is_on_one_wall(alignment):
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
             return around.log10_evidence(evidence.shares)
         return math.inf
@@ -511,8 +516,12 @@ class PairVerifier:
         # No structure repeats and no other motion fits: a contradicting region is reason for doubt.
         if regions.n_contradicted:
             return f"{{told}}, too few beside {regions.n_contradicted} that are missing from one"
-        what = f"all that agrees lies within {_TOUCHED * evidence.region_m:.2g} m"
-        return f"{what} and could be a copy; too few regions around confirm it"
+        where = f"within {_TOUCHED * evidence.region_m:.2g} m"
+        if self._is_on_one_wall(alignment):
+            where = "on one wall"
+        return (
+            f"all that agrees lies {where} and could be a copy; too few regions around confirm it"
+        )
 
     def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
         """Return the rivals that differ from a motion."""
@@ -524,6 +533,17 @@ class PairVerifier:
     def _extent_m(self, alignment: Alignment) -> float:
         """Return the longer side of the bounding box of the supporters."""
         return float(np.ptp(self._pairs.p_b[alignment.inlier, :2], axis=0).max(initial=0.0))
+
+    def _is_on_one_wall(self, alignment: Alignment) -> bool:
+        """Return True if the supporters lie on one line, as those of a picture on a wall do.
+
+        The line is their principal axis. The width of the wall is `gate_m`, which covers the drift.
+        """
+        p = self._pairs.p_a[alignment.inlier, :2]
+        centred = p - p.mean(axis=0)
+        across = np.linalg.svd(centred, full_matrices=False)[2][1]
+        near = np.abs(centred @ across) <= self._settings.evidence.gate_m
+        return bool(np.mean(near) >= _ON_ONE_WALL)
 
     def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
         """Return True if most of the smaller map agrees and lies within the size of a room."""
