@@ -471,9 +471,9 @@ class PairVerifier:
         """Return log10 of the largest `least_ratio` that the regions pass; infinite without limit.
 
         Maps without repeated structure and without another motion need no evidence if no region
-        contradicts and the supporters extend over two regions or more and over several walls. Less
-        may be a copy, such as a picture on a wall, that led to the motion as a whole. It is then
-        one region, which is no evidence.
+        contradicts and the supporters extend over two regions or more and over several walls. All
+        that agrees on one wall may be a large picture. Less than two regions may be a copy that led
+        to the motion as a whole. It is then one region, which is no evidence.
         """
         ratio = regions.log10_evidence(evidence.shares)
         # the best of n wrong motions reaches the threshold n times as often (Boole)
@@ -482,11 +482,10 @@ class PairVerifier:
             return passed
         if regions.n_contradicted:
             return passed
-        extent_m = self._extent_m(alignment)
-        if extent_m < _TOUCHED * evidence.region_m or self._is_on_one_wall(alignment):
+        if (extent_m := self._extent_m(alignment)) < _TOUCHED * evidence.region_m:
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
             return around.log10_evidence(evidence.shares)
-        return math.inf
+        return passed if self._is_on_one_wall(alignment) else math.inf
 
     def _doubt(
         self,
@@ -516,12 +515,10 @@ class PairVerifier:
         # No structure repeats and no other motion fits: a contradicting region is reason for doubt.
         if regions.n_contradicted:
             return f"{{told}}, too few beside {regions.n_contradicted} that are missing from one"
-        where = f"within {_TOUCHED * evidence.region_m:.2g} m"
-        if self._is_on_one_wall(alignment):
-            where = "on one wall"
-        return (
-            f"all that agrees lies {where} and could be a copy; too few regions around confirm it"
-        )
+        if extent_m >= _TOUCHED * evidence.region_m:
+            return "{told}, too few if all that agrees lies on one wall and could be a picture"
+        what = f"all that agrees lies within {_TOUCHED * evidence.region_m:.2g} m"
+        return f"{what} and could be a copy; too few regions around confirm it"
 
     def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
         """Return the rivals that differ from a motion."""
