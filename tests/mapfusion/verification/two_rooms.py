@@ -14,15 +14,19 @@ HALF_VIEW_RAD, FARTHEST_M = 0.45, 8.0
 class Wall:
     """Wall along x at y = 3 with landmarks: positions (N, 3) and descriptors.
 
-    Each of `copies` (first_x, width, at_x) repeats an interval of x elsewhere.
+    Each of `copies` (first_x, width, at_x) repeats an interval of x elsewhere. With `niches` every
+    second metre lies a metre deeper.
     """
 
-    def __init__(self, length_m: float, seed: int, copies=(), per_m: int = 12) -> None:
+    def __init__(
+        self, length_m: float, seed: int, copies=(), per_m: int = 12, niches: bool = False
+    ) -> None:
         rng = np.random.default_rng(seed)
         n = int(length_m * per_m)
         self.p = np.stack(
             [rng.uniform(0, length_m, n), np.full(n, 3.0), rng.uniform(0.1, 1.2, n)], axis=1
         )
+        self.p[:, 1] += niches * (np.floor(self.p[:, 0]) % 2)
         look = rng.standard_normal((n, 64))
         self.look = look / np.linalg.norm(look, axis=1, keepdims=True)
         for first, width, at in copies:
