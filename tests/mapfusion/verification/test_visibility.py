@@ -26,35 +26,33 @@ from tests.mapfusion.verification.two_rooms import Wall, between, mapped
 
 
 def slowly(seen: ObservedLandmarks, viewing: Viewing) -> list[int]:
-    """Classify the visibility pose by pose, by angles."""
+    """Classify the visibility of each landmark from all poses, by angles."""
     how, field = [], viewing.field
+    low, high = field.bearing_rad
+    x, y, theta = viewing.pose.T
     for p, direction, before, wall in zip(*seen, strict=True):
         own_sine = abs(direction[0] * wall[1] - direction[1] * wall[0])
-        alike, frames = 0, 0
-        for t, (x, y, theta) in enumerate(viewing.pose):
-            sight = np.array([p[0] - x, p[1] - y])
-            range_m = float(np.linalg.norm(sight))
-            if not before / 2 <= range_m <= 2 * before or range_m == 0:
-                continue
-            slant = math.acos(np.clip(sight @ direction / range_m, -1, 1))
-            sine = abs(sight[0] * wall[1] - sight[1] * wall[0]) / range_m
-            if not own_sine / 2 <= sine <= 2 * own_sine:
-                continue
-            bearing = math.remainder(math.atan2(sight[1], sight[0]) - theta, 2 * math.pi)
-            low, high = field.bearing_rad
-            if slant > math.radians(45) or not low <= bearing <= high:
-                continue
-            if not field.range_m[0] <= range_m <= field.range_m[1]:
-                continue
-            lowest, highest = field.height_m[min(int(8 * range_m / field.range_m[1]), 7)]
-            part = min(int(16 * (bearing - low) / (high - low)), 15)
-            unhidden = range_m <= viewing.reach_m[t, part] + 0.3
-            if lowest <= p[2] <= highest and unhidden:
-                near = before / 1.4 <= range_m <= 1.4 * before
-                near = near and own_sine / 1.4 <= sine <= 1.4 * own_sine
-                alike, frames = alike + (near and slant <= math.radians(30)), frames + 1
-        seen_so = MAY if frames >= LEAST_FRAMES else UNSEEN
-        how.append(MUST if alike >= SURE_FRAMES else seen_so)
+        sight = np.stack([p[0] - x, p[1] - y])
+        range_m = np.hypot(*sight)
+        away = np.maximum(range_m, 1e-12)
+        slant = np.arccos(np.clip(direction @ sight / away, -1, 1))
+        sine = np.abs(sight[0] * wall[1] - sight[1] * wall[0]) / away
+        bearing = np.angle(np.exp(1j * (np.arctan2(sight[1], sight[0]) - theta)))
+
+        step = np.minimum((8 * range_m / field.range_m[1]).astype(int), 7)
+        lowest, highest = field.height_m[step].T
+        part = np.clip((16 * (bearing - low) / (high - low)).astype(int), 0, 15)
+        farthest = viewing.reach_m[np.arange(len(x)), part] + 0.3
+        in_view = (low <= bearing) & (bearing <= high) & (range_m > 0) & (range_m <= farthest)
+        in_view &= (field.range_m[0] <= range_m) & (range_m <= field.range_m[1])
+        in_view &= (lowest <= p[2]) & (p[2] <= highest)
+        views = []
+        for ratio, most_deg in ((2.0, 45), (1.4, 30)):
+            near = (before / ratio <= range_m) & (range_m <= ratio * before)
+            facing = (own_sine / ratio <= sine) & (sine <= ratio * own_sine)
+            views.append(np.sum(in_view & near & facing & (slant <= math.radians(most_deg))))
+        seen_so = MAY if views[0] >= LEAST_FRAMES else UNSEEN
+        how.append(MUST if views[1] >= SURE_FRAMES else seen_so)
     return how
 
 
