@@ -21,7 +21,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, rms_distance_m, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Acceptance, Verdict
-from mapfusion.verification.likelihood import COPIED, OWN, TwinShares
+from mapfusion.verification.likelihood import COPIED, DECISIVE, OWN, TwinShares
 from mapfusion.verification.regions import (
     EvidenceParameters,
     RegionGrid,
@@ -66,9 +66,8 @@ N_RIVALS, N_SELF_MOTIONS = 4, 3  # motions searched between two maps, and of eac
 _EQUAL = 0.01
 # Regions of the grid that a copy of the size of one region may touch along an axis.
 _TOUCHED = 2
-# Share of the supporters that lie on one wall if a picture on a wall may be all that agrees. The
-# others may agree by chance.
-_ON_ONE_WALL = 0.9
+# Share of the supporters that may be one copy if the others agree by chance.
+_BULK = 0.9
 # Size of the residuals in stated sigmas from which on a verdict says it. Chance does not reach it
 # with the fewest pairs that pass the test against chance.
 _OVERCONFIDENT = 3.0
@@ -470,8 +469,9 @@ class PairVerifier:
     ) -> float:
         """Return log10 of the largest `least_ratio` that the regions pass; infinite without limit.
 
-        Maps without repeated structure and without another motion need no evidence if no region
-        contradicts and the supporters extend over two regions or more and over several walls. All
+        Maps without repeated structure and without another motion need little evidence if the
+        supporters extend over two regions or more and over several walls: the regions beside that
+        which led to the motion, if there are any, must confirm it, and none may contradict it. All
         that agrees on one wall may be a large picture. Less than two regions may be a copy that led
         to the motion as a whole. It is then one region, which is no evidence.
         """
@@ -482,10 +482,12 @@ class PairVerifier:
             return passed
         if regions.n_contradicted:
             return passed
-        if (extent_m := self._extent_m(alignment)) < _TOUCHED * evidence.region_m:
+        p = self._bulk(alignment)
+        if (extent_m := float(np.ptp(p, axis=0).max())) < _TOUCHED * evidence.region_m:
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
             return around.log10_evidence(evidence.shares)
-        return passed if self._is_on_one_wall(alignment) else math.inf
+        unconfirmed = len(regions) > 1 and ratio < DECISIVE
+        return passed if unconfirmed or self._is_one_wall(p) else math.inf
 
     def _doubt(
         self,
@@ -515,8 +517,11 @@ class PairVerifier:
         # No structure repeats and no other motion fits: a contradicting region is reason for doubt.
         if regions.n_contradicted:
             return f"{{told}}, too few beside {regions.n_contradicted} that are missing from one"
-        if extent_m >= _TOUCHED * evidence.region_m:
-            return "{told}, too few if all that agrees lies on one wall and could be a picture"
+        p = self._bulk(alignment)
+        if np.ptp(p, axis=0).max() >= _TOUCHED * evidence.region_m:
+            if self._is_one_wall(p):
+                return "{told}, too few if all that agrees lies on one wall and could be a picture"
+            return "{told}, too few to confirm it"
         what = f"all that agrees lies within {_TOUCHED * evidence.region_m:.2g} m"
         return f"{what} and could be a copy; too few regions around confirm it"
 
@@ -531,16 +536,21 @@ class PairVerifier:
         """Return the longer side of the bounding box of the supporters."""
         return float(np.ptp(self._pairs.p_b[alignment.inlier, :2], axis=0).max(initial=0.0))
 
-    def _is_on_one_wall(self, alignment: Alignment) -> bool:
-        """Return True if the supporters lie on one line, as those of a picture on a wall do.
+    def _bulk(self, alignment: Alignment) -> Float:
+        """Return the supporters (n, 2) nearest to their median, without those of chance."""
+        p = self._pairs.p_b[alignment.inlier, :2]
+        away_m = np.linalg.norm(p - np.median(p, axis=0), axis=1)
+        return p[away_m <= np.quantile(away_m, _BULK)]
 
-        The line is their principal axis. The width of the wall is `gate_m`, which covers the drift.
+    def _is_one_wall(self, p: Float) -> bool:
+        """Return True if supporters (n, 2) lie on one line, as those of a picture on a wall do.
+
+        The line is their principal axis. Two standard deviations across it are at most `gate_m`,
+        which covers the drift.
         """
-        p = self._pairs.p_a[alignment.inlier, :2]
         centred = p - p.mean(axis=0)
-        across = np.linalg.svd(centred, full_matrices=False)[2][1]
-        near = np.abs(centred @ across) <= self._settings.evidence.gate_m
-        return bool(np.mean(near) >= _ON_ONE_WALL)
+        across_m2 = np.linalg.eigvalsh(centred.T @ centred / len(p))[0]
+        return bool(2 * np.sqrt(max(across_m2, 0.0)) <= self._settings.evidence.gate_m)
 
     def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
         """Return True if most of the smaller map agrees and lies within the size of a room."""

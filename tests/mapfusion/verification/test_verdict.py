@@ -15,6 +15,7 @@ from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification import verdict as verdict_module
 from mapfusion.verification.false_alarms import Acceptance, Verdict
+from mapfusion.verification.likelihood import TwinShares
 from mapfusion.verification.regions import EvidenceParameters, ViewedMap
 from mapfusion.verification.registration import Registration
 from mapfusion.verification.rivals import BETWEEN, RepeatedLandmarks, self_motions
@@ -180,6 +181,36 @@ def test_what_agrees_within_two_regions_may_be_one_copy(start_b: float, passed: 
     assert said.log10_evidence > 1
     assert said.log10_ratio_passed == passed
     assert said.accepted == (passed > 0)
+
+
+def test_a_few_supporters_elsewhere_do_not_make_a_copy_large() -> None:
+    """All but two of the common landmarks lie within 2.5 m, the others 8 m away."""
+    wall = Wall(20, seed=1, niches=True)
+    x = wall.p[:, 0]
+    kept = ((x >= 10) & (x < 12.5)) | ((x >= 2) & (x < 2.2))
+    wall.p, wall.look = wall.p[kept], wall.look[kept]
+    small = Verifier(evidence=EvidenceParameters(place_m=1.0))
+    said, refined = verdict(mapped(wall, 1, 14, seed=2), mapped(wall, 1, 14, seed=3), small)
+    assert refined.inlier.sum() > 20
+    assert said.log10_ratio_passed < 2
+    assert "within 4 m" in said.reason
+
+
+def test_regions_beside_the_one_that_led_to_it_must_confirm_it() -> None:
+    """If nearly all regions are copies under a wrong motion, regions that agree tell little."""
+    a, b = mapped(NICHES, 1, 11, seed=2, name="A"), mapped(NICHES, 9, 19, seed=3, name="B")
+    pairs = match(a, b)
+    sought = Registration(Clique()).on(a, b, pairs)
+    assert sought.verifier is not None
+    known = sought.verifier.evidence
+    assert known is not None
+    for share, accepted in ((0.05, True), (0.95, False)):
+        shared = replace(known, shares=TwinShares(share, share))
+        registration = Registration(Clique()).on(a, b, pairs, shared)
+        said = registration.register(np.random.default_rng(0)).verdict
+        assert said.accepted == accepted
+    assert said.log10_evidence < 1
+    assert "too few to confirm it" in said.reason
 
 
 def test_what_agrees_on_one_wall_may_be_a_picture() -> None:

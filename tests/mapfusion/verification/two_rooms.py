@@ -41,14 +41,20 @@ class Wall:
 
 
 def mapped(
-    wall: Wall, first_x: float, last_x: float, seed: int, name: str = "R1", noise_m: float = 0.01
+    wall: Wall,
+    first_x: float,
+    last_x: float,
+    seed: int,
+    name: str = "R1",
+    noise_m: float = 0.01,
+    step_m: float = 0.125,
 ) -> LandmarkMap:
     """Return the map of a robot that drives along the wall, in the frame of its start.
 
     The camera faces the wall at a distance of 3 m.
     """
     rng = np.random.default_rng(seed)
-    x = np.arange(first_x, last_x, 0.125)
+    x = np.arange(first_x, last_x, step_m)
     path_world = np.stack([x, np.zeros(len(x)), np.full(len(x), np.pi / 2)], axis=1)
     T_world_map = path_world[0]
     path = se2.between(T_world_map, path_world)
