@@ -20,7 +20,15 @@ from experiments.reports.figures import study_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
 from experiments.scenario.settings import AnyScenario
-from experiments.studies.benchmark import SIGMA_M, SIZE_M, SUMMARY, TRIALS, BenchmarkDesign
+from experiments.studies.benchmark import (
+    CROSSING,
+    SIGMA_M,
+    SIZE_M,
+    SUMMARY,
+    TRIALS,
+    BenchmarkDesign,
+    crossings,
+)
 from experiments.studies.independence_trial import (
     COSTS,
     STRATEGIES,
@@ -28,7 +36,7 @@ from experiments.studies.independence_trial import (
     Independence,
     at_the_end,
 )
-from experiments.studies.paper_claims import CROSSING, READINGS, VALUES, crossings
+from experiments.studies.paper_claims import READINGS, VALUES
 from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,

@@ -10,10 +10,9 @@ import pytest
 
 from experiments.pipeline.tables import read_rows
 from experiments.reports.study_files import claim_text, claims_page, claims_table
-from experiments.studies.benchmark import crossing_shares
+from experiments.studies.benchmark import CROSSING, crossing_shares
 from experiments.studies.paper_claims import (
     CLAIMS,
-    CROSSING,
     SCENARIOS,
     VALUES,
     NotMeasured,
