@@ -36,7 +36,7 @@ from experiments.studies.independence_trial import (
     Independence,
     at_the_end,
 )
-from experiments.studies.paper_claims import READINGS, VALUES
+from experiments.studies.paper_claims import READINGS, VALUES, claims_table
 from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,
@@ -379,32 +379,6 @@ def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
         *(f"{line}\n" for line in crossing_lines(crossing)),
     ]
     return "\n".join(parts)
-
-
-def claims_table(values: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of VALUES as a table with one row per claim and texts in all cells."""
-    rows = []
-    for _, own in values.groupby("name", sort=False):
-        first = own.iloc[0]
-        row = {"claim": f"{first['claim']} ({first['where']})", "measure": first["measure"]}
-        records: Any = own.to_dict("records")
-        for of in records:
-            row[f"{of['scenario']}, {of['renderer']}"] = claim_text(of)
-        rows.append(row | {"why": first["why"]})
-    return pd.DataFrame(rows)
-
-
-def claim_text(row: Mapping[str, Any]) -> str:
-    """Write verdict, value and interval of a row of VALUES."""
-    if math.isnan(row["value"]):
-        return str(row["verdict"])
-    value, low, high = (
-        "no answer" if math.isinf(row[name]) else f"{row[name]:.3g}"
-        for name in ("value", "value_low", "value_high")
-    )
-    unit = f" {row['unit']}" if row["unit"] else ""
-    interval = f" ({low} to {high})" if not math.isnan(row["value_low"]) else " (one run)"
-    return f"**{row['verdict']}**: {value}{unit}{interval}"
 
 
 def crossing_lines(crossing: pd.DataFrame) -> list[str]:

@@ -27,8 +27,9 @@ from experiments.reports.layout import (
     print_skipped,
     print_table,
 )
-from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
+from experiments.reports.study_files import SHOWN, shown_numbers
 from experiments.studies.independence_trial import STRATEGIES
+from experiments.studies.paper_claims import claims_table
 from experiments.studies.refusal_rates import VERDICTS, Rate, pooled, worst
 from experiments.studies.sweep import Survey, SweepProgress
 from experiments.studies.sweep_tables import (

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from experiments.pipeline.tables import read_rows
-from experiments.reports.study_files import claim_text, claims_page, claims_table
+from experiments.reports.study_files import claims_page
 from experiments.studies.benchmark import CROSSING, crossing_shares
 from experiments.studies.paper_claims import (
     CLAIMS,
@@ -18,6 +18,8 @@ from experiments.studies.paper_claims import (
     NotMeasured,
     TablesOfRun,
     Verdict,
+    claim_text,
+    claims_table,
     compare_with_paper,
     verdict,
 )
