@@ -233,6 +233,11 @@ class LandmarkMap:
         if self.viewing is not None and len(self.viewing) != n:
             raise ValueError(f"viewing: of {len(self.viewing)} landmarks, the map has {n}")
 
+    @property
+    def n_dimensions(self) -> int:
+        """Number of estimated coordinates of a landmark: 2 in planar maps, else 3."""
+        return 2 if self.planar else 3
+
     def __len__(self) -> int:
         return len(self.position_m)
 

@@ -30,11 +30,13 @@ from experiments.studies.benchmark import (
     crossings,
 )
 from experiments.studies.independence_trial import (
+    COST_HEADINGS,
     COSTS,
     STRATEGIES,
     TEAMS,
     Independence,
     at_the_end,
+    shown_numbers,
 )
 from experiments.studies.paper_claims import READINGS, VALUES, claims_table
 from experiments.studies.refusal_rates import (
@@ -189,19 +191,6 @@ def cell_text(cell: pd.Series) -> str:
 
 
 FIGURE = "independence"
-# Columns of `at_the_end` in reports: headings of a page and of a screen.
-SHOWN = {
-    "robots_s": ("robots' own work, CPU s", "robots'\nCPU s"),
-    "busiest_robot_s": ("of the busiest robot", "busiest\nCPU s"),
-    "team_s": ("team's work, CPU s", "team's\nCPU s"),
-    "robot_peak_mb": ("peak of a robot, MB", "robot\nMB"),
-    "team_peak_mb": ("peak of the team's, MB", "team\nMB"),
-    "sent_mb": ("sent by all, MB", "sent\nMB"),
-    "landmark_rmse_m": ("map in its frame, mm", "map\nmm"),
-    "fitted_rmse_m": ("map after a fit, mm", "fitted\nmm"),
-    "path_rmse_m": ("paths after a fit, mm", "paths\nmm"),
-}
-_MM_PER_M = 1000.0
 
 
 def write_independence(
@@ -239,7 +228,7 @@ def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFram
     labels = {strategy.name: strategy.label for strategy in STRATEGIES}
     for n_robots, rows in summary.groupby("n_robots"):
         whole, n = rows["n_whole"].min(), rows["n_seeds"].max()
-        shown = {heading: shown_numbers(rows, name) for name, (heading, _) in SHOWN.items()}
+        shown = {heading: shown_numbers(rows, name) for name, (heading, _) in COST_HEADINGS.items()}
         table = pd.DataFrame({"way to one map": rows["strategy"].map(labels)} | shown)
         parts += [
             f"## {n_robots} robots\n",
@@ -247,11 +236,6 @@ def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFram
             to_markdown(table),
         ]
     return "\n".join(parts)
-
-
-def shown_numbers(rows: pd.DataFrame, name: str) -> pd.Series:
-    """Return a column of `SHOWN` in the unit of its heading: errors in mm."""
-    return rows[name] * (_MM_PER_M if name.endswith("rmse_m") else 1.0)
 
 
 _RATES = ("false_runs", "false_pairs", "false_by_chance", "wrong_pairs", "on_ground", "ambiguous")
