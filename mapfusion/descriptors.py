@@ -216,7 +216,7 @@ def merged_kind(*kinds: DescriptorKind | None) -> DescriptorKind | None:
     return replace(named, reference=mean)
 
 
-def reach(threshold: float, *kinds: DescriptorKind | None) -> float:
+def euclidean_distance_at(threshold: float, *kinds: DescriptorKind | None) -> float:
     """Return the Euclidean distance of vectors of some kinds at a threshold of their distance."""
     kind = merged_kind(*kinds)
     if kind is None:
@@ -224,8 +224,11 @@ def reach(threshold: float, *kinds: DescriptorKind | None) -> float:
     return (threshold * (kind.reference or 1.0)) ** (1 / kind._power)
 
 
-def relative(apart: Any, *kinds: DescriptorKind | None) -> Any:
-    """Return distances by Euclidean distances of vectors of some kinds; the inverse of `reach`."""
+def relative_distance(apart: Any, *kinds: DescriptorKind | None) -> Any:
+    """Return the distances of vectors of some kinds by their Euclidean distances.
+
+    The inverse of `euclidean_distance_at`.
+    """
     kind = merged_kind(*kinds)
     if kind is None:
         return apart

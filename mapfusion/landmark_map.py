@@ -233,6 +233,11 @@ class LandmarkMap:
         if self.viewing is not None and len(self.viewing) != n:
             raise ValueError(f"viewing: of {len(self.viewing)} landmarks, the map has {n}")
 
+    @property
+    def n_dimensions(self) -> int:
+        """Number of estimated coordinates of a landmark: 2 in planar maps, else 3."""
+        return 2 if self.planar else 3
+
     def __len__(self) -> int:
         return len(self.position_m)
 
@@ -312,10 +317,16 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
             parts |= {"categories": landmarks.category is not None}
         if lost := [name for name, there in parts.items() if there]:
             which = kind if kind == "g2o" else kind.upper()
-            text = f"{path}: {which} cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
-            warnings.warn(text, TellingWarning, stacklevel=3)
+            told = f"{path}: {which} cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
+            warnings.warn(told, TellingWarning, stacklevel=3)
         try:
-            text = _text_of(kind, landmarks)
+            if kind == "csv":
+                text = csv_bytes(_known_columns(landmarks))
+            elif kind == "ply":
+                text = coloured_ply(landmarks).encode()
+            else:
+                p, covariance_m2 = landmarks.position_m, landmarks.covariance_m2
+                text = g2o_text(p, covariance_m2, landmarks.name, landmarks.planar).encode()
         except ValueError as error:
             raise InputError(f"{path}: {error}") from error
         return {path: lambda temporary: temporary.write_bytes(text)}
@@ -365,16 +376,6 @@ def _known_columns(landmarks: LandmarkMap) -> dict[str, np.ndarray]:
     absent |= {name for name in ("size_m", "category") if getattr(landmarks, name) is None}
     kept = {name: each for name, each in _columns(landmarks).items() if name not in absent}
     return kept | appearance
-
-
-def _text_of(kind: str, landmarks: LandmarkMap) -> bytes:
-    """Return the content of a map's file as `csv`, `ply` or `g2o`; raises ValueError."""
-    if kind == "csv":
-        return csv_bytes(_known_columns(landmarks))
-    if kind == "ply":
-        return coloured_ply(landmarks).encode()
-    shape = landmarks.position_m, landmarks.covariance_m2, landmarks.name, landmarks.planar
-    return g2o_text(*shape).encode()
 
 
 def coloured_ply(landmarks: LandmarkMap, rgb: np.ndarray | None = None) -> str:

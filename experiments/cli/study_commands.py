@@ -301,7 +301,7 @@ def paper(
     from experiments.reports import layout, study_screen
     from experiments.reports.study_files import write_claims
     from experiments.studies import paper_claims
-    from experiments.studies.benchmark import run_benchmark
+    from experiments.studies.benchmark import crossing_designs, crossing_rows, run_benchmark
     from experiments.studies.run_tables import find_runs
     from mapfusion.errors import InputError
 
@@ -315,10 +315,10 @@ def paper(
     with layout.progress() as show:
         trials_of = {
             design.unpaired_share: run_benchmark(design, Store(results / "store"), show)
-            for design in paper_claims.crossing_designs(trials)
+            for design in crossing_designs(paper_claims.ALIGNERS, trials)
         }
     study_screen.print_claims(values)
-    crossing = paper_claims.crossing_rows(trials_of)
+    crossing = crossing_rows(trials_of)
     layout.print_paths(folder, write_claims(folder, values, crossing))
 
 

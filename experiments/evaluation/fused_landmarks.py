@@ -20,9 +20,7 @@ import pandas as pd
 from experiments.evaluation.truth import (
     EvaluatedRobot,
     MapPair,
-    degrees_of_freedom,
     fit_rmse_m,
-    squared_mahalanobis,
 )
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.files import named_columns, point_columns
@@ -31,7 +29,7 @@ from mapfusion.fusion.fusers import FusedMap, Fuser, Fusion, MergeParameters
 from mapfusion.fusion.kalman import Kalman, KalmanDrift, fuse_landmarks_sequentially, kalman_update
 from mapfusion.fusion.merge import connect, merge
 from mapfusion.geometry import se2
-from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.numerics import Float, chi_square_bound, squared_mahalanobis
 from mapfusion.landmark_map import LandmarkMap
 
 GATE_PROBABILITY = 0.95
@@ -139,7 +137,7 @@ def fusion_rows(
         truth = a.in_map_frame(((points_a[i] + points_b[j]) / 2)[:, None])[:, 0]
         moved_b = se2.transform_points(fused.T_first_map[1], map_b.position_m[j][:, None])[:, 0]
         error = fused.landmarks.position_m[both] - truth
-        used = degrees_of_freedom(fused.landmarks)
+        used = fused.landmarks.n_dimensions
         covariance = fused.landmarks.covariance_m2[both, :used, :used]
         vectors = {
             "error_a_m": map_a.position_m[i] - truth,
@@ -234,7 +232,7 @@ def landmark_nees(landmarks: LandmarkMap, point_m: Float) -> Float:
         landmarks: map of N landmarks.
         point_m: true points in the frame of the map, shape (N, 3).
     """
-    used = degrees_of_freedom(landmarks)
+    used = landmarks.n_dimensions
     error = (landmarks.position_m - point_m)[:, :used]
     covariance = landmarks.covariance_m2[:, :used, :used]
     return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
@@ -292,7 +290,7 @@ def landmark_nees_rows(team: FusedTeam, radius_m: float) -> list[dict[str, Any]]
 
 
 def _nees_row(name: str, which: str, landmarks: LandmarkMap, nees: Float) -> dict[str, Any]:
-    nees, dof = nees[np.isfinite(nees)], degrees_of_freedom(landmarks)
+    nees, dof = nees[np.isfinite(nees)], landmarks.n_dimensions
     row = {"map": name, "landmarks": which, "n_landmarks": len(nees), "degrees_of_freedom": dof}
     if len(nees):
         row |= {"nees_mean": nees.mean(), "nees_median": np.median(nees)}

@@ -20,11 +20,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy
 
-from experiments.evaluation.truth import degrees_of_freedom, squared_mahalanobis
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
 from mapfusion.geometry.joint_covariance import JointCovariance
-from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.numerics import Float, chi_square_bound, squared_mahalanobis
 from mapfusion.landmark_map import LandmarkMap
 
 # Several times the error of a map of a room after a fit, and about half the distance between
@@ -165,7 +164,7 @@ def consistencies(landmarks: LandmarkMap, fit: FittedMap) -> tuple[Consistency, 
     rows = fit.rows[not_gross]
     if len(rows) < _LEAST or fit.too_many_gross:
         return UNKNOWN, UNKNOWN
-    d = degrees_of_freedom(landmarks)
+    d = landmarks.n_dimensions
     # without a joint covariance, errors of landmarks are taken to be independent
     known = landmarks.joint
     if known is None:

@@ -34,13 +34,11 @@ from experiments.evaluation.truth import (
     EvaluatedRobot,
     MapPair,
     common_landmarks,
-    degrees_of_freedom,
     join_map_pairs,
     landmark_truth,
     load_robot,
     load_robot_smoothed,
     motion_errors,
-    squared_mahalanobis,
     truth_or_unknown,
 )
 from experiments.pipeline.stage import Job, StageKind
@@ -65,7 +63,7 @@ from mapfusion.files import POSE_FIELDS, named_columns
 from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import FusedMap, Fusion
 from mapfusion.geometry import se2
-from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.numerics import Float, chi_square_bound, squared_mahalanobis
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import RobotLog
 from mapfusion.verification.verdict import Verifier
@@ -514,7 +512,7 @@ def _coverage_of(
     relative, frame = (
         np.concatenate([each.own_nees for each in both]) for both in zip(*maps, strict=True)
     )
-    d = degrees_of_freedom(fusion.fusion.landmarks)
+    d = fusion.fusion.landmarks.n_dimensions
     for nominal in NOMINAL_COVERAGES if len(relative) else ():
         bound = chi_square_bound(nominal, d)
         shares = {"coverage": np.mean(relative <= bound), "frame_coverage": np.mean(frame <= bound)}

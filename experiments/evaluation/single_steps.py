@@ -1,7 +1,7 @@
 """Single steps on a user's files: record, export as a dataset, slam, align, merge, calibrate."""
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ from mapfusion.datasets.formats import EXPORTERS, export_drive
 from mapfusion.datasets.log_consistency import Finding, gate_finding
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
-from mapfusion.files import Write, write_together
+from mapfusion.files import write_together
 from mapfusion.fusion.map_merging import MapAlignment, MergedMaps, align_maps, load_maps, merge_maps
 from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap, map_writes
@@ -172,15 +172,11 @@ def save_maps(path: Path, made: SlamResult) -> list[Path]:
     if made.smoothed is not None:
         paths.append(smoothed_path(path))
         writes |= map_writes(paths[-1], made.smoothed)
-    _save(path, writes)
-    return paths
-
-
-def _save(path: Path, writes: Mapping[Path, Write]) -> None:
     try:
         write_together(writes)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    return paths
 
 
 def save_fused(path: Path, merged: MergedMaps) -> list[Path]:

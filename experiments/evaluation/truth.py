@@ -194,20 +194,10 @@ def _fit_to_points(position_m: Float, point_world_m: Float) -> tuple[Float, int,
     return T_world_map, len(points), float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
 
 
-def degrees_of_freedom(landmarks: LandmarkMap) -> int:
-    """Return the number of estimated coordinates of a landmark."""
-    return 2 if landmarks.planar else 3
-
-
 def motion_errors(T: Float, T_true: Float) -> tuple[Float, Float]:
     """Return translation errors in m and signed rotation errors in rad of motions (..., 3)."""
     error = T - T_true
     return np.hypot(error[..., 0], error[..., 1]), se2.wrap(error[..., 2])
-
-
-def squared_mahalanobis(error: Float, covariance: Float) -> Float:
-    """Return squared Mahalanobis lengths of errors (..., D) with covariances (..., D, D)."""
-    return np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])
 
 
 @dataclass(frozen=True)

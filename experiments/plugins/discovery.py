@@ -8,11 +8,8 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import json
-import re
-import sys
 from dataclasses import dataclass
 from enum import StrEnum
-from importlib import import_module
 from importlib.machinery import ModuleSpec
 from operator import attrgetter
 from pathlib import Path
@@ -21,10 +18,10 @@ from typing import Any
 from experiments.plugins.isolated_process import IsolatedAligner, ProcessFailedError, process_for
 from mapfusion.align.aligners import ALIGNERS, PEERS, Aligner, as_aligner, construct
 from mapfusion.errors import did_you_mean, not_installed
+from mapfusion.plugin_classes import IN_FILE, load_class, target_in_file
 
 ENTRY_POINTS = "mapfusion.aligners"  # group of the entry points that declare aligners
 _CODE_SUFFIXES = (".py", ".so", ".pyd")
-_OWN_FILE = re.compile(r"(.+\.py):(\w+)")  # a class in a Python file, as name of a method
 _PEER_PACKAGES = {  # distribution and import package
     "opencv": ("opencv-python-headless", "cv2"),
     "kiss_matcher": ("kiss-matcher", "kiss_matcher"),
@@ -142,12 +139,8 @@ def find_method(name: str) -> KnownMethod:
     Raises:
         ValueError: no method has the name, several plug-ins declare it, or there is no such file.
     """
-    if own_file := _OWN_FILE.fullmatch(name):
-        file = Path(own_file[1])
-        if not file.is_file():
-            raise ValueError(f"{file}: no such file (expected FILE.py:CLASS, an aligner of yours)")
-        target = f"{file.absolute()}:{own_file[2]}"
-        return KnownMethod(name, Kind.PLUG_IN, target, package=str(file.absolute()))
+    if in_file := target_in_file(name, "an aligner"):
+        return KnownMethod(name, Kind.PLUG_IN, in_file, package=in_file.rpartition(":")[0])
     # Our own methods need no search of installed packages.
     known = _OWN_METHODS if name in _OWN_METHODS else known_methods()
     if name not in known:
@@ -167,7 +160,7 @@ def absolute_method(name: str, folder: Path | None = None) -> str:
         name: name of a method.
         folder: folder that a relative path belongs to; None: the working folder.
     """
-    own_file = _OWN_FILE.fullmatch(name)
+    own_file = IN_FILE.fullmatch(name)
     return f"{(folder or Path()).absolute() / own_file[1]}:{own_file[2]}" if own_file else name
 
 
@@ -178,25 +171,8 @@ def make_method(name: str, /, **parameters: Any) -> Any:
         ValueError: the name or a parameter is unknown, or a parameter is out of range.
     """
     method = find_method(name)
-    own_file = _OWN_FILE.fullmatch(method.target)
-    if own_file is None:
-        module, _, names = method.target.partition(":")
-        return construct(name, attrgetter(names)(import_module(module)), parameters)
-    file, names = own_file.groups()
-    # Import the file under a name of its own.
-    own_name = f"mapfusion_own_{Path(file).stem}"
-    spec = importlib.util.spec_from_file_location(own_name, file)
-    assert spec is not None
-    assert spec.loader is not None
-    made = importlib.util.module_from_spec(spec)
-    sys.modules[own_name] = made  # dataclasses look their module up
-    spec.loader.exec_module(made)
-    if not hasattr(made, names):
-        classes = {key: each for key, each in vars(made).items() if isinstance(each, type)}
-        own = [key for key, each in classes.items() if each.__module__ == own_name]
-        there = ", ".join(own) or "none"
-        raise ValueError(f"{file}: has no class {names}; there: {there}{did_you_mean(names, own)}")
-    return construct(names, getattr(made, names), parameters)
+    own_file = IN_FILE.fullmatch(method.target)
+    return construct(own_file[2] if own_file else name, load_class(method.target), parameters)
 
 
 def callable_aligner(method: str, parameters: dict[str, Any], time_limit_s: float) -> Aligner:

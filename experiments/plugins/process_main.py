@@ -59,11 +59,20 @@ class MethodRunner:
     maps: bytes
 
     def answer(self, action: str, *arguments: Any) -> dict[str, Any]:
-        """Return the answer of an action, `make` or `align`, or the `error` that it raised."""
+        """Return the answer of an action, `make` or `align`, or the `error` in one line."""
         try:
             return getattr(self, action)(*arguments)
         except BaseException as error:  # also SystemExit, which would end the process
-            return {"error": _description(error)}
+            try:
+                text = f"{error}{moved_module_note(error)}"
+            except BaseException:  # an error class of the plug-in may fail as well
+                text = ""
+            if isinstance(error, InvalidAnswerError):
+                return {"error": one_line(text)}
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            file = one_line(os.path.basename(frame.filename))  # folders differ by machine
+            told = one_line(f"raised {type(error).__name__}: {text}")
+            return {"error": f"{told} ({file}:{frame.lineno})"}
 
     def make(self, name: str, parameters: dict[str, Any]) -> dict[str, Any]:
         """Construct the method, and return whether it is randomised."""
@@ -83,19 +92,6 @@ class MethodRunner:
         answer = self.aligner.align(map_a, map_b, correspondences, rng)
         elapsed_s = time.perf_counter() - started_s
         return alignment_to_json(checked_alignment(answer, len(correspondences), elapsed_s))
-
-
-def _description(error: BaseException) -> str:
-    """Return the error, file and line in one line, without folders, which differ by machine."""
-    try:
-        text = f"{error}{moved_module_note(error)}"
-    except BaseException:  # an error class of the plug-in may fail as well
-        text = ""
-    if isinstance(error, InvalidAnswerError):
-        return one_line(text)
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    file = one_line(os.path.basename(frame.filename))
-    return f"{one_line(f'raised {type(error).__name__}: {text}')} ({file}:{frame.lineno})"
 
 
 if __name__ == "__main__":

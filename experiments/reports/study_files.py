@@ -20,15 +20,25 @@ from experiments.reports.figures import study_figures
 from experiments.reports.figures.drawing import draw_figure, save_figure
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables
 from experiments.scenario.settings import AnyScenario
-from experiments.studies.benchmark import SIGMA_M, SIZE_M, SUMMARY, TRIALS, BenchmarkDesign
+from experiments.studies.benchmark import (
+    CROSSING,
+    SIGMA_M,
+    SIZE_M,
+    SUMMARY,
+    TRIALS,
+    BenchmarkDesign,
+    crossings,
+)
 from experiments.studies.independence_trial import (
+    COST_HEADINGS,
     COSTS,
     STRATEGIES,
     TEAMS,
     Independence,
     at_the_end,
+    shown_numbers,
 )
-from experiments.studies.paper_claims import CROSSING, READINGS, VALUES, crossings
+from experiments.studies.paper_claims import READINGS, VALUES, claims_table
 from experiments.studies.refusal_rates import (
     VERDICTS,
     Rate,
@@ -181,19 +191,6 @@ def cell_text(cell: pd.Series) -> str:
 
 
 FIGURE = "independence"
-# Columns of `at_the_end` in reports: headings of a page and of a screen.
-SHOWN = {
-    "robots_s": ("robots' own work, CPU s", "robots'\nCPU s"),
-    "busiest_robot_s": ("of the busiest robot", "busiest\nCPU s"),
-    "team_s": ("team's work, CPU s", "team's\nCPU s"),
-    "robot_peak_mb": ("peak of a robot, MB", "robot\nMB"),
-    "team_peak_mb": ("peak of the team's, MB", "team\nMB"),
-    "sent_mb": ("sent by all, MB", "sent\nMB"),
-    "landmark_rmse_m": ("map in its frame, mm", "map\nmm"),
-    "fitted_rmse_m": ("map after a fit, mm", "fitted\nmm"),
-    "path_rmse_m": ("paths after a fit, mm", "paths\nmm"),
-}
-_MM_PER_M = 1000.0
 
 
 def write_independence(
@@ -231,7 +228,7 @@ def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFram
     labels = {strategy.name: strategy.label for strategy in STRATEGIES}
     for n_robots, rows in summary.groupby("n_robots"):
         whole, n = rows["n_whole"].min(), rows["n_seeds"].max()
-        shown = {heading: shown_numbers(rows, name) for name, (heading, _) in SHOWN.items()}
+        shown = {heading: shown_numbers(rows, name) for name, (heading, _) in COST_HEADINGS.items()}
         table = pd.DataFrame({"way to one map": rows["strategy"].map(labels)} | shown)
         parts += [
             f"## {n_robots} robots\n",
@@ -239,11 +236,6 @@ def independence_markdown(scenarios: Sequence[AnyScenario], summary: pd.DataFram
             to_markdown(table),
         ]
     return "\n".join(parts)
-
-
-def shown_numbers(rows: pd.DataFrame, name: str) -> pd.Series:
-    """Return a column of `SHOWN` in the unit of its heading: errors in mm."""
-    return rows[name] * (_MM_PER_M if name.endswith("rmse_m") else 1.0)
 
 
 _RATES = ("false_runs", "false_pairs", "false_by_chance", "wrong_pairs", "on_ground", "ambiguous")
@@ -371,32 +363,6 @@ def claims_page(values: pd.DataFrame, crossing: pd.DataFrame) -> str:
         *(f"{line}\n" for line in crossing_lines(crossing)),
     ]
     return "\n".join(parts)
-
-
-def claims_table(values: pd.DataFrame) -> pd.DataFrame:
-    """Return rows of VALUES as a table with one row per claim and texts in all cells."""
-    rows = []
-    for _, own in values.groupby("name", sort=False):
-        first = own.iloc[0]
-        row = {"claim": f"{first['claim']} ({first['where']})", "measure": first["measure"]}
-        records: Any = own.to_dict("records")
-        for of in records:
-            row[f"{of['scenario']}, {of['renderer']}"] = claim_text(of)
-        rows.append(row | {"why": first["why"]})
-    return pd.DataFrame(rows)
-
-
-def claim_text(row: Mapping[str, Any]) -> str:
-    """Write verdict, value and interval of a row of VALUES."""
-    if math.isnan(row["value"]):
-        return str(row["verdict"])
-    value, low, high = (
-        "no answer" if math.isinf(row[name]) else f"{row[name]:.3g}"
-        for name in ("value", "value_low", "value_high")
-    )
-    unit = f" {row['unit']}" if row["unit"] else ""
-    interval = f" ({low} to {high})" if not math.isnan(row["value_low"]) else " (one run)"
-    return f"**{row['verdict']}**: {value}{unit}{interval}"
 
 
 def crossing_lines(crossing: pd.DataFrame) -> list[str]:

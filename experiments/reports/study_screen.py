@@ -27,8 +27,8 @@ from experiments.reports.layout import (
     print_skipped,
     print_table,
 )
-from experiments.reports.study_files import SHOWN, claims_table, shown_numbers
-from experiments.studies.independence_trial import STRATEGIES
+from experiments.studies.independence_trial import COST_HEADINGS, STRATEGIES, shown_numbers
+from experiments.studies.paper_claims import claims_table
 from experiments.studies.refusal_rates import VERDICTS, Rate, pooled, worst
 from experiments.studies.sweep import Survey, SweepProgress
 from experiments.studies.sweep_tables import (
@@ -70,10 +70,10 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
 
 def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[str]) -> None:
     """Print costs and errors of each strategy (rows of `at_the_end`), and the folder."""
-    headings = [("way", ""), *((heading, ">") for _, heading in SHOWN.values())]
+    headings = [("way", ""), *((heading, ">") for _, heading in COST_HEADINGS.values())]
     note = "; ".join(f"{strategy.name}: {strategy.label}" for strategy in STRATEGIES)
     for n_robots, rows in summary.groupby("n_robots"):
-        numbers = (shown_numbers(rows, name).map(two_digits) for name in SHOWN)
+        numbers = (shown_numbers(rows, name).map(two_digits) for name in COST_HEADINGS)
         cells = zip(rows["strategy"], *numbers, strict=True)
         whole = f"{rows['n_whole'].min()} of {rows['n_seeds'].max()} runs"
         title = f"{n_robots} robots, at the end (one map of all in {whole})"

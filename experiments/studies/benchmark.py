@@ -8,7 +8,7 @@ everything it depends on: an interrupted benchmark continues, and a new method a
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -361,4 +361,54 @@ def crossing_shares(errors: pd.DataFrame, first: str, second: str) -> list[float
         known = np.isfinite(left) and np.isfinite(right)
         along = left / (left - right) if known else 0.5
         found.append(float(share[k] + along * (share[k + 1] - share[k])))
+    return found
+
+
+# Shares of landmarks without a correspondence in the trials of `crossing_designs`: maps that the
+# correspondences cover, and maps as those of the scenarios, where few landmarks have one.
+UNPAIRED_SHARES = (0.0, 0.75)
+_N_PAIRS = 200
+_FALSE_SHARES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+
+
+def crossing_designs(aligners: Sequence[str], trials: int) -> list[BenchmarkDesign]:
+    """Return benchmarks of aligners on maps with known shares of false pairs."""
+    entries = entries_of(aligners)
+    return [
+        BenchmarkDesign(
+            entries,
+            trials,
+            pair_counts=(_N_PAIRS,),
+            outlier_shares=_FALSE_SHARES,
+            unpaired_share=unpaired,
+        )
+        for unpaired in UNPAIRED_SHARES
+    ]
+
+
+# One row per share of unpaired landmarks, share of false pairs and aligner.
+CROSSING = schema(
+    "paper.crossing",
+    1,
+    fields(unpaired_share=FLOAT, outlier_share=FLOAT, method=TEXT, n_trials=INT, error_m=FLOAT),
+)
+
+
+def crossing_rows(trials: Mapping[float, pd.DataFrame]) -> pd.DataFrame:
+    """Return the median errors of the trials of each share of unpaired landmarks (CROSSING)."""
+    parts = []
+    for unpaired, rows in trials.items():
+        errors = median_errors(rows).reset_index()
+        long = errors.melt("outlier_share", var_name="method", value_name="error_m")
+        n = rows.groupby(["outlier_share", "method"]).size().rename("n_trials").reset_index()
+        parts.append(long.merge(n, "left").assign(unpaired_share=unpaired))
+    return pd.concat(parts, ignore_index=True)[CROSSING.names]
+
+
+def crossings(rows: pd.DataFrame, first: str, second: str) -> dict[float, list[float]]:
+    """Return `crossing_shares` by share of unpaired landmarks for rows of CROSSING."""
+    found = {}
+    for unpaired, own in rows.groupby("unpaired_share"):
+        errors = own.pivot_table("error_m", "outlier_share", "method")
+        found[float(str(unpaired))] = crossing_shares(errors, first, second)
     return found

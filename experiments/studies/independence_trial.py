@@ -469,3 +469,23 @@ def at_the_end(found: Independence) -> pd.DataFrame:
         .sort_values(["n_robots", "place"], ignore_index=True)
         .drop(columns="place")
     )
+
+
+# Columns of `at_the_end` in reports: headings of a page and of a screen.
+COST_HEADINGS = {
+    "robots_s": ("robots' own work, CPU s", "robots'\nCPU s"),
+    "busiest_robot_s": ("of the busiest robot", "busiest\nCPU s"),
+    "team_s": ("team's work, CPU s", "team's\nCPU s"),
+    "robot_peak_mb": ("peak of a robot, MB", "robot\nMB"),
+    "team_peak_mb": ("peak of the team's, MB", "team\nMB"),
+    "sent_mb": ("sent by all, MB", "sent\nMB"),
+    "landmark_rmse_m": ("map in its frame, mm", "map\nmm"),
+    "fitted_rmse_m": ("map after a fit, mm", "fitted\nmm"),
+    "path_rmse_m": ("paths after a fit, mm", "paths\nmm"),
+}
+_MM_PER_M = 1000.0
+
+
+def shown_numbers(rows: pd.DataFrame, name: str) -> pd.Series:
+    """Return a column of `COST_HEADINGS` in the unit of its heading: errors in mm."""
+    return rows[name] * (_MM_PER_M if name.endswith("rmse_m") else 1.0)

@@ -34,12 +34,6 @@ from experiments.evaluation.loop_closures import WINDOW_FRAMES, LoopClosure, loo
 from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import repetition_spread_m
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields
-from experiments.studies.benchmark import (
-    BenchmarkDesign,
-    crossing_shares,
-    entries_of,
-    median_errors,
-)
 from experiments.studies.intervals import RUN, Clusters, median_interval
 from experiments.studies.run_tables import Runs
 from mapfusion.errors import InputError
@@ -850,51 +844,27 @@ def _value(claim: Claim, of: TablesOfRun) -> float:
         return math.nan
 
 
-# Shares of landmarks without a correspondence in the trials of `crossing_design`: maps that the
-# correspondences cover, and maps as those of the scenarios, where few landmarks have one.
-UNPAIRED_SHARES = (0.0, 0.75)
-_N_PAIRS = 200
-_FALSE_SHARES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+def claims_table(values: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of VALUES as a table with one row per claim and texts in all cells."""
+    rows = []
+    for _, own in values.groupby("name", sort=False):
+        first = own.iloc[0]
+        row = {"claim": f"{first['claim']} ({first['where']})", "measure": first["measure"]}
+        records: Any = own.to_dict("records")
+        for of in records:
+            row[f"{of['scenario']}, {of['renderer']}"] = claim_text(of)
+        rows.append(row | {"why": first["why"]})
+    return pd.DataFrame(rows)
 
 
-def crossing_designs(trials: int) -> list[BenchmarkDesign]:
-    """Return benchmarks of the paper's aligners on maps with known shares of false pairs."""
-    entries = entries_of(ALIGNERS)
-    return [
-        BenchmarkDesign(
-            entries,
-            trials,
-            pair_counts=(_N_PAIRS,),
-            outlier_shares=_FALSE_SHARES,
-            unpaired_share=unpaired,
-        )
-        for unpaired in UNPAIRED_SHARES
-    ]
-
-
-# One row per share of unpaired landmarks, share of false pairs and aligner.
-CROSSING = schema(
-    "paper.crossing",
-    1,
-    fields(unpaired_share=FLOAT, outlier_share=FLOAT, method=TEXT, n_trials=INT, error_m=FLOAT),
-)
-
-
-def crossing_rows(trials: Mapping[float, pd.DataFrame]) -> pd.DataFrame:
-    """Return the median errors of the trials of each share of unpaired landmarks (CROSSING)."""
-    parts = []
-    for unpaired, rows in trials.items():
-        errors = median_errors(rows).reset_index()
-        long = errors.melt("outlier_share", var_name="method", value_name="error_m")
-        n = rows.groupby(["outlier_share", "method"]).size().rename("n_trials").reset_index()
-        parts.append(long.merge(n, "left").assign(unpaired_share=unpaired))
-    return pd.concat(parts, ignore_index=True)[CROSSING.names]
-
-
-def crossings(rows: pd.DataFrame, first: str, second: str) -> dict[float, list[float]]:
-    """Return `crossing_shares` by share of unpaired landmarks for rows of CROSSING."""
-    found = {}
-    for unpaired, own in rows.groupby("unpaired_share"):
-        errors = own.pivot_table("error_m", "outlier_share", "method")
-        found[float(str(unpaired))] = crossing_shares(errors, first, second)
-    return found
+def claim_text(row: Mapping[str, Any]) -> str:
+    """Write verdict, value and interval of a row of VALUES."""
+    if math.isnan(row["value"]):
+        return str(row["verdict"])
+    value, low, high = (
+        "no answer" if math.isinf(row[name]) else f"{row[name]:.3g}"
+        for name in ("value", "value_low", "value_high")
+    )
+    unit = f" {row['unit']}" if row["unit"] else ""
+    interval = f" ({low} to {high})" if not math.isnan(row["value_low"]) else " (one run)"
+    return f"**{row['verdict']}**: {value}{unit}{interval}"

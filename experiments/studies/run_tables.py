@@ -17,10 +17,11 @@ import pyarrow as pa
 from experiments.evaluation import tables
 from experiments.evaluation.criteria import RUN_KEYS, setting_columns
 from experiments.evaluation.tables import read_provenance, read_scenario, require_tables
-from experiments.studies.sweep_tables import SCHEMA_VERSION
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, require_version, row_groups, text_attributes
 
+# Version of a sweep's files: since 3 their row groups are those of `joined_tables`.
+SWEEP_SCHEMA_VERSION = 3
 _VERSION = b"mapfusion.schema_version"
 _STATUS = ("status", "reason")  # columns of `runs` of a sweep
 # One call to reduce a batch takes as long as 10 000 rows; a batch of `errors` is about 15 MB.
@@ -172,7 +173,7 @@ def find_runs(paths: Path | Sequence[Path]) -> Runs:
     for path in [paths] if isinstance(paths, Path) else paths:
         if (path / "sweep.json").is_file():
             about = path / "sweep.json"
-            require_version(about, read_json(about, "description of a sweep"), SCHEMA_VERSION)
+            require_version(about, read_json(about, "description of a sweep"), SWEEP_SCHEMA_VERSION)
             sweeps.append(path)
         elif (path / "scenario.json").is_file():
             require_tables(path)

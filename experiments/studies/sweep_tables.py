@@ -35,6 +35,7 @@ from experiments.evaluation.metrics import load_checked
 from experiments.pipeline.stage import library_versions, source_hash
 from experiments.pipeline.tables import FLOAT, TEXT, fields
 from experiments.scenario.settings import AnyScenario
+from experiments.studies.run_tables import SWEEP_SCHEMA_VERSION
 from mapfusion.errors import DamagedFileError, InputError, StoreRepairWarning
 from mapfusion.files import (
     read_json,
@@ -46,7 +47,6 @@ from mapfusion.files import (
 )
 
 _HASH_LENGTH = 8  # hexadecimal digits of a run's values: 32 bits, and clashes are refused
-SCHEMA_VERSION = 3  # since 3 the row groups of a file are those of `joined_tables`
 RUNS, RUN_TIMES, ALIGNER_TIMINGS = "runs", "run_times", "aligner_timings"
 Rows = pd.DataFrame | list[dict[str, Any]]
 
@@ -124,7 +124,9 @@ class SweepDataset:
         described |= dict(run.settings)
         leading = fields(**dict.fromkeys(described, TEXT) | {"seed": pa.int64()})
         own_schema = schema(
-            f"sweep.{table}", SCHEMA_VERSION, [field.remove_metadata() for field in leading + own]
+            f"sweep.{table}",
+            SWEEP_SCHEMA_VERSION,
+            [field.remove_metadata() for field in leading + own],
         )
         if not len(rows):
             return own_schema.empty_table()
@@ -199,13 +201,13 @@ class JoinedTables:
             if folder.exists() and any(folder.iterdir()):
                 what = "is no folder of a sweep (no sweep.json); give another --output"
                 raise InputError(f"{folder}: {what}")
-            return _Description(schema_version=SCHEMA_VERSION, settings=keys)
+            return _Description(schema_version=SWEEP_SCHEMA_VERSION, settings=keys)
         try:
             found = _Description.model_validate(read_json(path, "description of a sweep"))
         except ValidationError as error:
             raise InputError(f"{path}: damaged or no description of a sweep") from error
-        if found.schema_version != SCHEMA_VERSION:
-            reads = f"this program adds to {SCHEMA_VERSION} alone; give it another --output"
+        if found.schema_version != SWEEP_SCHEMA_VERSION:
+            reads = f"this program adds to {SWEEP_SCHEMA_VERSION} alone; give it another --output"
             raise InputError(f"{path}: schema_version is {found.schema_version}, {reads}")
         if found.settings != keys:
             was, now = (", ".join(names) or "seeds alone" for names in (found.settings, keys))
@@ -222,7 +224,7 @@ class JoinedTables:
                 self._place[run_id] = len(self.run_ids)
                 self.run_ids.append(run_id)
         description = {
-            "schema_version": SCHEMA_VERSION,
+            "schema_version": SWEEP_SCHEMA_VERSION,
             "kind": "sweep",
             "settings": self.dataset.keys,
         }

@@ -16,7 +16,7 @@ from mapfusion.align.geometric_matching import (
     attributes_of_pairs_agree,
     match_by_geometry,
 )
-from mapfusion.descriptors import USURF, relative, require_one_kind
+from mapfusion.descriptors import USURF, relative_distance, require_one_kind
 from mapfusion.geometry.numerics import (
     WORD,
     Float,
@@ -524,7 +524,11 @@ def _mutually_nearest(
     nearest_b, distance2, nearest_a = nearest_descriptors(map_a, map_b, height_bound, floor_m2)
     rows = np.flatnonzero(nearest_a[nearest_b] == np.arange(len(map_a)))
     apart = np.sqrt(np.maximum(distance2[rows], 0.0))
-    return rows, nearest_b[rows], relative(apart, map_a.descriptor_kind, map_b.descriptor_kind)
+    return (
+        rows,
+        nearest_b[rows],
+        relative_distance(apart, map_a.descriptor_kind, map_b.descriptor_kind),
+    )
 
 
 def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters) -> str:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.descriptors import USURF, reach
+from mapfusion.descriptors import USURF, euclidean_distance_at
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float, chi_square_bound
@@ -100,7 +100,7 @@ def links(
         squares = (np.einsum("ij,ij->i", each, each) for each in (one, two))
         similarity += 1 - np.add.outer(*squares) / 2
     other, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    most = reach(_MAX_DESCRIPTOR_DISTANCE, seen.descriptor_kind)
+    most = euclidean_distance_at(_MAX_DESCRIPTOR_DISTANCE, seen.descriptor_kind)
     similar = similarity.max(axis=1) > 1 - most**2 / 2
     mutual = similar & (back[other] == np.arange(len(a)))
     return a[mutual], b[other[mutual]]

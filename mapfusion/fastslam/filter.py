@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
-from mapfusion.descriptors import DescriptorKind, reach
+from mapfusion.descriptors import DescriptorKind, euclidean_distance_at
 from mapfusion.fastslam.association import (
     Association,
     associate,
@@ -383,7 +383,7 @@ class FastSlam:
                 seen,
                 settings.gate,
                 observations.descriptor,
-                reach(settings.descriptor_threshold, observations.descriptor_kind),
+                euclidean_distance_at(settings.descriptor_threshold, observations.descriptor_kind),
             )
         else:
             pairs = candidate_pairs(self._maps, seen, settings.gate)

@@ -10,7 +10,7 @@ import scipy
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.rigid_motion import motion_jacobian
-from mapfusion.descriptors import USURF, DescriptorKind, merged_kind, relative
+from mapfusion.descriptors import USURF, DescriptorKind, merged_kind, relative_distance
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.geometry.se2 import transform_covariances, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -191,7 +191,7 @@ class AssociationTest:
         i, j = self._gated(a, b)
         both_labelled = (a.label[i] != NO_LABEL) & (b.label[j] != NO_LABEL)
         apart = np.linalg.norm(a.descriptor[i] - b.descriptor[j], axis=1)
-        distance = relative(apart, a.kind, b.kind)
+        distance = relative_distance(apart, a.kind, b.kind)
         passes = ~both_labelled & (distance <= self.max_descriptor_distance)  # False for NaN
         return (
             np.concatenate([labelled_a[same_a], i[passes]]),

@@ -4,6 +4,7 @@ Joint fusion provides the associations and the initial poses of the maps. Then t
 members are smoothed as one. Robots have to exchange their complete logs for this.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +12,18 @@ import numpy as np
 from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
-from mapfusion.smoother.joint_smoothing import smooth_jointly
-from mapfusion.smoother.smooth import condensed_points
+from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.se2 import IDENTITY, between, compose
+from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
+from mapfusion.smoother.elimination import pose_covariances, require_memory
+from mapfusion.smoother.noise_estimation import UNIT_SCALES, optimize_with_noise
+from mapfusion.smoother.normal_equations import Estimate, initial_landmarks
+from mapfusion.smoother.optimizer import Problem, optimize
+from mapfusion.smoother.problem import order_observations
+from mapfusion.smoother.smooth import AssociatedLog, Smoothed, condensed_points
 
 _NO_POINT = -1
+_UNKNOWN = np.zeros((1, 3))  # information of the motion between two logs
 
 
 @dataclass(frozen=True)
@@ -74,3 +83,102 @@ class Batch:
             motion_covariance=motion_covariance,
             paths=smoothed.paths,
         )
+
+
+@dataclass(frozen=True)
+class JointlySmoothed:
+    """Result of smoothing K logs, in the frame of the first robot's first pose.
+
+    Attributes:
+        smoothed: poses of all logs, points and their joint covariance.
+        points: number of each point as given, shape (L,).
+        T_first_robot: first pose of each robot, shape (K, 3).
+        motion_covariance: covariances of the first poses, shape (K, 3, 3); zero for the first.
+        paths: path of each robot, shape (T_k, 3).
+    """
+
+    smoothed: Smoothed
+    points: np.ndarray
+    T_first_robot: Float
+    motion_covariance: Float
+    paths: tuple[Float, ...]
+
+
+def smooth_jointly(
+    recordings: Sequence[AssociatedLog],
+    points: Sequence[np.ndarray],
+    T_first_robot: Float,
+    max_memory_gb: float,
+) -> JointlySmoothed:
+    """Compute the most probable paths and points of K robots with equal noise scales.
+
+    The logs are concatenated. The odometry between the last frame of one log and the first frame
+    of the next is unknown, so only observations determine where a robot began. The frame is the
+    first pose of the first robot.
+
+    Args:
+        recordings: K recordings; `stray_m` is that of the first.
+        points: point number of each observation of each log, shape (N_k,); the same number in two
+            logs is the same point; negative for none.
+        T_first_robot: initial poses of the robots' frames in the first one, shape (K, 3).
+        max_memory_gb: smoothing that may take more memory is refused.
+
+    Raises:
+        LinAlgError: the pose of a robot is not determined.
+        MemoryError: it may take more than `max_memory_gb`.
+    """
+    log, point = _concatenate([each.log for each in recordings]), np.concatenate(points)
+    offset_prior = recordings[0].parameters.offset_prior
+    obs = order_observations(log, point, min_count=1, with_offsets=offset_prior > 0)
+    require_memory(obs, max_memory_gb)
+    starts = np.cumsum([0, *(len(each.log) for each in recordings[:-1])])
+    path = np.concatenate(
+        [
+            compose(T, between(each.path[0], each.path))
+            for T, each in zip(T_first_robot, recordings, strict=True)
+        ]
+    )
+    path[0] = IDENTITY  # removes rounding errors
+    information = [
+        np.concatenate([each.parameters.odometry_information(each.log), _UNKNOWN])
+        for each in recordings
+    ]
+    problem = Problem(obs, log.odometry, np.concatenate(information)[:-1], offset_prior)
+    start = Estimate(path, initial_landmarks(obs, path), np.zeros((len(obs.has_offset), 3)))
+    if all(each.parameters.has_own_odometry for each in recordings):
+        state, scales = optimize_with_noise(problem, start)
+    else:
+        state, scales = optimize(problem, start), UNIT_SCALES
+    covariance = np.zeros((len(starts), 3, 3))
+    covariance[1:] = pose_covariances(obs, state.equations, state.solution, starts[1:])
+    names = point[obs.row[obs.starts[:-1]]]
+    paths = tuple(np.split(state.estimate.path, starts[1:]))
+    smoothed = Smoothed.of(problem, state, point, scales)
+    if smoothed.second_order is not None:
+        covariance += smoothed.second_order.pose_covariances(starts)
+    return JointlySmoothed(smoothed, names, state.estimate.path[starts], covariance, paths)
+
+
+def _concatenate(logs: Sequence[RobotLog]) -> RobotLog:
+    """Concatenate the logs; they have no common tracks."""
+    n_before = np.cumsum([0, *(len(log) for log in logs[:-1])])
+    tracks, first_free = [], 0
+    for log in logs:
+        track = log.observations.track
+        track = np.full(len(log.observations), NO_TRACK) if track is None else track
+        tracks.append(np.where(track == NO_TRACK, NO_TRACK, track.astype(np.int64) + first_free))
+        first_free = max(first_free, int(tracks[-1].max(initial=NO_TRACK)) + 1)
+    iteration = [log.iteration + n for log, n in zip(logs, n_before, strict=True)]
+    obs = Observations(
+        np.concatenate([log.observations.position_m for log in logs]),
+        np.concatenate([log.observations.covariance_m2 for log in logs]),
+        track=np.concatenate(tracks),
+    )
+    return RobotLog(
+        logs[0].robot,
+        any(log.planar for log in logs),
+        np.arange(n_before[-1] + len(logs[-1])) * 1.0,
+        np.concatenate([log.odometry for log in logs]),
+        np.concatenate(iteration),
+        obs,
+    )

@@ -4,7 +4,6 @@ A package provides a fuser by an entry point of the group `mapfusion.fusers`: it
 that implements `Fuser` and has a constructor without arguments.
 """
 
-import importlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,6 +21,7 @@ from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Probability, Range, require_in_range
+from mapfusion.plugin_classes import load_class
 from mapfusion.smoother.smooth import AssociatedLog
 
 
@@ -286,9 +286,8 @@ def make_fuser(name: str = USUAL) -> Fuser:
         ValueError: the name is unknown, or a plug-in cannot be used.
     """
     target = target_of(name)
-    module, _, attribute = target.partition(":")
     try:
-        made = getattr(importlib.import_module(module), attribute)()
+        made = load_class(target)()
     except Exception as error:
         told = f"{error}{moved_module_note(error)}"
         raise ValueError(f"fuser {name}: {target} cannot be made: {told}") from error

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from mapfusion.align.alignment import MIN_PAIRS
-from mapfusion.descriptors import USURF, merged_kind, relative
+from mapfusion.descriptors import USURF, merged_kind, relative_distance
 from mapfusion.fusion.aligned_landmarks import (
     ABSENT,
     AlignedLandmarks,
@@ -272,7 +272,7 @@ def _candidates(
             unlabelled = (labels[a][i] == NO_LABEL) | (labels[b][j] == NO_LABEL)
             i, j = i[unlabelled], j[unlabelled]
             apart = np.linalg.norm(first[i] - second[j], axis=1).astype(np.float64)
-            distance = relative(apart, given[a].descriptor_kind, given[b].descriptor_kind)
+            distance = relative_distance(apart, given[a].descriptor_kind, given[b].descriptor_kind)
             similar = distance <= parameters.max_descriptor_distance
             i, j, distance = i[similar], j[similar], distance[similar]
 

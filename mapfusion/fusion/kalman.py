@@ -159,7 +159,7 @@ class KalmanAsPrinted:
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the maps of a component; `fallback` reports covariances that are not positive."""
         fused = fuse_sequentially(component, parameters, kalman_update_as_printed, use_drift=False)
-        dimensions = 2 if fused.landmarks.planar else 3
+        dimensions = fused.landmarks.n_dimensions
         several = np.count_nonzero(fused.parents != ABSENT, axis=1) > 1
         covariance = fused.landmarks.covariance_m2[several, :dimensions, :dimensions]
         n_wrong = int(np.count_nonzero(np.linalg.eigvalsh(covariance)[:, 0] <= 0))

@@ -317,7 +317,9 @@ def advice(found: Sequence[MapAlignment]) -> str:
     text += f", {sigma_text(at_overlap, refined.lower_bound)} where the maps overlap. It is "
     text += "accepted"
     text += f": {np.count_nonzero(best.inlier)} of {len(best.inlier)} correspondences support it, "
-    text += f"chance gives as much once in {_times(-_log10_chance(best))} pairs of maps"
+    log10_pairs = -_log10_chance(best)
+    n_pairs = f"1e{log10_pairs:.0f}" if math.isfinite(log10_pairs) else "an unknown number of"
+    text += f"chance gives as much once in {n_pairs} pairs of maps"
     if several:
         agree = "all" if len(accepted) == len(found) else f"{len(accepted)} of"
         text += f", and {agree} {len(found)} methods agree"
@@ -327,10 +329,6 @@ def advice(found: Sequence[MapAlignment]) -> str:
 
 _RANKS = [Status.ACCEPTED, Status.AMBIGUOUS, Status.TOO_UNCERTAIN, Status.REFUSED]
 _RANKS += [Status.DEGENERATE, Status.FAILED, Status.ABSENT]
-
-
-def _times(log10: float) -> str:
-    return f"1e{log10:.0f}" if math.isfinite(log10) else "an unknown number of"
 
 
 def _sentence(text: str) -> str:

@@ -121,6 +121,11 @@ def chi_square_bound(probability: float, degrees_of_freedom: float) -> float:
     return 2.0 * float(gammaincinv(degrees_of_freedom / 2, probability))
 
 
+def squared_mahalanobis(error: Float, covariance: Float) -> Float:
+    """Return squared Mahalanobis lengths of errors (..., D) with covariances (..., D, D)."""
+    return np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
 _SINGULAR = 1e-12  # largest determinant by rounding errors, for a matrix of unit diagonal
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapfusion.align.correspondences import HeightGate
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
-from mapfusion.descriptors import reach
+from mapfusion.descriptors import euclidean_distance_at
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import inverse, rotation, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -354,7 +354,7 @@ class ViewedMapPair:
         planar = a.landmarks.planar or b.landmarks.planar
         bound = np.inf if planar else height.bound
         kinds = a.landmarks.descriptor_kind, b.landmarks.descriptor_kind
-        unlike = reach(parameters.max_descriptor_distance, *kinds)
+        unlike = euclidean_distance_at(parameters.max_descriptor_distance, *kinds)
         self._gates = MatchGates(parameters.gate_m, bound, height.floor_m**2, unlike)
         # matches and visibility of all landmarks of a map (first key: True for map a) by motion
         self._found: dict[tuple[bool, bytes], np.ndarray] = {}

@@ -338,7 +338,16 @@ def common_unit(
     correspondences agree.
     """
     for unit, size_m in _UNITS.items():
-        a, b = (_scaled(each, size_m) for each in (map_a, map_b))
+        a, b = (
+            replace(
+                each,
+                position_m=each.position_m * size_m,
+                covariance_m2=each.covariance_m2 * size_m**2,
+                joint=None,
+                viewing=None,
+            )
+            for each in (map_a, map_b)
+        )
         pairs = Pairs(a, b, match(a, b, parameters))
         aligner = MethodAligner(Clique())
         found = aligner.align_pairs(pairs, np.random.default_rng(0))
@@ -349,17 +358,6 @@ def common_unit(
         if refined.ok and 2 * np.count_nonzero(refined.inlier) > len(pairs) and extent_m > 1:
             return unit
     return ""
-
-
-def _scaled(landmarks: LandmarkMap, size_m: float) -> LandmarkMap:
-    """Return a map in metres whose unit has this size, without joint covariance and viewing."""
-    return replace(
-        landmarks,
-        position_m=landmarks.position_m * size_m,
-        covariance_m2=landmarks.covariance_m2 * size_m**2,
-        joint=None,
-        viewing=None,
-    )
 
 
 def supported_by(

@@ -19,7 +19,7 @@ from mapfusion.align.correspondences import (
 from mapfusion.align.geometric_matching import DISTINCT_M
 from mapfusion.align.nearest_neighbours import Grid, ranges_within
 from mapfusion.align.refinement import Refinement
-from mapfusion.descriptors import reach, relative
+from mapfusion.descriptors import euclidean_distance_at, relative_distance
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import rms_distance_m, transform_points
 from mapfusion.landmark_map import LandmarkMap
@@ -108,7 +108,7 @@ def similar_landmarks(landmarks: LandmarkMap) -> Correspondences:
     gates = bound, height.floor_m**2, _ELSEWHERE_M
     nearest, distance2, _ = nearest_descriptors(landmarks, landmarks, *gates)
     rows = np.arange(n)
-    unlike = relative(np.sqrt(np.maximum(distance2, 0.0)), landmarks.descriptor_kind)
+    unlike = relative_distance(np.sqrt(np.maximum(distance2, 0.0)), landmarks.descriptor_kind)
     kept = (nearest >= 0) & (nearest[nearest] == rows) & (unlike <= _UNLIKE)
     return Correspondences(rows[kept], nearest[kept], unlike[kept])
 
@@ -271,7 +271,7 @@ def explained_landmarks(
     row_a, row_b = near["i"], near["j"]
     if map_a.descriptor is not None and map_b.descriptor is not None:
         off = map_a.descriptor[row_a] - map_b.descriptor[row_b]
-        unlike = reach(_UNLIKE, map_a.descriptor_kind, map_b.descriptor_kind)
+        unlike = euclidean_distance_at(_UNLIKE, map_a.descriptor_kind, map_b.descriptor_kind)
         row_b = row_b[np.linalg.norm(off, axis=1) <= unlike]
     explained = np.zeros(len(map_b), np.bool_)
     explained[row_b] = True

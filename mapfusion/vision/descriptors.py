@@ -8,13 +8,8 @@ SIFT: Lowe (2004), "Distinctive image features from scale-invariant keypoints". 
 Konolige and Bradski (2011), "ORB: an efficient alternative to SIFT or SURF".
 """
 
-import importlib
-import importlib.util
 import math
-import re
-import sys
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
@@ -23,10 +18,10 @@ import numpy as np
 from mapfusion.descriptors import USURF, DescriptorKind, Metric, as_vectors, require_metric
 from mapfusion.errors import InputError, did_you_mean, moved_module_note, one_line
 from mapfusion.geometry.numerics import Float
+from mapfusion.plugin_classes import IN_FILE, load_class, target_in_file
 from mapfusion.vision import surf
 
 GROUP = "mapfusion.descriptors"  # entry points of other packages
-_OWN_FILE = re.compile(r"(.+\.py):(\w+)")  # a class in a Python file
 
 
 class Describer(Protocol):
@@ -147,10 +142,8 @@ def target_of(name: str) -> str:
     """
     if name in DESCRIBERS:
         return f"{__name__}:{DESCRIBERS[name].__name__}"
-    if own := _OWN_FILE.fullmatch(name):
-        if not Path(own[1]).is_file():
-            raise ValueError(f"{own[1]}: no such file (expected FILE.py:CLASS of a descriptor)")
-        return f"{Path(own[1]).absolute()}:{own[2]}"
+    if in_file := target_in_file(name, "a descriptor"):
+        return in_file
     offered = {entry.name: entry.value for entry in entry_points(group=GROUP)}
     if name not in offered:
         known = [*DESCRIBERS, *offered]
@@ -168,12 +161,11 @@ class NamedDescriber:
     """
 
     def __init__(self, name: str) -> None:
-        self._name, own = name, _OWN_FILE.fullmatch(name)
+        self._name, own = name, IN_FILE.fullmatch(name)
         self._method = own[2] if own else name  # in files: the folder does not matter
         target = target_of(name)
-        place, _, attribute = target.rpartition(":")
         try:
-            made = getattr(_module(place), attribute)()
+            made = load_class(target)()
             require_metric(made.metric)
         except Exception as error:
             told = f"{error}{moved_module_note(error)}"
@@ -211,17 +203,3 @@ class NamedDescriber:
         except ValueError as error:
             raise InputError(f"descriptor {name}: {error}") from error
         return vectors, kind
-
-
-def _module(place: str) -> Any:
-    """Import a module by its name, or a Python file under a name of its own."""
-    if not place.endswith(".py"):
-        return importlib.import_module(place)
-    own_name = f"mapfusion_own_{Path(place).stem}"
-    spec = importlib.util.spec_from_file_location(own_name, place)
-    assert spec is not None
-    assert spec.loader is not None
-    made = importlib.util.module_from_spec(spec)
-    sys.modules[own_name] = made  # dataclasses look their module up
-    spec.loader.exec_module(made)
-    return made

@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from mapfusion.camera import StereoCamera
-from mapfusion.descriptors import USURF, DescriptorKind, reach
+from mapfusion.descriptors import USURF, DescriptorKind, euclidean_distance_at
 from mapfusion.geometry.numerics import Float, kernel, require_finite, require_shape
 from mapfusion.parameters import Probability, Range, require_in_range
 from mapfusion.vision.patch_alignment import Templates, fit_patches
@@ -391,7 +391,7 @@ def link(
         Row in `previous` of each feature of `current`, or -1, shape (N,).
     """
     steps = min(steps, _LONGEST_PAUSE)
-    unlike = reach(parameters.max_descriptor_distance, previous.kind, current.kind)
+    unlike = euclidean_distance_at(parameters.max_descriptor_distance, previous.kind, current.kind)
     return _link_mutually(
         previous.uv_px,
         previous.disparity_px,

@@ -17,12 +17,12 @@ from mapfusion.descriptors import (
     DescriptorKind,
     Metric,
     as_vectors,
+    euclidean_distance_at,
     guessed_kind,
     median_distance,
     merged_kind,
     pack_bits,
-    reach,
-    relative,
+    relative_distance,
     require_one_kind,
     unpack_bits,
 )
@@ -92,12 +92,14 @@ def test_different_landmarks_have_a_median_distance_of_08(
 ) -> None:
     vectors, kind = as_vectors(looks_of(KINDS[name], rng, 100), KINDS[name])
     apart = np.array([np.linalg.norm(a - b) for a, b in itertools.combinations(vectors, 2)])
-    assert np.median(relative(apart, kind)) == pytest.approx(0.8, rel=1e-5)
-    assert relative(reach(0.3, kind), kind) == pytest.approx(0.3)
+    assert np.median(relative_distance(apart, kind)) == pytest.approx(0.8, rel=1e-5)
+    assert relative_distance(euclidean_distance_at(0.3, kind), kind) == pytest.approx(0.3)
     if kind.metric == "hamming":  # the distance is the number of different bits
-        assert relative(np.sqrt(128), kind) == pytest.approx(2 * relative(np.sqrt(64), kind))
-    assert reach(0.3, USURF) == 0.3
-    assert relative(0.3, USURF, USURF) == 0.3
+        assert relative_distance(np.sqrt(128), kind) == pytest.approx(
+            2 * relative_distance(np.sqrt(64), kind)
+        )
+    assert euclidean_distance_at(0.3, USURF) == 0.3
+    assert relative_distance(0.3, USURF, USURF) == 0.3
 
 
 def test_the_kind_of_unknown_numbers(rng: np.random.Generator) -> None:

@@ -14,8 +14,8 @@ from experiments.evaluation.tables import UNKNOWN
 from experiments.reports.figures import style
 from experiments.reports.figures.result_tables import NothingToDraw
 from experiments.reports.figures.style import BLACK, GRAY
+from experiments.studies.benchmark import crossings
 from experiments.studies.independence_trial import STRATEGIES
-from experiments.studies.paper_claims import crossings
 from experiments.studies.refusal_rates import (
     FEW,
     POSTER_RADII_M,

@@ -52,7 +52,6 @@ from experiments.reports.report.charts import (
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
 from experiments.reports.run_screen import images_by, team_lines
-from experiments.reports.study_files import claims_table
 from experiments.scenario.settings import Bound
 from experiments.studies.comparison import (
     BETTER,
@@ -63,7 +62,7 @@ from experiments.studies.comparison import (
 )
 from experiments.studies.intervals import FEW_RUNS
 from experiments.studies.method_comparison import recommend
-from experiments.studies.paper_claims import SCENARIOS, compare_with_paper
+from experiments.studies.paper_claims import SCENARIOS, claims_table, compare_with_paper
 from experiments.studies.run_tables import Runs, find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, BAND, configurations, reduced_errors
 from mapfusion.errors import InputError, install_command

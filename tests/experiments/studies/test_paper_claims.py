@@ -9,16 +9,17 @@ import pandas as pd
 import pytest
 
 from experiments.pipeline.tables import read_rows
-from experiments.reports.study_files import claim_text, claims_page, claims_table
-from experiments.studies.benchmark import crossing_shares
+from experiments.reports.study_files import claims_page
+from experiments.studies.benchmark import CROSSING, crossing_shares
 from experiments.studies.paper_claims import (
     CLAIMS,
-    CROSSING,
     SCENARIOS,
     VALUES,
     NotMeasured,
     TablesOfRun,
     Verdict,
+    claim_text,
+    claims_table,
     compare_with_paper,
     verdict,
 )

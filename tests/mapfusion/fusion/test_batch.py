@@ -8,14 +8,13 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from mapfusion.fusion.aligned_landmarks import ABSENT
-from mapfusion.fusion.batch import Batch
+from mapfusion.fusion.batch import Batch, JointlySmoothed, smooth_jointly
 from mapfusion.fusion.fusers import FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.fusion.merge import connect
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, compose, rotation, wrap
 from mapfusion.robot_log import NO_TRACK
-from mapfusion.smoother.joint_smoothing import JointlySmoothed, smooth_jointly
 from tests.mapfusion.fusion.logged_team import STRAY_M, LoggedTeam, labels, log_labels
 from tests.mapfusion.smoother.white_noise_logs import NOISE, Known
 

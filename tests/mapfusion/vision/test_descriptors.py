@@ -185,5 +185,5 @@ def test_wrong_answers_of_plug_ins_are_told_in_one_line(
 def test_plug_ins_that_cannot_be_made_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be made: descriptor_metric: is 'manhattan'"):
         NamedDescriber(plug_in(tmp_path, "manhattan"))
-    with pytest.raises(InputError, match=r"cannot be made: .* no attribute 'Dark'"):
+    with pytest.raises(InputError, match=r"cannot be made: .* no class Dark; there: Brightness"):
         NamedDescriber(plug_in(tmp_path).replace("Brightness", "Dark"))
