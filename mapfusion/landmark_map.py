@@ -9,6 +9,7 @@ The file of a joint covariance stores the independent part of each landmark's co
 precision, and the effect of the shared variables in single precision.
 """
 
+import re
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -232,6 +233,13 @@ class LandmarkMap:
             raise ValueError(f"joint: of {len(self.joint)} landmarks, the map has {n}")
         if self.viewing is not None and len(self.viewing) != n:
             raise ValueError(f"viewing: of {len(self.viewing)} landmarks, the map has {n}")
+
+    @property
+    def called(self) -> str:
+        """Name in messages: `map NAME`, or NAME alone if it begins with the word map."""
+        return (
+            self.name if re.match(r"map(?![a-z])", self.name, re.IGNORECASE) else f"map {self.name}"
+        )
 
     def __len__(self) -> int:
         return len(self.position_m)
