@@ -208,4 +208,4 @@ def test_no_message_says_map_twice(name: str, called: str) -> None:
     labelled = replace(each, label=np.arange(2, dtype=np.int32))
     shortage = match(labelled, other).shortage
     assert f"{called} only labels" in shortage
-    assert "map map" not in shortage
+    assert "map map " not in shortage
