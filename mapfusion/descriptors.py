@@ -38,6 +38,7 @@ USURF_MEDIAN = 0.8
 # Ratio of the references of two maps from which on their numbers have different units. Maps of one
 # method differ by a few percent.
 _OTHER_UNIT = 4.0
+_ONE_METHOD = "compute both by one method, or remove the column `descriptor`"
 _METRIC, _NAME, _REFERENCE = "descriptor_metric", "descriptor_name", "descriptor_reference"
 
 
@@ -81,6 +82,11 @@ class DescriptorKind:
     def _power(self) -> int:
         """Power of the vectors' Euclidean distance that is the distance of the descriptors."""
         return 2 if self.metric == "hamming" else 1
+
+    def may_be_bits_of(self, other: "DescriptorKind") -> bool:
+        """Return True if these numbers may be the packed bits of another kind."""
+        is_other = self.metric == "euclidean" and other.metric == "hamming"
+        return is_other and not self.name and 8 * self.length == other.length
 
     def differs_from(self, other: "DescriptorKind") -> bool:
         """Return True if descriptors of both kinds cannot be compared.
@@ -245,9 +251,15 @@ def require_one_kind(named: Sequence[tuple[str, DescriptorKind | None]]) -> None
     for k, (name, kind) in enumerate(stated):
         for before, known in stated[:k]:
             if kind.differs_from(known):
+                remedy = _ONE_METHOD
+                for floats, bits, of in ((kind, known, name), (known, kind, before)):
+                    if floats.may_be_bits_of(bits):
+                        remedy = f"if those of {of} are packed bits, which an empty cell turned "
+                        remedy += "into floats, give --descriptor-metric hamming, or name the "
+                        remedy += "column descriptor_hamming; else " + _ONE_METHOD
                 raise InputError(
                     f"{name} has descriptors of another kind ({kind}) than {before} ({known}); "
-                    "compute both by one method, or remove the column `descriptor`"
+                    f"{remedy}"
                 )
             ratio = (kind.reference or 1.0) / (known.reference or 1.0)
             if kind.reference and known.reference and not 1 / _OTHER_UNIT < ratio < _OTHER_UNIT:

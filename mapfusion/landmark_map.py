@@ -9,6 +9,7 @@ The file of a joint covariance stores the independent part of each landmark's co
 precision, and the effect of the shared variables in single precision.
 """
 
+import re
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -237,6 +238,13 @@ class LandmarkMap:
     def n_dimensions(self) -> int:
         """Number of estimated coordinates of a landmark: 2 in planar maps, else 3."""
         return 2 if self.planar else 3
+
+    @property
+    def called(self) -> str:
+        """Name in messages: `map NAME`, or NAME alone if it begins with the word map."""
+        return (
+            self.name if re.match(r"map(?![a-z])", self.name, re.IGNORECASE) else f"map {self.name}"
+        )
 
     def __len__(self) -> int:
         return len(self.position_m)

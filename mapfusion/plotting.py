@@ -231,6 +231,7 @@ def _draw(axes: Axes, plan: Plan, scale: float, factor: int) -> None:
     if len(plan.accepted):  # ends that coincide have no visible line
         ring: dict[str, Any] = {"marker": "o", "markersize": 10 * scale, "linestyle": "none"}
         ring |= {"markerfacecolor": "none", "markeredgewidth": scale, "color": ACCEPTED_COLOUR}
+        ring["label"] = "middle of a supporting correspondence"
         axes.plot(*plan.accepted.mean(axis=1).T, **ring, zorder=2)
     for part in plan.parts:
         look = {"edgecolors": part.colour, "linewidths": 0.6 * scale, "alpha": 0.7, "zorder": 3}

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv
 
+from mapfusion.column_units import UNIT, plain_name, renaming
 from mapfusion.descriptors import (
     METRICS,
     USURF,
@@ -43,8 +44,9 @@ _ABOUT, _DEFAULT = b"about", b"default"
 HEIGHT = ("z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2")
 # Other usual names of heights, without units.
 _HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "position_z", "p_z", "pz")
-_UNIT = re.compile(r"_?(\[.*\]|\(.*\)|[mc]?m2?|met(er|re)s?|ft|feet|m?s|rad|deg|px)$")
-_MAX_NAMED = 3  # columns with similar names in one message
+# Norms of packed bits, taken as numbers, differ by 8 % for 32 bytes and by 4 % for 128 bytes.
+# SIFT's numbers have one norm, and rounding changes it by less than 1 %.
+_SAME_NORM, _LEAST_NORMS = 0.02, 10
 _OTHER_READERS = {".ply": read_ply, ".g2o": read_g2o}
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
 
@@ -153,16 +155,14 @@ def read_open_table(
     found = {field.name: _column(path, table, field, planar) for field in table_schema}
     if missing := [name for name, values in found.items() if values is None]:
         remedy = f"`mapfusion docs formats` describes the columns of a {kind} table"
-        if here := [f"{name} for {similar[name]}" for name in missing if name in similar]:
-            more = ", ..." if len(here) > _MAX_NAMED else ""
-            remedy = f"did you mean {', '.join(here[:_MAX_NAMED])}{more}?"
+        if here := [name for name in missing if name in similar]:
+            remedy = renaming({name: similar[name] for name in here})
         elif kind == "landmark_map" and {"cov_xx_m2", "cov_yy_m2"} <= set(missing):
             remedy = "`--sigma 0.05` states one standard deviation for all landmarks, in metres"
         raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")
     if similar:
-        asked = " and ".join(f"{there} to {name}" for name, there in similar.items())
         reason = "columns with unknown names are ignored"
-        raise InputError(f"{path}: rename column {asked} (mind the unit), or remove it: {reason}")
+        raise InputError(f"{path}: {renaming(similar)}, or remove it: {reason}")
     if planar:
         attributes = {"planar": "true"} | attributes
     plain = [pa.field(field.name, field.type) for field in table_schema]
@@ -176,23 +176,19 @@ def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, s
     Similar names differ only in letter case, blanks, hyphens or the unit. Every usual name of a
     height is similar to z_m, since data without z_m would be read as planar.
     """
-    known = {_plain_name(field.name): field.name for field in table_schema}
-    known = {_UNIT.sub("", name): field for name, field in known.items()} | known
+    known = {plain_name(field.name): field.name for field in table_schema}
+    known = {UNIT.sub("", name): field for name, field in known.items()} | known
     if "z_m" in table_schema.names and "z_m" not in names:
         known |= dict.fromkeys(_HEIGHT_NAMES, "z_m")
     similar: dict[str, str] = {}
     for name in names:
         if name in table_schema.names:
             continue
-        plain = _plain_name(name)
-        like = known.get(plain) or known.get(_UNIT.sub("", plain))
+        plain = plain_name(name)
+        like = known.get(plain) or known.get(UNIT.sub("", plain))
         if like is not None and like not in names:
             similar.setdefault(like, name)
     return similar
-
-
-def _plain_name(name: str) -> str:
-    return re.sub(r"[\s-]+", "_", name.strip().lower())
 
 
 def _read_csv(path: Path, table_schema: pa.Schema) -> pa.Table:
@@ -216,7 +212,7 @@ def _require_dialect(path: Path, data: bytes, table_schema: pa.Schema) -> None:
     """Raise InputError if the first line of a CSV file has another separator, or holds no names."""
     first = data.split(b"\n", 1)[0].decode("utf-8-sig", "replace").strip()
     for separator, called in _SEPARATORS.items():
-        names = {_plain_name(each.strip("\"'")) for each in first.split(separator)}
+        names = {plain_name(each.strip("\"'")) for each in first.split(separator)}
         if len(names) > 1 and names & set(table_schema.names):
             raise InputError(f"{path}: is separated by {called}; write it with commas")
     cells = [each for each in re.split(r"[,;\s]+", first.replace('"', "")) if each]
@@ -378,7 +374,7 @@ def _with_vectors(
         reason = f"{' '.join(str(error).split())} (expected numbers)"
         raise InputError(f"{path}: column {first}: {reason}") from error
     if metric == "hamming":
-        vectors = _unpacked(path, first, vectors, width)
+        vectors = _unpacked(path, first, vectors, width, own_file=bool(stated))
     vectors = vectors.cast(pa.list_(pa.float32(), vectors.type.list_size))
     place = min(map(own.column_names.index, renamed.values()))
     joined = own.drop_columns(list(renamed.values())).add_column(place, "descriptor", vectors)
@@ -428,8 +424,12 @@ def _length_of_lists(path: Path, name: str, table: pa.Table) -> int:
     return lengths[0] if lengths else USURF.length
 
 
-def _unpacked(path: Path, name: str, packed: pa.Array, width: int) -> pa.Array:
-    """Return bytes (N, width) of bits as vectors of bits (N, 8 width), NaN for none."""
+def _unpacked(path: Path, name: str, packed: pa.Array, width: int, own_file: bool) -> pa.Array:
+    """Return bytes (N, width) of bits as vectors of bits (N, 8 width), NaN for none.
+
+    A TellingWarning names bytes that look like numbers, unless the metadata of the file state the
+    metric (`own_file`).
+    """
     matrix = packed.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
     known = np.logical_not(np.all(np.isnan(matrix), axis=1))
     given = matrix[known]
@@ -438,8 +438,15 @@ def _unpacked(path: Path, name: str, packed: pa.Array, width: int) -> pa.Array:
         row, number = wrong[0]
         cell = re.sub(r"_0$", f"_{number}", name)  # the first of numbered columns, or one of lists
         found = f"is {given[row, number]:g} in row {np.flatnonzero(known)[row]}"
-        needed = "packed bits are whole numbers from 0 to 255"
+        needed = "packed bits are whole numbers from 0 to 255; a row without descriptor has all "
+        needed += "its cells empty; numbers that are no bits have the metric euclidean or cosine"
         raise InputError(f"{path}: column {cell}: {found}; {needed}")
+    norms = np.linalg.norm(given, axis=1)
+    if not own_file and len(given) >= _LEAST_NORMS and norms.std() < _SAME_NORM * norms.mean():
+        found = f"column {name}: is read as packed bits, but all rows have the norm"
+        remedy = "numbers of SIFT look so: store them as floats, without the metric hamming"
+        text = f"{path}: {found} {norms.mean():.0f}; {remedy}"
+        warnings.warn(text, TellingWarning, stacklevel=2)
     bits = np.full((len(matrix), 8 * width), np.nan, np.float32)
     bits[known] = unpack_bits(given.astype(np.uint8))
     return pa.FixedSizeListArray.from_arrays(pa.array(bits.ravel()), 8 * width)

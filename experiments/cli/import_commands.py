@@ -20,6 +20,7 @@ from mapfusion.datasets.formats import (
 from mapfusion.errors import InputError
 
 if TYPE_CHECKING:
+    from mapfusion.datasets.log_consistency import Finding
     from mapfusion.datasets.stereo_import import RecordingPart
 
 app = typer.Typer(no_args_is_help=True, help="Turn recordings in foreign formats into robot logs.")
@@ -78,22 +79,30 @@ def _log_command(format_name: str) -> Callable[..., None]:
 
     def command(folder: Folder, output: options.Output, overrides: options.ImportOverrides) -> None:
         from experiments.cli.options import require_folder
+        from experiments.evaluation.evaluated_run import finding_of_truth
         from experiments.reports.layout import print_lines, print_paths
         from experiments.scenario.loading import made_settings
+        from mapfusion.datasets.log_consistency import check_log
         from mapfusion.fastslam.filter import FastSlamParameters
         from mapfusion.fastslam.mapping import association_for
-        from mapfusion.robot_log import read_log
+        from mapfusion.robot_log import read_log, read_true_poses
 
         require_folder(output, [folder])
         settings = made_settings(format_name, settings_class(format_name), overrides)
         paths = import_recording(format_name, folder, output, settings)
+        findings: list[tuple[str, Finding]] = []
         for path in paths:
-            log = read_log(path)
-            stated = FastSlamParameters().association
-            chosen = f"associated by {association_for(log, stated)}"
+            log, truth, stated = read_log(path), read_true_poses(path), FastSlamParameters()
+            found = list(check_log(log, stated.motion).findings)
+            sound = not any(finding.kind == "odometry" for finding in found)
+            if truth is not None and (wrong := finding_of_truth(log, truth, stated.motion, sound)):
+                found.append(wrong)
+            findings += [(log.robot, finding) for finding in found]
+            chosen = f"associated by {association_for(log, stated.association)}"
             counts = f"{len(log)} frames, {len(log.observations)} observations"
             print_lines([f"{log.robot}: {counts}, {chosen} (slam.filter.association)"])
         print_paths(output, paths)
+        _print_findings(findings, "observations", "maps of these logs would be wrong")
 
     return command
 
@@ -149,15 +158,9 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
             for log in one.robots
             for finding in log.findings
         ]
-        for robot, finding in findings:
-            options.print_to_stderr(f"warning: {robot}: {finding.text}")
-        if too_little := [line for one in done for line in one.too_little]:
-            options.print_to_stderr(too_little[0])
-            raise typer.Exit(options.EXIT_FAILED)
-        if any(finding.kind == "odometry" for _, finding in findings):
-            remedy = "maps of these logs would be wrong; --odometry images takes the pictures' own"
-            options.print_to_stderr(f"odometry and pictures contradict each other: {remedy}")
-            raise typer.Exit(options.EXIT_FAILED)
+        too_little = [line for one in done for line in one.too_little]
+        remedy = "maps of these logs would be wrong; --odometry images takes the pictures' own"
+        _print_findings(findings, "pictures", remedy, too_little)
 
     # Typer reads the signature: replace `**chosen` by the options of the format.
     *shared, _ = inspect.signature(command).parameters.values()
@@ -169,6 +172,30 @@ def _stereo_command(format_name: str) -> Callable[..., None]:
     command.__annotations__ = {each.name: each.annotation for each in parameters}
     setattr(command, "__signature__", inspect.Signature(parameters))  # noqa: B010
     return command
+
+
+def _print_findings(
+    findings: "Sequence[tuple[str, Finding]]",
+    seen: str,
+    remedy: str,
+    too_little: Sequence[str] = (),
+) -> None:
+    """Print the findings about logs by robot; exit if maps of the logs would be wrong.
+
+    Args:
+        findings: names of the robots and findings.
+        seen: source of the motions that the odometry is compared with.
+        remedy: end of the message about odometry that contradicts them.
+        too_little: messages about logs with too few observations.
+    """
+    for robot, finding in findings:
+        options.print_to_stderr(f"warning: {robot}: {finding.text}")
+    if too_little:
+        options.print_to_stderr(too_little[0])
+        raise typer.Exit(options.EXIT_FAILED)
+    if any(finding.kind == "odometry" for _, finding in findings):
+        options.print_to_stderr(f"odometry and {seen} contradict each other: {remedy}")
+        raise typer.Exit(options.EXIT_FAILED)
 
 
 def _cuts(recording: str, frames: Sequence[str]) -> "list[RecordingPart]":

@@ -199,11 +199,11 @@ def print_to_stderr(text: str) -> None:
 def announce_compilation(as_json: bool = False) -> None:
     """Print a line on stderr before kernels are compiled in this process, unless `as_json`.
 
-    Only the first command after an installation or an update compiles.
+    A kernel is compiled by the first command that needs it after an installation or an update.
     """
     from mapfusion.geometry.numerics import before_compilation
 
-    told = "compiling numerical kernels, once per version; about half a minute"
+    told = "compiling numerical kernels that no earlier command needed; at most half a minute"
     before_compilation(None if as_json else lambda: typer.echo(told, file=sys.stderr))
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # listings without data frames skip this slow import
 
 Column = tuple[str, str]  # heading and format
 MANUAL = Path(__file__).parents[1] / "docs"  # folder of the manual's pages
+_WHOLE_WORD = 20  # characters; names of methods are not folded
 _LEAST_TEXT = 8  # characters of a column of text: folded names stay legible
 NO_ESTIMATE = "given: share with an estimate; without one the error is infinite"
 _GAP = 2  # characters between columns
@@ -102,15 +103,17 @@ def print_table(
         return
     # Plain rules and narrow gaps: all columns should fit into 80 characters.
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
-    needed = wanted = 0
+    needed = wanted = least = 0
     for place, (heading, layout) in enumerate(columns):
         shown = Text(plain(heading))
         widest = max(*map(len, heading.split("\n")), *(row[place].cell_len for row in cells))
         if layout:
             table.add_column(shown, justify="right", no_wrap=True, min_width=widest)
         else:
-            table.add_column(shown, overflow="fold")
-        needed += (widest if layout else min(widest, _LEAST_TEXT)) + 1
+            words = [word for row in cells for word in row[place].plain.split()]
+            least = max([_LEAST_TEXT, *(len(word) for word in words if len(word) <= _WHOLE_WORD)])
+            table.add_column(shown, overflow="fold", min_width=min(least, widest))
+        needed += (widest if layout else min(widest, least)) + 1
         wanted += widest + _GAP
     for row in cells:
         table.add_row(*row)

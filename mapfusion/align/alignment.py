@@ -254,7 +254,7 @@ def why_too_few(
         return ""
     for landmarks in (map_a, map_b):
         if len(landmarks) == 0:
-            return f"map {landmarks.name} is empty"
+            return f"{landmarks.called} is empty"
     few = f"{n_pairs} correspondences, at least {needed} are needed"
     return f"{few}: {shortage}" if shortage else few
 

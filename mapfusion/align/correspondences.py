@@ -69,7 +69,7 @@ def nearest_descriptors(
     Raises:
         InputError: the descriptors are of different kinds.
     """
-    require_one_kind([(f"map {each.name}", each.descriptor_kind) for each in (map_a, map_b)])
+    require_one_kind([(each.called, each.descriptor_kind) for each in (map_a, map_b)])
     # distances of vectors far from the origin would lose digits
     are_usurf = map_a.descriptor_kind == map_b.descriptor_kind == USURF
     centre = None if are_usurf else _centre(map_a)
@@ -404,7 +404,7 @@ def match(
                 for labels in (labels_a, labels_b)
             )
             shortage = (
-                f"{len(common) or 'none'} {both} (map {map_a.name}: {a}; map {map_b.name}: {b}); "
+                f"{len(common) or 'none'} {both} ({map_a.called}: {a}; {map_b.called}: {b}); "
                 "where both maps have labels, landmarks are matched by them alone"
             )
         named = Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
@@ -413,9 +413,8 @@ def match(
         offset_m = _height_offset(map_a, map_b, named, parameters.height)
         return _placed(map_a, map_b, replace(named, height_offset_m=offset_m))
     for landmarks in (map_a, map_b):
-        name = landmarks.name
         if not len(landmarks):
-            return _no_pairs(f"map {name} is empty")
+            return _no_pairs(f"{landmarks.called} is empty")
     height_bound = math.inf if map_a.planar or map_b.planar else parameters.height.bound
     floor_m2 = parameters.height.floor_m**2
     if matched_by_geometry(map_a, map_b):
@@ -434,7 +433,7 @@ def match(
     if map_a.descriptor is None or map_b.descriptor is None:
         described, labelled = (map_b, map_a) if map_a.descriptor is None else (map_a, map_b)
         return _no_pairs(
-            f"map {described.name} has descriptors, map {labelled.name} only labels; give both "
+            f"{described.called} has descriptors, {labelled.called} only labels; give both "
             "maps descriptors, or both labels, or neither to one to match by geometry"
         )
     offset_m, free = 0.0, None
@@ -547,7 +546,7 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
     said = f"{len(rows)} mutually nearest descriptors"
     if len(rows) < FEW:
         a, b = np.count_nonzero(known_a), np.count_nonzero(known_b)
-        return f"{said} (map {map_a.name} has {a} descriptors, map {map_b.name} {b})"
+        return f"{said} ({map_a.called} has {a} descriptors, {map_b.called} {b})"
     alike = distance <= parameters.max_descriptor_distance
     n_alike = np.count_nonzero(alike)
     if n_alike < FEW:
@@ -566,7 +565,7 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
     higher = map_b if np.median(up_m) > 0 else map_a
     said += (
         f", {np.count_nonzero(agree)} within {np.median(reach):.2g} m of height "
-        f"(median difference {np.median(np.abs(up_m)):.2f} m, map {higher.name} higher)"
+        f"(median difference {np.median(np.abs(up_m)):.2f} m, {higher.called} higher)"
     )
     scale = scale_note(map_a, map_b, rows, nearest)
     return f"{said}; {scale}" if scale else said
@@ -591,7 +590,7 @@ def scale_note(
         if not min(extents) > 0 or max(extents) < _OTHER_WORLD * min(extents):
             return ""
         return (
-            f"map {map_a.name} spans {_short(extents[0])} m, map {map_b.name} "
+            f"{map_a.called} spans {_short(extents[0])} m, {map_b.called} "
             f"{_short(extents[1])} m: are both in metres?"
         )
     if 1 / _SAME_SCALE < scale < _SAME_SCALE:
@@ -601,8 +600,8 @@ def scale_note(
     units = (name for name, size in _UNITS.items() if abs(factor / size - 1) < _RATIO_WIDTH)
     asked = f"is it in {unit}?" if (unit := next(units, "")) else "are both in metres?"
     return (
-        f"distances between landmarks of map {large.name} are {_short(factor)} times those of map "
-        f"{small.name}: {asked}"
+        f"distances between landmarks of {large.called} are {_short(factor)} times those of "
+        f"{small.called}: {asked}"
     )
 
 

@@ -29,7 +29,7 @@ from mapfusion.datasets.relative_motion import (
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.se2 import between, inverse
+from mapfusion.geometry.se2 import between, inverse, rotation
 
 # Probability of a finding for a log whose agreement lies at the limit. The agreement of sound logs
 # is far above the limit.
@@ -55,6 +55,7 @@ _STANDS_STILL = 0.02  # stated distance over observed distance of a robot that s
 # Units that are often confused: number of units in a metre, and in a radian.
 _UNITS_M = {1000.0: "millimetres", 100.0: "centimetres", 1 / 0.3048: "feet"}
 _DEGREES = 180 / np.pi
+_LEAST_CHORD = 0.05  # chord over arc; shorter chords are dominated by noise
 _UNIT_TOLERANCE = 0.15  # relative deviation of a ratio from that of a unit
 
 
@@ -350,11 +351,18 @@ def odometry_mistakes(increments: Float) -> dict[str, Float]:
     differences = np.zeros_like(increments)
     differences[1:] = between(increments[:-1], increments[1:])
     in_radians = increments / [1, 1, _DEGREES]
+    # An arc of heading change a has the chord r sinc(a / 2) in the direction a / 2. The chord of a
+    # full turn is zero and tells no length.
+    arcs, half, true_half = in_radians.copy(), increments[:, 2] / 2, in_radians[:, 2] / 2
+    longer = np.sinc(true_half / np.pi) / np.maximum(np.sinc(half / np.pi), _LEAST_CHORD)
+    chord = longer[:, None] * increments[:, :2]
+    arcs[:, :2] = np.einsum("nij,nj->ni", rotation(true_half - half), chord)
     poses_of = poses_from_increments
     return {
         "": poses_of(increments),
         "its columns look like poses since the start, not increments": poses_of(differences),
         "odometry_theta_rad looks like degrees (factor 57.3)": poses_of(in_radians),
+        "its turn rates look like degrees per second (factor 57.3)": poses_of(arcs),
         "its increments look inverted (T_after_before)": poses_of(inverse(increments)),
         "its columns look like poses since the start, with degrees": in_radians,
         "only its heading has the other sign": poses_of(increments * [1, 1, -1]),

@@ -16,7 +16,8 @@ A folder without odometry holds one such folder for each robot. Their landmarks 
 above.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,9 @@ from typing import Annotated, Any
 import numpy as np
 import pyarrow as pa
 
+from mapfusion.datasets.log_consistency import check_log
 from mapfusion.errors import InputError
+from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import (
     COVARIANCE_FIELDS,
     POSE_FIELDS,
@@ -219,19 +222,22 @@ def _import_robots(
         raise InputError(f"{folder}: no such folder (expected a recording with odometry.csv)")
     robots = [each for each in (folder, *sorted(folder.iterdir())) if _holds_odometry(each)]
     if not robots:
-        raise InputError(f"{folder}: no odometry.csv or odometry.parquet, nor in a folder below")
+        missing = "no odometry.csv or odometry.parquet, nor in a folder below"
+        raise InputError(f"{folder}: {missing}; see `mapfusion docs point_logs`")
     made = []
     for robot in robots[:1] if robots[0] == folder else robots:
-        measured, odometry_at = read(robot), _read_odometry(table_path(robot, "odometry"))
-        clock_s = _clock(robot, measured.time_s, settings.frame_s)
-        log = log_on_clock(robot.resolve().name, clock_s, odometry_at, measured)
-        poses, points = table_path(robot, "truth_poses"), None
-        T_world_robot = _read_true_poses(poses, clock_s, settings) if poses.is_file() else None
-        surveys = (table_path(each, "landmarks") for each in (robot, folder))
-        survey = next((path for path in surveys if path.is_file()), None)
-        if survey is not None:
-            points = _true_points(survey, log.observations.label)
-        made.append((destination / log.robot, log, T_world_robot, points))
+        with _naming_the_page():
+            measured, odometry = read(robot), table_path(robot, "odometry")
+            clock_s = _clock(robot, measured.time_s, settings.frame_s)
+            log = log_on_clock(robot.resolve().name, clock_s, _read_odometry(odometry), measured)
+            _require_radians(odometry, log, clock_s, measured)
+            poses, points = table_path(robot, "truth_poses"), None
+            T_world_robot = _read_true_poses(poses, clock_s, settings) if poses.is_file() else None
+            surveys = (table_path(each, "landmarks") for each in (robot, folder))
+            survey = next((path for path in surveys if path.is_file()), None)
+            if survey is not None:
+                points = _true_points(survey, log.observations.label)
+            made.append((destination / log.robot, log, T_world_robot, points))
     for path, log, T_world_robot, points in made:
         write_log(path, log)
         for outdated in TRUTH_FILES:  # of an earlier import into the same folder
@@ -241,6 +247,39 @@ def _import_robots(
         if points is not None:
             write_truth_points(path, points)
     return [path for path, *_ in made]
+
+
+def _contradicts_itself(log: RobotLog) -> bool:
+    """Return True if the odometry contradicts the motion that the observations show."""
+    findings = check_log(log, MotionNoise()).findings
+    return any(finding.kind == "odometry" for finding in findings)
+
+
+def _require_radians(path: Path, log: RobotLog, clock_s: Float, measured: Measurements) -> None:
+    """Raise InputError for odometry that agrees with the observations only in degrees.
+
+    Turns of more than half a circle between frames are lost in a log, so the odometry is read
+    again.
+    """
+    if not _contradicts_itself(log):
+        return
+    in_degrees = _read_odometry(path, np.pi / 180)
+    if _contradicts_itself(log_on_clock(log.robot, clock_s, in_degrees, measured)):
+        return
+    table, _ = _read_timed(path, ODOMETRY)
+    has_poses = not np.isnan(column(table, "theta_rad")).all()
+    name, unit = ("theta_rad", "degrees") if has_poses else (_VELOCITY_FIELDS[1], "degrees/s")
+    said = f"holds {unit}: only then the odometry agrees with the observations"
+    raise InputError(f"{path}: column {name}: {said}; multiply it by pi/180")
+
+
+@contextmanager
+def _naming_the_page() -> Iterator[None]:
+    """Add the page that describes the tables to the message of an InputError."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{error}; see `mapfusion docs point_logs`") from error
 
 
 def _holds_odometry(folder: Path) -> bool:
@@ -389,8 +428,13 @@ def log_on_clock(
     return RobotLog(robot, measured.planar, times, increments, frame, observations, **extras)
 
 
-def _read_odometry(path: Path) -> PosesAt:
-    """Read the odometry of a robot and return its poses as a function of time."""
+def _read_odometry(path: Path, radians: float = 1.0) -> PosesAt:
+    """Read the odometry of a robot and return its poses as a function of time.
+
+    Args:
+        path: of the table.
+        radians: unit of its angles, in radians.
+    """
     table, _ = _read_timed(path, ODOMETRY)
     time_s = column(table, "time_s")
     poses, velocities = (columns(table, names) for names in (POSE_FIELDS, _VELOCITY_FIELDS))
@@ -403,6 +447,7 @@ def _read_odometry(path: Path) -> PosesAt:
     if absent := [name for name, own in zip(names, values.T, strict=True) if np.isnan(own).all()]:
         raise InputError(f"{path}: has no column {absent[0]}; odometry needs {', '.join(names)}")
     require_cells(path, table, names, np.isfinite, "give a finite number")
+    values[:, -1] *= radians
     repeated = np.flatnonzero(np.diff(time_s) <= 0)
     if len(repeated):
         raise InputError(f"{path}: column time_s: repeats in row {int(repeated[0]) + 1}")

@@ -525,7 +525,7 @@ def load_maps(
     loaded, kinds = list[LandmarkMap](), list[tuple[str, DescriptorKind | None]]()
     for name, each in given.items():
         if isinstance(each, LandmarkMap):
-            landmarks, place = each, f"map {each.name}"
+            landmarks, place = each, each.called
         elif isinstance(each, str | os.PathLike):
             landmarks, place = read_map(Path(each), False, sigma_m, descriptor_metric), str(each)
         else:

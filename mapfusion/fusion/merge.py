@@ -91,7 +91,7 @@ def merge(
         InputError: the descriptors are of different kinds.
     """
     _require_valid_pairs(maps, pairs)
-    require_one_kind([(f"map {each.name}", each.descriptor_kind) for each in maps])
+    require_one_kind([(each.called, each.descriptor_kind) for each in maps])
     origins, height = [origin_of(each) for each in maps], _heights(len(maps), pairs)
     local = [in_local_frame(*each) for each in zip(maps, origins, height.tolist(), strict=True)]
     pairs = [_in_local_frames(pair, origins) for pair in pairs]
@@ -165,7 +165,7 @@ def connect(
         InputError: the descriptors are of different kinds.
     """
     _require_valid_pairs(maps, pairs)
-    require_one_kind([(f"map {each.name}", each.descriptor_kind) for each in maps])
+    require_one_kind([(each.called, each.descriptor_kind) for each in maps])
     # Sort maps by name, so that the result does not depend on their order.
     rank = np.empty(len(maps), dtype=np.int64)
     by_rank = np.array(sorted(range(len(maps)), key=lambda k: name_order(maps[k].name)))

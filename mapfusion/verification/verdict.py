@@ -149,7 +149,7 @@ def why_not_sought(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
             ("descriptors", landmarks.descriptor),
         ):
             if held is None:
-                return f"map {landmarks.name} has no {what}"
+                return f"{landmarks.called} has no {what}"
     return ""
 
 
@@ -328,7 +328,8 @@ class PairVerifier:
             elif self._pairs.by_geometry:
                 reason = "matched by geometry alone"
             else:
-                reason = f"no evidence to the contrary could be sought: {why}"
+                untested = "another place that looks the same could not be ruled out"
+                reason = f"{untested}: {why} (see `mapfusion docs refusal`)"
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
             status, reason = Status.TOO_UNCERTAIN, unsure
         if status is Status.ACCEPTED and (note := self._overconfidence_note(alignment)):

@@ -53,10 +53,21 @@ def _set(frame: int, axis: int, value: float) -> Callable[[Float], Float]:
     return change
 
 
+def _arcs_in_degrees(odometry: Float) -> Float:
+    """Return the motions along arcs whose turns are in degrees and were taken as radians."""
+    true, degrees = odometry[:, 2], np.degrees(odometry[:, 2])
+    chord = odometry[:, 0] + 1j * odometry[:, 1]
+    with np.errstate(invalid="ignore"):
+        arc = np.where(true == 0, chord, chord * true / (np.exp(1j * true) - 1) * 1j)
+        moved = np.where(true == 0, arc, arc * (np.exp(1j * degrees) - 1) / (1j * degrees))
+    return np.column_stack([moved.real, moved.imag, degrees])
+
+
 # What was done to the odometry, and words that name it.
 MISTAKES: dict[str, tuple[Callable[[Float], Float], tuple[str, ...]]] = {
     "absolute poses": (poses_from_increments, ("poses since the start, not increments",)),
     "degrees": (lambda u: u * [1, 1, 180 / np.pi], ("odometry_theta_rad", "degrees", "57.3")),
+    "turn rates in degrees": (_arcs_in_degrees, ("turn rates look like degrees per second",)),
     "millimetres": (lambda u: u * [1000, 1000, 1], ("millimetres",)),
     "centimetres": (lambda u: u * [100, 100, 1], ("centimetres",)),
     "observations in mm": (lambda u: u * [1e-3, 1e-3, 1], ("observed ones millimetres",)),

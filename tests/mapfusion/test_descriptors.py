@@ -1,6 +1,7 @@
 """Descriptors of any kind: distances, files, and the way from logs to a fused map."""
 
 import itertools
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -360,5 +361,45 @@ def test_a_wrong_cell_of_packed_bits_is_named_by_column_and_row(tmp_path: Path) 
     table = plain(9).assign(**{f"descriptor_hamming_{k}": np.arange(9.0) for k in range(4)})
     table.loc[5, "descriptor_hamming_2"] = np.nan
     table.to_csv(tmp_path / "m.csv", index=False)
-    with pytest.raises(InputError, match="column descriptor_hamming_2: is nan in row 5; packed"):
+    with pytest.raises(
+        InputError,
+        match=r"hamming_2: is nan in row 5; packed .*; a row without descriptor has all",
+    ):
         read_map(tmp_path / "m.csv")
+
+
+def test_bits_that_an_empty_row_turned_into_floats_are_told(rng: np.random.Generator) -> None:
+    packed = rng.integers(0, 256, (9, 32)).astype(np.uint8)
+    columns = pd.DataFrame(packed, columns=[f"descriptor_{k}" for k in range(32)])
+    a = LandmarkMap.from_pandas(plain(9).join(columns), "a")
+    gap = columns.astype(float)
+    gap.loc[3] = np.nan
+    with pytest.warns(TellingWarning, match="if they are packed bits"):
+        b = LandmarkMap.from_pandas(plain(9).join(gap), "b")
+    for maps in ((a, b), (b, a)):
+        told = "if those of map b are packed bits, .*give --descriptor-metric hamming"
+        with pytest.raises(InputError, match=told):
+            match(*maps)
+    mended = LandmarkMap.from_pandas(plain(9).join(gap), "b", descriptor_metric="hamming")
+    assert str(mended.descriptor_kind) == "hamming, 256 bits"
+    assert mended.descriptor is not None
+    np.testing.assert_array_equal(np.isnan(mended.descriptor).all(axis=1), np.arange(9) == 3)
+
+
+def test_numbers_that_are_no_bits_are_told(rng: np.random.Generator) -> None:
+    looks = np.abs(rng.standard_normal((40, 128)))
+    looks *= 512 / np.linalg.norm(looks, axis=1, keepdims=True)
+    for numbers in (np.round(looks), np.round(looks).astype(np.uint8)):
+        with pytest.warns(TellingWarning, match="all rows have the norm 512; numbers of SIFT"):
+            LandmarkMap.from_pandas(
+                plain(40).assign(descriptor=list(numbers)), descriptor_metric="hamming"
+            )
+    with pytest.raises(InputError, match="numbers that are no bits have the metric euclidean"):
+        LandmarkMap.from_pandas(
+            plain(40).assign(descriptor=list(looks)), descriptor_metric="hamming"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for width in (32, 128):
+            packed = list(rng.integers(0, 256, (40, width)).astype(np.uint8))
+            LandmarkMap.from_pandas(plain(40).assign(descriptor=packed))

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from mapfusion.align.correspondences import match
 from mapfusion.errors import InputError
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.landmark_map import LandmarkMap, joint_path, read_map, write_map
@@ -187,3 +188,24 @@ def test_wrong_arguments_are_named():
             replace(landmarks, **{name: getattr(landmarks, name)[:2]})
     with pytest.raises(ValueError, match="position_m"):
         replace(landmarks, position_m=np.full((5, 3), np.nan))
+
+
+@pytest.mark.parametrize(
+    ("name", "called"),
+    [
+        ("a", "map a"),
+        ("map 1", "map 1"),
+        ("map", "map"),
+        ("Map_2", "Map_2"),
+        ("maple", "map maple"),
+    ],
+)
+def test_no_message_says_map_twice(name: str, called: str) -> None:
+    covariance = np.tile(np.eye(3), (2, 1, 1))
+    each = LandmarkMap(np.zeros((2, 3)), covariance, np.ones(2, int), np.arange(2), name=name)
+    assert each.called == called
+    other = replace(each, name="b", descriptor=np.ones((2, 64), np.float32))
+    labelled = replace(each, label=np.arange(2, dtype=np.int32))
+    shortage = match(labelled, other).shortage
+    assert f"{called} only labels" in shortage
+    assert "map map " not in shortage

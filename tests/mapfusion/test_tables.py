@@ -1,5 +1,6 @@
 """Maps and logs by numpy and pandas alone, in every shape that these give to a table."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from mapfusion import robot_log
+from mapfusion.datasets.point_logs import ODOMETRY, RANGES
 from mapfusion.errors import InputError
 from mapfusion.landmark_map import read_map
 from mapfusion.robot_log import read_log, read_truth
+from mapfusion.tables import read_open_table
 
 N = 30
 
@@ -105,9 +108,12 @@ def test_descriptors_are_counted_from_0_or_1_without_gaps(tmp_path, rng):
     [
         (lambda text: text.replace(",", ";"), "m.csv: is separated by ';'; write it with commas"),
         (lambda text: text.replace(",", "\t"), "m.csv: is separated by tabs"),
-        (str.upper, "has no column x_m, y_m, .*; did you mean x_m for X_M, y_m for Y_M, cov"),
+        (str.upper, "has no column x_m, y_m, .*; rename column X_M to x_m and Y_M to y_m and COV"),
         (lambda text: text.split("\n", 1)[1], "has no header line; put one with .*[(]x_m, y_m"),
-        (lambda text: text.replace("x_m,", "x,"), "has no column x_m; did you mean x_m for x[?]"),
+        (
+            lambda text: text.replace("x_m,", "x,"),
+            "has no column x_m; rename column x to x_m .mind the unit",
+        ),
     ],
 )
 @pytest.mark.parametrize("n_columns", [1, 9])
@@ -133,7 +139,9 @@ def test_blanks_around_names_and_numbers_change_nothing(tmp_path, rng):
 def test_heights_of_another_name_make_no_map_planar(tmp_path, rng, name):
     flat = plain_map(rng).drop(columns=["z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2"])
     for kind in ("csv", "parquet"):
-        with pytest.raises(InputError, match=r"rename column .* to z_m .*or remove it"):
+        with pytest.raises(
+            InputError, match=r"(rename column .* to z_m |z_mm is in millimetres: ).*or remove it"
+        ):
             read_map(write(flat.assign(**{name: 1.0}), tmp_path / f"m.{kind}"))
     with pytest.raises(InputError, match="cov_zz to cov_zz_m2"):
         read_map(write(flat.assign(cov_zz=1.0), tmp_path / "m.csv"))
@@ -278,3 +286,51 @@ def test_what_is_told_of_columns_is_not_written_into_files(tmp_path, rng):
     robot_log.write_log(tmp_path / "b", read_log(tmp_path / "a"))
     stored = pq.read_schema(tmp_path / "b" / "observations.parquet")
     assert not any(field.metadata and b"about" in field.metadata for field in stored)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "said"),
+    [
+        ("x_m", "x_mm", "x_mm is in millimetres: multiply by 0.001 and name it x_m"),
+        ("x_m", "X [cm]", r"X \[cm\] is in centimetres: multiply by 0.01 and name it x_m"),
+        ("x_m", "x (ft)", r"x \(ft\) is in feet: multiply by 0.3048 and name it x_m"),
+        ("cov_xx_m2", "cov_xx_cm2", "cov_xx_cm2 is in cm2: multiply by 1e-4 and name it cov_xx_m2"),
+        ("cov_xx_m2", "cov_xx_ft", "cov_xx_ft is in feet: convert it and name it cov_xx_m2"),
+        ("x_m", "x_metres", r"rename column x_metres to x_m \(mind the unit\)"),
+    ],
+)
+def test_a_column_in_another_unit_must_be_converted(tmp_path, rng, name, given, said):
+    frame = plain_map(rng).rename(columns={name: given})
+    with pytest.raises(InputError, match=f"m.csv: has no column {name}; {said}$"):
+        read_map(write(frame, tmp_path / "m.csv"))
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "said"),
+    [
+        ("bearing_rad", "bearing_deg", "is in degrees: multiply by pi/180"),
+        ("time_s", "time_ms", "is in milliseconds: multiply by 0.001"),
+        ("time_s", "time_ns", "is in nanoseconds: multiply by 1e-9"),
+    ],
+)
+def test_angles_and_times_in_another_unit_must_be_converted(tmp_path, name, given, said):
+    values = {"time_s": [0.0], "range_m": [1.0], "bearing_rad": [0.1]}
+    path = write(pd.DataFrame(values).rename(columns={name: given}), tmp_path / "ranges.csv")
+    with pytest.raises(InputError, match=f"{given} {said} and name it {name}$"):
+        read_open_table(path, RANGES)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "said"),
+    [
+        ("turn_rate_rad_s", "turn_rate_deg_s", "is in degrees per second: multiply by pi/180"),
+        ("theta_rad", "theta [deg]", "is in degrees: multiply by pi/180"),
+        ("speed_m_s", "speed_km_h", "is in kilometres per hour: multiply by 1/3.6"),
+    ],
+)
+def test_optional_columns_in_another_unit_are_not_ignored(tmp_path, name, given, said):
+    path = write(pd.DataFrame({"time_s": [0.0], given: [1.0]}), tmp_path / "odometry.csv")
+    with pytest.raises(
+        InputError, match=f"{re.escape(given)} {said} and name it {name}, or remove"
+    ):
+        read_open_table(path, ODOMETRY)

@@ -5,12 +5,14 @@ import shlex
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import read_map
 from tests.helpers.tiny_scenario import command
+from tests.mapfusion.datasets.test_point_logs import write_recording
 
 PAGE = Path(__file__).parents[3] / "experiments" / "docs" / "point_logs.md"
 
@@ -40,3 +42,29 @@ def test_the_worked_example_maps_the_trees(
     # Some forty sightings of 0.05 m each leave about a centimetre.
     assert np.sqrt(np.mean(np.sum(apart**2, axis=1))) < 0.03
     assert np.hypot(*T[:2]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("table", "said", "code"),
+    [
+        ("odometry", "the odometry contradicts the motion that the observations show", 1),
+        ("truth_poses", "the truth contradicts the odometry", 0),
+    ],
+)
+def test_import_compares_odometry_truth_and_observations(
+    table: str, said: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_recording(tmp_path / "R1", {}, "points")
+    call = ("import", "points", tmp_path / "R1", "-o", tmp_path / "logs", "--param", "sigma_m=0.05")
+    sound = command(capsys, *call)
+    assert sound.code == 0
+    assert "contradict" not in sound.err
+    path = tmp_path / "R1" / f"{table}.csv"
+    poses = pd.read_csv(path)
+    in_mm = poses.assign(x_m=1000 * poses["x_m"], y_m=1000 * poses["y_m"])
+    in_mm.to_csv(path, index=False)
+    wrong = command(capsys, *call)
+    assert wrong.code == code
+    assert f"warning: R1: {said}" in wrong.err
+    assert "millimetres" in wrong.err
+    assert ("odometry and observations contradict each other" in wrong.err) == bool(code)

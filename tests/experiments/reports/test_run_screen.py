@@ -247,3 +247,12 @@ def test_alignments_are_told_by_what_became_of_them() -> None:
     told = ["alignments bridge: B-D", "alignments confirmed: A-B and B-C"]
     assert list(edge_lines(edges)) == told
     assert list(edge_lines(edges.head(1))) == []  # of two robots nobody else says anything
+
+
+def test_names_of_methods_are_not_folded_at_80_columns(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    columns = [("aligner", ""), *((f"quantity {k}", "d") for k in range(5)), ("reason", "")]
+    print_table(columns, [["ransac_mahalanobis", 1, 2, 3, 4, 5, "a long reason " * 20]])
+    assert "ransac_mahalanobis" in capsys.readouterr().out

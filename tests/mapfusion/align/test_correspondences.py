@@ -201,7 +201,7 @@ def test_the_test_that_left_too_few_pairs_is_named():
     assert "40 from 0 to 39" in said
     assert "40 from 100 to 139" in said
     said = told_apart(a, replace(named[1], label=label))
-    assert "map " + a.name + " has descriptors, map " + b.name + " only labels" in said
+    assert f"{a.called} has descriptors, {b.called} only labels" in said
     few = b.descriptor.copy()
     few[1:] = np.nan
     assert "1 mutually nearest descriptors" in told_apart(a, replace(b, descriptor=few))
@@ -223,7 +223,7 @@ def test_a_scale_is_seen_among_false_pairs_and_none_without_one(factor, unit):
         assert f" {max(factor, 1 / factor):.2g}" in said or f" {factor}" in said, (trial, said)
         assert (unit in said) if unit else ("are both in metres?" in said)
         larger_one = "north" if factor > 1 else a.name
-        assert f"landmarks of map {larger_one} are" in said
+        assert f"landmarks of {replace(a, name=larger_one).called} are" in said
         assert scale_note(a, b, index, shuffled) == ""
         assert scale_note(a, b, index, rng.permutation(60)) == ""
     far = replace(b, position_m=1000 * b.position_m, name="north")

@@ -170,3 +170,36 @@ def test_noise_must_be_stated_and_bearings_are_radians(tmp_path: Path) -> None:
     table.assign(bearing_rad=np.degrees(table["bearing_rad"])).to_csv(path, index=False)
     with pytest.raises(InputError, match="are they degrees"):
         import_recording("ranges", tmp_path / "R", tmp_path / "logs", NOISE["ranges"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "unit"),
+    [("points", "theta_rad", "degrees"), ("ranges", "turn_rate_rad_s", "degrees/s")],
+)
+@pytest.mark.parametrize("frame_s", [0.0, 2.0])
+def test_odometry_in_degrees_is_refused(
+    kind: str, name: str, unit: str, frame_s: float, tmp_path: Path
+) -> None:
+    """In a frame of 2 s the heading changes by 29 degrees, 29 radians if it is taken so."""
+    write_recording(tmp_path / "R1", {}, kind)
+    path = tmp_path / "R1" / "odometry.csv"
+    table = pd.read_csv(path)
+    table.assign(**{name: np.degrees(table[name])}).to_csv(path, index=False)
+    settings = {"points": PointsSettings, "ranges": RangesSettings}[kind]
+    noise = {"points": {"sigma_m": 0.05}, "ranges": {"range_sigma_m": 0.05}}[kind]
+    noise |= {"bearing_sigma_rad": 0.01} if kind == "ranges" else {}
+    said = f"column {name}: holds {unit}: .*multiply it by pi/180; see `mapfusion docs point_logs`"
+    with pytest.raises(InputError, match=said) as refused:
+        import_recording(
+            kind, tmp_path / "R1", tmp_path / "logs", settings(frame_s=frame_s, **noise)
+        )
+    assert str(path) in str(refused.value)
+    assert not (tmp_path / "logs").exists()
+
+
+def test_a_refused_table_names_the_page(tmp_path: Path) -> None:
+    write_recording(tmp_path / "R", {}, "ranges")
+    for folder in (tmp_path / "R", tmp_path):
+        with pytest.raises(InputError, match=r"see `mapfusion docs point_logs`$"):
+            import_recording("ranges", folder, tmp_path / "logs")
+        (tmp_path / "R" / "odometry.csv").unlink(missing_ok=True)

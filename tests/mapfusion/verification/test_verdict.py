@@ -227,8 +227,10 @@ def test_what_agrees_on_one_wall_may_be_a_picture() -> None:
 def test_without_viewing_evidence_it_is_said_that_none_was_sought() -> None:
     said, _ = verdict(replace(A, viewing=None), B)
     assert said.status is Status.ACCEPTED
-    expected = "no evidence to the contrary could be sought: map A has no viewing evidence"
-    assert said.reason == expected
+    expected = (
+        "another place that looks the same could not be ruled out: map A has no viewing evidence"
+    )
+    assert said.reason == f"{expected} (see `mapfusion docs refusal`)"
     assert math.isnan(said.log10_evidence)
 
 
