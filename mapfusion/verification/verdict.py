@@ -328,7 +328,7 @@ class PairVerifier:
             elif self._pairs.by_geometry:
                 reason = "matched by geometry alone"
             else:
-                untested = "another place that looks the same could not be ruled out"
+                untested = "another place that looks alike could not be ruled out"
                 reason = f"{untested}: {why} (see `mapfusion docs refusal`)"
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
             status, reason = Status.TOO_UNCERTAIN, unsure

@@ -87,7 +87,7 @@ def test_a_merge_tells_that_no_evidence_could_be_sought(
 ) -> None:
     a, b, _ = described
     told = command(capsys, "merge", a, b, *ONE, "-o", tmp_path / "f.parquet").out.splitlines()
-    note = "another place that looks the same could not be ruled out: map a has no viewing evidence"
+    note = "another place that looks alike could not be ruled out: map a has no viewing evidence"
     assert note in told[-1]
     assert "a and b are the same map" in told[-1]
     assert not any("evidence" in line for line in told[:-1])

@@ -228,7 +228,7 @@ def test_without_viewing_evidence_it_is_said_that_none_was_sought() -> None:
     said, _ = verdict(replace(A, viewing=None), B)
     assert said.status is Status.ACCEPTED
     expected = (
-        "another place that looks the same could not be ruled out: map A has no viewing evidence"
+        "another place that looks alike could not be ruled out: map A has no viewing evidence"
     )
     assert said.reason == f"{expected} (see `mapfusion docs refusal`)"
     assert math.isnan(said.log10_evidence)
