@@ -473,7 +473,8 @@ class PairVerifier:
         Maps without repeated structure and without another motion need little evidence if the
         supporters extend over two regions or more and over several walls: the regions beside that
         which led to the motion, if there are any, must confirm it, and none may contradict it. All
-        that agrees on one wall may be a large picture. Less than two regions may be a copy that led
+        that agrees on one wall may be a large picture, and few supporters elsewhere may be chance.
+        Less than two regions may be a copy that led
         to the motion as a whole. It is then one region, which is no evidence.
         """
         ratio = regions.log10_evidence(evidence.shares)
@@ -483,12 +484,13 @@ class PairVerifier:
             return passed
         if regions.n_contradicted:
             return passed
-        p = self._bulk(alignment)
-        if (extent_m := float(np.ptp(p, axis=0).max())) < _TOUCHED * evidence.region_m:
+        if (extent_m := self._extent_m(alignment)) < _TOUCHED * evidence.region_m:
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
             return around.log10_evidence(evidence.shares)
+        p = self._bulk(alignment)
+        small = np.ptp(p, axis=0).max() < _TOUCHED * evidence.region_m
         unconfirmed = len(regions) > 1 and ratio < DECISIVE
-        return passed if unconfirmed or self._is_one_wall(p) else math.inf
+        return passed if small or unconfirmed or self._is_one_wall(p) else math.inf
 
     def _doubt(
         self,
@@ -518,9 +520,8 @@ class PairVerifier:
         # No structure repeats and no other motion fits: a contradicting region is reason for doubt.
         if regions.n_contradicted:
             return f"{{told}}, too few beside {regions.n_contradicted} that are missing from one"
-        p = self._bulk(alignment)
-        if np.ptp(p, axis=0).max() >= _TOUCHED * evidence.region_m:
-            if self._is_one_wall(p):
+        if extent_m >= _TOUCHED * evidence.region_m:
+            if self._is_one_wall(self._bulk(alignment)):
                 return "{told}, too few if all that agrees lies on one wall and could be a picture"
             return "{told}, too few to confirm it"
         what = f"all that agrees lies within {_TOUCHED * evidence.region_m:.2g} m"
