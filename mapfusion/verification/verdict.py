@@ -487,10 +487,11 @@ class PairVerifier:
         if (extent_m := self._extent_m(alignment)) < _TOUCHED * evidence.region_m:
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
             return around.log10_evidence(evidence.shares)
-        p = self._bulk(alignment)
+        p, everywhere = self._bulk(alignment), self._pairs.p_b[alignment.inlier, :2]
+        on_wall = self._is_one_wall(p) or self._is_one_wall(everywhere)
         small = np.ptp(p, axis=0).max() < _TOUCHED * evidence.region_m
         unconfirmed = len(regions) > 1 and ratio < DECISIVE
-        return passed if small or unconfirmed or self._is_one_wall(p) else math.inf
+        return passed if small or unconfirmed or on_wall else math.inf
 
     def _doubt(
         self,
@@ -547,12 +548,11 @@ class PairVerifier:
     def _is_one_wall(self, p: Float) -> bool:
         """Return True if supporters (n, 2) lie on one line, as those of a picture on a wall do.
 
-        The line is their principal axis. Two standard deviations across it are at most `gate_m`,
-        which covers the drift.
+        The line is their principal axis. Most of them are within `gate_m`, which covers the drift.
         """
         centred = p - p.mean(axis=0)
-        across_m2 = np.linalg.eigvalsh(centred.T @ centred / len(p))[0]
-        return bool(2 * np.sqrt(max(across_m2, 0.0)) <= self._settings.evidence.gate_m)
+        across_m = centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0]
+        return bool(np.quantile(np.abs(across_m), _BULK) <= self._settings.evidence.gate_m)
 
     def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
         """Return True if most of the smaller map agrees and lies within the size of a room."""
