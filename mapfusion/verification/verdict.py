@@ -473,8 +473,7 @@ class PairVerifier:
         Maps without repeated structure and without another motion need little evidence if the
         supporters extend over two regions or more and over several walls: the regions beside that
         which led to the motion, if there are any, must confirm it, and none may contradict it. All
-        that agrees on one wall may be a large picture, and few supporters elsewhere may be chance.
-        Less than two regions may be a copy that led
+        that agrees on one wall may be a large picture. Less than two regions may be a copy that led
         to the motion as a whole. It is then one region, which is no evidence.
         """
         ratio = regions.log10_evidence(evidence.shares)
@@ -484,14 +483,12 @@ class PairVerifier:
             return passed
         if regions.n_contradicted:
             return passed
-        if (extent_m := self._extent_m(alignment)) < _TOUCHED * evidence.region_m:
+        p = self._bulk(alignment)
+        if (extent_m := float(np.ptp(p, axis=0).max())) < _TOUCHED * evidence.region_m:
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
             return around.log10_evidence(evidence.shares)
-        p, everywhere = self._bulk(alignment), self._pairs.p_b[alignment.inlier, :2]
-        on_wall = self._is_one_wall(p) or self._is_one_wall(everywhere)
-        small = np.ptp(p, axis=0).max() < _TOUCHED * evidence.region_m
         unconfirmed = len(regions) > 1 and ratio < DECISIVE
-        return passed if small or unconfirmed or on_wall else math.inf
+        return passed if unconfirmed or self._is_one_wall(p) else math.inf
 
     def _doubt(
         self,
@@ -521,8 +518,9 @@ class PairVerifier:
         # No structure repeats and no other motion fits: a contradicting region is reason for doubt.
         if regions.n_contradicted:
             return f"{{told}}, too few beside {regions.n_contradicted} that are missing from one"
-        if extent_m >= _TOUCHED * evidence.region_m:
-            if self._is_one_wall(self._bulk(alignment)):
+        p = self._bulk(alignment)
+        if np.ptp(p, axis=0).max() >= _TOUCHED * evidence.region_m:
+            if self._is_one_wall(p):
                 return "{told}, too few if all that agrees lies on one wall and could be a picture"
             return "{told}, too few to confirm it"
         what = f"all that agrees lies within {_TOUCHED * evidence.region_m:.2g} m"
@@ -548,11 +546,12 @@ class PairVerifier:
     def _is_one_wall(self, p: Float) -> bool:
         """Return True if supporters (n, 2) lie on one line, as those of a picture on a wall do.
 
-        The line is their principal axis. Most of them are within `gate_m`, which covers the drift.
+        The line is their principal axis. Two standard deviations across it are at most `gate_m`,
+        which covers the drift.
         """
         centred = p - p.mean(axis=0)
-        across_m = centred @ np.linalg.eigh(centred.T @ centred)[1][:, 0]
-        return bool(np.quantile(np.abs(across_m), _BULK) <= self._settings.evidence.gate_m)
+        across_m2 = np.linalg.eigvalsh(centred.T @ centred / len(p))[0]
+        return bool(2 * np.sqrt(max(across_m2, 0.0)) <= self._settings.evidence.gate_m)
 
     def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
         """Return True if most of the smaller map agrees and lies within the size of a room."""

@@ -192,8 +192,8 @@ def test_a_few_supporters_elsewhere_do_not_make_a_copy_large() -> None:
     small = Verifier(evidence=EvidenceParameters(place_m=1.0))
     said, refined = verdict(mapped(wall, 1, 14, seed=2), mapped(wall, 1, 14, seed=3), small)
     assert refined.inlier.sum() > 20
-    assert said.log10_ratio_passed == pytest.approx(said.log10_evidence)
-    assert "too few to confirm it" in said.reason
+    assert said.log10_ratio_passed < 2
+    assert "within 4 m" in said.reason
 
 
 def test_regions_beside_the_one_that_led_to_it_must_confirm_it() -> None:
