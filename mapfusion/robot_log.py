@@ -339,7 +339,22 @@ def read_log(folder: str | Path) -> RobotLog:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a robot log with frames.parquet)")
     frames, attributes = read_open_table(path, FRAMES)
-    _require_frames(path, frames)
+    _require_numbered(path, frames)
+    finite = "give a finite number"
+    require_cells(path, frames, ["time_s", *_ODOMETRY_FIELDS], np.isfinite, finite)
+    odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
+    still = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(still):
+        row = still[0] + 1
+        found = f"is {time_s[row]:.15g} in row {row}, after {time_s[row - 1]:.15g}"
+        remedy = "times must increase from row to row; mend the clock or the order of the rows"
+        raise InputError(f"{path}: column time_s: {found}; {remedy}")
+    way = f"the motion since the row before is at most {LARGEST_POSITION_M:g} m"
+    require_cells(
+        path, frames, _ODOMETRY_FIELDS[:2], lambda moved: abs(moved) <= LARGEST_POSITION_M, way
+    )
+    turn = f"the turn since the row before, in radians, is at most {LARGEST_TURN:g}"
+    require_cells(path, frames, _ODOMETRY_FIELDS[2:], lambda by: abs(by) <= LARGEST_TURN, turn)
     iteration, observations, planar = _observations(folder)
     seen = table_path(folder, "observations")
     beyond = np.flatnonzero(iteration >= frames.num_rows)
@@ -350,7 +365,6 @@ def read_log(folder: str | Path) -> RobotLog:
     if "robot" in attributes:
         planar = attributes.get("planar") == "true"
     name = attributes.get("robot", name_in_text(folder.resolve().name))
-    odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
     odometry[:1] = 0.0  # the first frame has no row before
     calibration = calibration_from(attributes, path)
     try:
@@ -366,26 +380,6 @@ def read_log(folder: str | Path) -> RobotLog:
     except ValueError as error:
         raise InputError(f"{seen}: {error}") from error
     return log
-
-
-def _require_frames(path: Path, table: pa.Table) -> None:
-    """Raise InputError for the first invalid frame; the message names column and row."""
-    _require_numbered(path, table)
-    finite = "give a finite number"
-    require_cells(path, table, ["time_s", *_ODOMETRY_FIELDS], np.isfinite, finite)
-    time_s = column(table, "time_s")
-    still = np.flatnonzero(np.diff(time_s) <= 0)
-    if len(still):
-        row = still[0] + 1
-        found = f"is {time_s[row]:.15g} in row {row}, after {time_s[row - 1]:.15g}"
-        remedy = "times must increase from row to row; mend the clock or the order of the rows"
-        raise InputError(f"{path}: column time_s: {found}; {remedy}")
-    way = f"the motion since the row before is at most {LARGEST_POSITION_M:g} m"
-    require_cells(
-        path, table, _ODOMETRY_FIELDS[:2], lambda moved: abs(moved) <= LARGEST_POSITION_M, way
-    )
-    turn = f"the turn since the row before, in radians, is at most {LARGEST_TURN:g}"
-    require_cells(path, table, _ODOMETRY_FIELDS[2:], lambda by: abs(by) <= LARGEST_TURN, turn)
 
 
 def _require_numbered(path: Path, table: pa.Table) -> None:

@@ -210,21 +210,16 @@ def times_vectors(A: Float, x: Float) -> Float:
     return A[:, :, 0] * x[:, None, 0] + A[:, :, 1] * x[:, None, 1] + A[:, :, 2] * x[:, None, 2]
 
 
+@kernel
 def times_blocks(A: Float, B: Float) -> Float:
     """Return the products (N, 3, 3) of blocks (N, 3, 3)."""
     made = np.empty(A.shape)
-    _fill_products(A, B, made)
-    return made
-
-
-@kernel
-def _fill_products(A: Float, B: Float, made: Float) -> None:
-    """Fill the products (N, 3, 3) of blocks (N, 3, 3)."""
     for i in range(len(made)):
         for r in range(3):
             x, y, z = A[i, r, 0], A[i, r, 1], A[i, r, 2]
             for q in range(3):
                 made[i, r, q] = x * B[i, 0, q] + y * B[i, 1, q] + z * B[i, 2, q]
+    return made
 
 
 def sums_by(group: np.ndarray, values: Float, n: int) -> Float:
