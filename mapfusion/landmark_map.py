@@ -29,6 +29,7 @@ from mapfusion.files import (
     column,
     covariance_columns,
     covariances_from,
+    described,
     float_fields,
     name_in_text,
     named_columns,
@@ -50,8 +51,8 @@ from mapfusion.geometry.numerics import (
     require_no_twins,
     require_points,
     require_shape,
+    with_rows,
 )
-from mapfusion.robot_log import with_rows
 from mapfusion.tables import (
     APPEARANCE_FIELDS,
     HEIGHT,
@@ -60,7 +61,6 @@ from mapfusion.tables import (
     appearance_from,
     appearance_schema,
     csv_bytes,
-    described,
     is_alone,
     read_open_table,
     require_appearance,

@@ -12,9 +12,8 @@ All observations of a track show the same point, which has a small offset from t
 offset differs between tracks. Within a track it is constant, so it does not average out.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -30,6 +29,7 @@ from mapfusion.files import (
     columns,
     covariance_columns,
     covariances_from,
+    described,
     float_fields,
     name_in_text,
     named_columns,
@@ -49,21 +49,17 @@ from mapfusion.geometry.numerics import (
     require_no_twins,
     require_points,
     require_shape,
+    with_rows,
 )
 from mapfusion.tables import (
     APPEARANCE_FIELDS,
     appearance_columns,
     appearance_from,
     appearance_schema,
-    described,
     read_open_table,
     require_appearance,
     table_path,
 )
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 
 NO_TRACK = -1
 # Limit of the heading increment between two frames, as a number. Larger turns are not observable
@@ -72,7 +68,6 @@ NO_TRACK = -1
 LARGEST_TURN = 360.0
 TRUTH_TABLES = ("truth_poses", "truth_points")
 TRUTH_FILES = tuple(f"{name}.parquet" for name in TRUTH_TABLES)
-Arrays = TypeVar("Arrays", bound="DataclassInstance")
 _ITERATION = described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
 _ODOMETRY_FIELDS = ["odometry_x_m", "odometry_y_m", "odometry_theta_rad"]
 _PIXEL_FIELDS = ["u_px", "v_px", "disparity_px"]  # left image; NaN where there are no images
@@ -136,18 +131,6 @@ TRUTH_POINTS = schema(
         for field in float_fields(POSITION_FIELDS)
     ],
 )
-
-
-def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
-    """Return a copy of a dataclass with some rows of each array.
-
-    The checks of the constructor are skipped, since slicing logs into frames must be fast.
-    """
-    cut = object.__new__(type(value))
-    for field in fields(value):
-        v = getattr(value, field.name)
-        vars(cut)[field.name] = v[rows] if isinstance(v, np.ndarray) else v
-    return cut
 
 
 @dataclass(frozen=True)

@@ -34,13 +34,14 @@ from mapfusion.exchange import read_g2o, read_ply
 from mapfusion.files import (
     UNREADABLE,
     column,
+    default_of,
+    described,
     read_parquet,
     require_cells,
     require_kind,
     text_attributes,
 )
 
-_ABOUT, _DEFAULT = b"about", b"default"
 HEIGHT = ("z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2")
 # Other usual names of heights, without units.
 _HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "position_z", "p_z", "pz")
@@ -49,25 +50,6 @@ _HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "positi
 _SAME_NORM, _LEAST_NORMS = 0.02, 10
 _OTHER_READERS = {".ply": read_ply, ".g2o": read_g2o}
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
-
-
-def described(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
-    """Return a field with its description, and the default that replaces a missing column."""
-    metadata = {_ABOUT: about.encode()}
-    if default is not None:
-        metadata[_DEFAULT] = str(default).encode()
-    return field.with_metadata(metadata)
-
-
-def description_of(field: pa.Field) -> str:
-    """Return the description of a field; empty if it has none."""
-    return (field.metadata or {}).get(_ABOUT, b"").decode()
-
-
-def default_of(field: pa.Field) -> float | None:
-    """Return the default of a missing column; None if the column is required."""
-    text = (field.metadata or {}).get(_DEFAULT)
-    return None if text is None else float(text)
 
 
 def table_path(folder: Path, name: str) -> Path:

@@ -1,4 +1,4 @@
-"""Numerical building blocks: kernels, 3 x 3 matrices, bit sets, bounds, generators, checks.
+"""Numerical building blocks: kernels, 3 x 3 matrices, bit sets, rows, generators, checks.
 
 BLAS threads: NumPy and SciPy each have a BLAS with its own threads, and the threads of one BLAS
 spin while the other computes. Alternating calls with small blocks, as in an envelope factorisation,
@@ -11,14 +11,19 @@ and its rounding depends on the processor.
 import math
 import zlib
 from collections.abc import Callable
+from dataclasses import fields
 from functools import cache, cached_property, partial
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Float = NDArray[np.float64]
+Arrays = TypeVar("Arrays", bound="DataclassInstance")
 
 
 class Compiled:
@@ -385,6 +390,18 @@ def require_finite(name: str, values: np.ndarray) -> None:
     """Raise ValueError when `values` holds NaN or infinity."""
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name}: contains NaN or infinity")
+
+
+def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
+    """Return a copy of a dataclass with some rows of each array.
+
+    The checks of the constructor are skipped, since slicing logs into frames must be fast.
+    """
+    cut = object.__new__(type(value))
+    for field in fields(value):
+        v = getattr(value, field.name)
+        vars(cut)[field.name] = v[rows] if isinstance(v, np.ndarray) else v
+    return cut
 
 
 def require_shape(name: str, values: np.ndarray, shape: tuple[int | None, ...]) -> None:

@@ -34,8 +34,7 @@ from mapfusion.files import (
     write_table,
     write_whole,
 )
-from mapfusion.geometry.numerics import Float, generator
-from mapfusion.robot_log import with_rows
+from mapfusion.geometry.numerics import Float, generator, with_rows
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
 from mapfusion.vision.tracking import PATCH_SIDE_PX, Features
 from sim.renderer import Renderer

@@ -43,9 +43,9 @@ from mapfusion.files import (
     schema,
     write_table,
 )
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, with_rows
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
-from mapfusion.robot_log import RobotLog, first_frames, read_log, with_rows
+from mapfusion.robot_log import RobotLog, first_frames, read_log
 from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map, with_path_errors
 from mapfusion.viewing import LogSightings
 
@@ -355,7 +355,7 @@ class Snapshots(Mapping[int, LandmarkMap]):
 
     @cached_property
     def _sight_lines(self) -> LogSightings:
-        return LogSightings.of(self._log)
+        return LogSightings.of(self._log.iteration, self._log.observations.position_m)
 
     @cached_property
     def associations(self) -> Associations:
