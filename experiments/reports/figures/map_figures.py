@@ -27,13 +27,14 @@ from experiments.reports.figures.result_tables import (
     ResultTables,
     of_pair,
 )
-from experiments.reports.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, PURPLE
+from experiments.reports.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 from mapfusion.files import POSITION_FIELDS
 from mapfusion.geometry.numerics import Float
 from mapfusion.plotting import (
     ELLIPSE_BOUND,
     FUSED_COLOUR,
     LEVEL_TEXT,
+    PURPLE,
     add_ellipses,
     ellipse_handle,
     semi_axes,
