@@ -247,9 +247,9 @@ def _import_robots(
             survey = next((path for path in surveys if path.is_file()), None)
             if survey is not None:
                 points = _true_points(survey, log.observations.label)
+            made.append((destination / log.robot, log, T_world_robot, points))
         except InputError as error:
             raise InputError(f"{error}; see `mapfusion docs point_logs`") from error
-            made.append((destination / log.robot, log, T_world_robot, points))
     for path, log, T_world_robot, points in made:
         write_log(path, log)
         for outdated in TRUTH_FILES:  # of an earlier import into the same folder
