@@ -234,7 +234,7 @@ class MapAlignment:
             title = f"{status}: {self.map_b.name} drawn beside {self.map_a.name}"
         motions = [(title, self.T_a_b, self.inlier)]
         for each in self.other_motions:
-            title = f"another motion: {motion_text(each.T_a_b)},\n"
+            title = f"another motion:\n{motion_text(each.T_a_b)},\n"
             title += f"{np.count_nonzero(each.inlier)} of {len(self.inlier)} correspondences"
             motions.append((title, each.T_a_b, each.inlier))
         return [self.plan(title, np.zeros(3), T, inlier) for title, T, inlier in motions]
@@ -485,6 +485,7 @@ class MergedMaps:
             if np.isnan(T_a).any() or np.isnan(T_b).any():
                 T_a, T_b = np.zeros(3), found.T_a_b
                 title = f"{title}, not merged"
+            title += f",\n{np.count_nonzero(found.inlier)} of {len(found.inlier)} correspondences"
             plans.append(found.plan(title, T_a, T_b, found.inlier, (a, b)))
         return plans
 
