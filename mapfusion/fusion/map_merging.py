@@ -64,6 +64,8 @@ if TYPE_CHECKING:  # results are printed and written without data frames and fig
 
     MapLike = LandmarkMap | str | os.PathLike[str] | pd.DataFrame
 
+# Ratio of the sigmas at the origin and at the overlap from which on T_a_b alone misleads.
+_LEVER = 30
 _MOST_RIVALS = 3  # motions beside the estimate; pictures of more are not legible
 _MOST_PAIRS = 6  # of maps in a picture, two rows of plans
 # What a user can do about an alignment that is not accepted.
@@ -172,6 +174,22 @@ class MapAlignment:
             return ""
         return self.ready.pairs.note(int(np.count_nonzero(self.inlier))) or self.cause
 
+    @property
+    def far_away(self) -> str:
+        """Say what a motion of maps far from their origin means; empty if it is near."""
+        overlap = self.registered.refined.overlap
+        if overlap is None:
+            return ""
+        sigma_m, at_overlap_m = (motion_sigma(S)[0] for S in (self.covariance, overlap.covariance))
+        if sigma_m < max(_LEVER * at_overlap_m, DISTINCT_M):
+            return ""
+        name, (dx, dy) = self.map_b.name, overlap.p_a - overlap.p_b
+        return (
+            f"The overlap lies {np.linalg.norm(overlap.p_b) / 1e3:.1f} km from the origin of {name}, "
+            f"where T_a_b has a sigma of {sigma_m:.0f} m; at the overlap it moves {name} by "
+            f"({dx:.3f} m, {dy:.3f} m)."
+        )
+
     @cached_property
     def other_motions(self) -> list[SupportedMotion]:
         """Other motions that many correspondences support, the best supported first."""
@@ -197,8 +215,10 @@ class MapAlignment:
         why = _sentence(f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}")
         heights = self.registered.refined.heights
         asks = reason.endswith("?") and not self.hint  # for a likely cause, such as another unit
-        if asks or (heights is not None and heights.loses_pairs):  # the reason says what to do
-            return why
+        described = [each.descriptor is not None for each in (self.map_a, self.map_b)]
+        unlike = not len(self.correspondences) and described[0] != described[1]
+        if asks or unlike or (heights is not None and heights.loses_pairs):
+            return why  # the reason says what to do
         return f"{why} {_sentence(self.hint or _REMEDIES[self.status])}"
 
     @property
@@ -324,6 +344,8 @@ def advice(found: Sequence[MapAlignment]) -> str:
         agree = "all" if len(accepted) == len(found) else f"{len(accepted)} of"
         text += f", and {agree} {len(found)} methods agree"
     text += "."
+    if best.far_away:
+        text += f" {best.far_away}"
     return f"{text} Note: {_sentence(best.reason)}" if best.reason else text
 
 

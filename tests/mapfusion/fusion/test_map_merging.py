@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -123,6 +124,34 @@ def test_the_advice_says_what_to_use_and_how_sure_it_is(found: MapAlignment) -> 
     said = advice([found, other])
     assert said.startswith("Use no T_a_b without a check: accepted motions contradict each other")
     assert "of other" in said
+
+
+def test_the_advice_on_maps_far_from_their_origin_says_how_they_move_where_they_are() -> None:
+    far = np.array([465e3, 5250e3, 0.0])
+    a, b = two_maps()
+    assert not mapfusion.align_maps(a, b).far_away
+    own = se2.transform_points(T_A_B, b.position_m)  # of the same frame as a, but for 0.1 m
+    moved = [
+        replace(a, position_m=a.position_m + far),
+        replace(b, position_m=own + far - [0.1, 0, 0]),
+    ]
+    found = mapfusion.align_maps(*moved)
+    said = found.advice
+    assert "The overlap lies 5270.6 km from the origin of south, where T_a_b has a sigma" in said
+    told = re.search(r"at the overlap it moves south by \((.*) m, (.*) m\)", said)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(0.1, abs=0.02)
+    assert float(told[2]) == pytest.approx(0.0, abs=0.02)
+
+
+def test_maps_with_descriptors_and_labels_are_told_what_they_lack() -> None:
+    a, b = two_maps()
+    labelled = replace(
+        b, descriptor=None, descriptor_kind=None, label=np.arange(60, dtype=np.int32)
+    )
+    found = mapfusion.align_maps(a, labelled)
+    assert found.refusal.endswith("they are matched by geometry.")
+    assert found.reason.startswith("0 correspondences: map north has descriptors, map south only")
 
 
 def with_status(found: MapAlignment, status: Status, reason: str) -> MapAlignment:
