@@ -186,7 +186,8 @@ class MapAlignment:
         name, (dx, dy) = self.map_b.name, overlap.p_a - overlap.p_b
         away_km = np.linalg.norm(overlap.p_b) / 1e3
         return (
-            f"The overlap lies {away_km:.1f} km from the origin of {name}, where T_a_b has a sigma of {sigma_m:.0f} m; at the overlap it moves {name} by "
+            f"The overlap lies {away_km:.1f} km from the origin of {name}, where T_a_b has a sigma "
+            f"of {sigma_m:.0f} m; at the overlap it moves {name} by "
             f"({dx:.3f} m, {dy:.3f} m)."
         )
 
