@@ -161,7 +161,8 @@ class MapAlignment:
             return ""
         a, b, refinement = self.map_a.name, self.map_b.name, self._refinement
         if is_mirrored(self.ready.pairs, self._acceptance, refinement, self.matching):
-            image = "look like mirror images of each other: check the sign of y and theta"
+            image = "look like mirror images of each other: check the signs of y and "
+            image += "theta, and the order of x and y"
             return f"{a} and {b} {image}"
         if unit := common_unit(self.map_a, self.map_b, self.matching, refinement):
             return f"{a} and {b} fit each other as maps in {unit}: write both in metres"
