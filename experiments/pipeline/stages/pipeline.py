@@ -233,9 +233,10 @@ def _recorded(scenario: Recording) -> Iterable[RobotStages]:
             raise InputError(f"{frames}: robot {name} is in another log already")
         robots[name] = read
     n_most = max(read.n_frames for read in robots.values())
-    for name, (recorded, _, *size) in robots.items():
+    for name, (recorded, _, n_frames, n_observations, n_bytes) in robots.items():
         mapped = _slam(scenario, recorded)
-        smoothed = _smooth(scenario, recorded, mapped, size[0], n_most)
+        smoothed = _smooth(scenario, recorded, mapped, n_frames, n_most)
+        size = n_frames, n_observations, n_bytes
         yield RobotStages(name, *size, recorded, mapped, smoothed)
 
 
