@@ -26,6 +26,7 @@ import pyarrow as pa
 from mapfusion.errors import InputError
 from mapfusion.files import (
     columns,
+    described,
     float_fields,
     named_columns,
     read_parquet,
@@ -38,7 +39,6 @@ from mapfusion.files import (
 from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se3 import tilt
 from mapfusion.robot_log import Observations
-from mapfusion.tables import described
 
 FILE = "attitude.parquet"
 _ANGLES = ["roll_rad", "pitch_rad"]

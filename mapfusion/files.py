@@ -27,6 +27,7 @@ from mapfusion.errors import DamagedFileError, InputError
 
 _KIND = b"mapfusion.kind"
 _VERSION = b"mapfusion.schema_version"
+_ABOUT, _DEFAULT = b"about", b"default"  # of a field
 _PREFIX = "mapfusion."
 _OURS = _PREFIX.encode()
 _ARROW_SCHEMA = b"ARROW:schema"
@@ -457,6 +458,25 @@ def columns(table: pa.Table, names: Sequence[str]) -> np.ndarray:
 def named_columns(names: Sequence[str], values: np.ndarray) -> dict[str, np.ndarray]:
     """Return an array (N, len(names)) as columns by name; the inverse of `columns`."""
     return dict(zip(names, values.T, strict=True))
+
+
+def described(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
+    """Return a field with its description, and the default that replaces a missing column."""
+    metadata = {_ABOUT: about.encode()}
+    if default is not None:
+        metadata[_DEFAULT] = str(default).encode()
+    return field.with_metadata(metadata)
+
+
+def description_of(field: pa.Field) -> str:
+    """Return the description of a field; empty if it has none."""
+    return (field.metadata or {}).get(_ABOUT, b"").decode()
+
+
+def default_of(field: pa.Field) -> float | None:
+    """Return the default of a missing column; None if the column is required."""
+    text = (field.metadata or {}).get(_DEFAULT)
+    return None if text is None else float(text)
 
 
 def float_fields(names: Sequence[str]) -> list[pa.Field]:

@@ -29,6 +29,7 @@ from mapfusion.files import (
     column,
     covariance_columns,
     covariances_from,
+    described,
     float_fields,
     name_in_text,
     named_columns,
@@ -50,8 +51,8 @@ from mapfusion.geometry.numerics import (
     require_no_twins,
     require_points,
     require_shape,
+    with_rows,
 )
-from mapfusion.robot_log import with_rows
 from mapfusion.tables import (
     APPEARANCE_FIELDS,
     HEIGHT,
@@ -60,7 +61,6 @@ from mapfusion.tables import (
     appearance_from,
     appearance_schema,
     csv_bytes,
-    described,
     is_alone,
     read_open_table,
     require_appearance,
@@ -400,18 +400,6 @@ def coloured_ply(landmarks: LandmarkMap, rgb: np.ndarray | None = None) -> str:
     return ply_text(xyz | columns, landmarks.name, landmarks.planar)
 
 
-def _with_sigma(sigma_m: float) -> pa.Schema:
-    """Return the schema of maps in which missing covariances are those of one sigma."""
-    variances = {"cov_xx_m2", "cov_yy_m2", "cov_zz_m2"}
-    fields = [
-        described(field, "", sigma_m**2 if field.name in variances else 0.0)
-        if field.name in COVARIANCE_FIELDS
-        else field
-        for field in LANDMARKS
-    ]
-    return pa.schema(fields, LANDMARKS.metadata)
-
-
 def read_map(
     path: str | Path,
     alone: bool = False,
@@ -440,7 +428,15 @@ def _map_from(
     path: Path, table: pa.Table | None, sigma_m: float | None, descriptor_metric: str
 ) -> LandmarkMap:
     """Return the map of a table, or of a file if the table is None; raises InputError."""
-    known = LANDMARKS if sigma_m is None else _with_sigma(sigma_m)
+    known = LANDMARKS
+    if sigma_m is not None:  # missing covariances are those of one sigma
+        variances = ("cov_xx_m2", "cov_yy_m2", "cov_zz_m2")
+        usual = {name: sigma_m**2 if name in variances else 0.0 for name in COVARIANCE_FIELDS}
+        fields = [
+            described(field, "", usual[field.name]) if field.name in usual else field
+            for field in LANDMARKS
+        ]
+        known = pa.schema(fields, LANDMARKS.metadata)
     table, attributes = read_open_table(path, known, table, descriptor_metric)
     finite = "give a finite number, or remove the row"
     require_cells(path, table, [*POSITION_FIELDS, *COVARIANCE_FIELDS], np.isfinite, finite)

@@ -12,9 +12,8 @@ All observations of a track show the same point, which has a small offset from t
 offset differs between tracks. Within a track it is constant, so it does not average out.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -30,6 +29,7 @@ from mapfusion.files import (
     columns,
     covariance_columns,
     covariances_from,
+    described,
     float_fields,
     name_in_text,
     named_columns,
@@ -49,21 +49,17 @@ from mapfusion.geometry.numerics import (
     require_no_twins,
     require_points,
     require_shape,
+    with_rows,
 )
 from mapfusion.tables import (
     APPEARANCE_FIELDS,
     appearance_columns,
     appearance_from,
     appearance_schema,
-    described,
     read_open_table,
     require_appearance,
     table_path,
 )
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 
 NO_TRACK = -1
 # Limit of the heading increment between two frames, as a number. Larger turns are not observable
@@ -72,7 +68,6 @@ NO_TRACK = -1
 LARGEST_TURN = 360.0
 TRUTH_TABLES = ("truth_poses", "truth_points")
 TRUTH_FILES = tuple(f"{name}.parquet" for name in TRUTH_TABLES)
-Arrays = TypeVar("Arrays", bound="DataclassInstance")
 _ITERATION = described(pa.field("iteration", pa.int32()), "number of the frame: 0, 1, 2, ...")
 _ODOMETRY_FIELDS = ["odometry_x_m", "odometry_y_m", "odometry_theta_rad"]
 _PIXEL_FIELDS = ["u_px", "v_px", "disparity_px"]  # left image; NaN where there are no images
@@ -136,18 +131,6 @@ TRUTH_POINTS = schema(
         for field in float_fields(POSITION_FIELDS)
     ],
 )
-
-
-def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
-    """Return a copy of a dataclass with some rows of each array.
-
-    The checks of the constructor are skipped, since slicing logs into frames must be fast.
-    """
-    cut = object.__new__(type(value))
-    for field in fields(value):
-        v = getattr(value, field.name)
-        vars(cut)[field.name] = v[rows] if isinstance(v, np.ndarray) else v
-    return cut
 
 
 @dataclass(frozen=True)
@@ -339,7 +322,22 @@ def read_log(folder: str | Path) -> RobotLog:
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a robot log with frames.parquet)")
     frames, attributes = read_open_table(path, FRAMES)
-    _require_frames(path, frames)
+    _require_numbered(path, frames)
+    finite = "give a finite number"
+    require_cells(path, frames, ["time_s", *_ODOMETRY_FIELDS], np.isfinite, finite)
+    odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
+    still = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(still):
+        row = still[0] + 1
+        found = f"is {time_s[row]:.15g} in row {row}, after {time_s[row - 1]:.15g}"
+        remedy = "times must increase from row to row; mend the clock or the order of the rows"
+        raise InputError(f"{path}: column time_s: {found}; {remedy}")
+    way = f"the motion since the row before is at most {LARGEST_POSITION_M:g} m"
+    require_cells(
+        path, frames, _ODOMETRY_FIELDS[:2], lambda moved: abs(moved) <= LARGEST_POSITION_M, way
+    )
+    turn = f"the turn since the row before, in radians, is at most {LARGEST_TURN:g}"
+    require_cells(path, frames, _ODOMETRY_FIELDS[2:], lambda by: abs(by) <= LARGEST_TURN, turn)
     iteration, observations, planar = _observations(folder)
     seen = table_path(folder, "observations")
     beyond = np.flatnonzero(iteration >= frames.num_rows)
@@ -350,7 +348,6 @@ def read_log(folder: str | Path) -> RobotLog:
     if "robot" in attributes:
         planar = attributes.get("planar") == "true"
     name = attributes.get("robot", name_in_text(folder.resolve().name))
-    odometry, time_s = columns(frames, _ODOMETRY_FIELDS), column(frames, "time_s")
     odometry[:1] = 0.0  # the first frame has no row before
     calibration = calibration_from(attributes, path)
     try:
@@ -366,26 +363,6 @@ def read_log(folder: str | Path) -> RobotLog:
     except ValueError as error:
         raise InputError(f"{seen}: {error}") from error
     return log
-
-
-def _require_frames(path: Path, table: pa.Table) -> None:
-    """Raise InputError for the first invalid frame; the message names column and row."""
-    _require_numbered(path, table)
-    finite = "give a finite number"
-    require_cells(path, table, ["time_s", *_ODOMETRY_FIELDS], np.isfinite, finite)
-    time_s = column(table, "time_s")
-    still = np.flatnonzero(np.diff(time_s) <= 0)
-    if len(still):
-        row = still[0] + 1
-        found = f"is {time_s[row]:.15g} in row {row}, after {time_s[row - 1]:.15g}"
-        remedy = "times must increase from row to row; mend the clock or the order of the rows"
-        raise InputError(f"{path}: column time_s: {found}; {remedy}")
-    way = f"the motion since the row before is at most {LARGEST_POSITION_M:g} m"
-    require_cells(
-        path, table, _ODOMETRY_FIELDS[:2], lambda moved: abs(moved) <= LARGEST_POSITION_M, way
-    )
-    turn = f"the turn since the row before, in radians, is at most {LARGEST_TURN:g}"
-    require_cells(path, table, _ODOMETRY_FIELDS[2:], lambda by: abs(by) <= LARGEST_TURN, turn)
 
 
 def _require_numbered(path: Path, table: pa.Table) -> None:

@@ -17,7 +17,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv
 
-from mapfusion.column_units import UNIT, plain_name, renaming
 from mapfusion.descriptors import (
     METRICS,
     USURF,
@@ -34,13 +33,14 @@ from mapfusion.exchange import read_g2o, read_ply
 from mapfusion.files import (
     UNREADABLE,
     column,
+    default_of,
+    described,
     read_parquet,
     require_cells,
     require_kind,
     text_attributes,
 )
 
-_ABOUT, _DEFAULT = b"about", b"default"
 HEIGHT = ("z_m", "cov_xz_m2", "cov_yz_m2", "cov_zz_m2")
 # Other usual names of heights, without units.
 _HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "position_z", "p_z", "pz")
@@ -48,26 +48,38 @@ _HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "positi
 # SIFT's numbers have one norm, and rounding changes it by less than 1 %.
 _SAME_NORM, _LEAST_NORMS = 0.02, 10
 _OTHER_READERS = {".ply": read_ply, ".g2o": read_g2o}
+# Units at the end of the names of columns, other spellings, and their names in messages.
+_UNIT = re.compile(
+    r"_?(\[.*\]|\(.*\)|(?:(?<=_)|^)(?:rad|deg|[mck]?m)_s|km_?h|degps|[mck]?m2?|met(er|re)s?|ft|feet"
+    r"|[mun]?s|rad(ian)?s?|deg(ree)?s?|px)$"
+)
+_SPELLINGS: dict[str, str] = dict.fromkeys(("meter", "meters", "metre", "metres"), "m")
+_SPELLINGS |= {"feet": "ft", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad"}
+_SPELLINGS |= {"°": "deg", "sec": "s", "seconds": "s", "degps": "deg_s"}
+_UNIT_NAMES = {"deg": "degrees", "mm": "millimetres", "cm": "centimetres", "ft": "feet"}
+_UNIT_NAMES |= {"km_h": "kilometres per hour", "kmh": "kilometres per hour"}
+_UNIT_NAMES |= {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_UNIT_NAMES |= {"deg_s": "degrees per second", "km": "kilometres", "m": "metres", "s": "seconds"}
+# What numbers of a unit are multiplied by, by the unit and the needed unit.
+_CONVERSIONS = {
+    ("deg", "rad"): "pi/180",
+    ("deg_s", "rad_s"): "pi/180",
+    ("mm", "m"): "0.001",
+    ("cm", "m"): "0.01",
+    ("km", "m"): "1000",
+    ("ft", "m"): "0.3048",
+    ("mm2", "m2"): "1e-6",
+    ("cm2", "m2"): "1e-4",
+    ("mm_s", "m_s"): "0.001",
+    ("cm_s", "m_s"): "0.01",
+    ("km_h", "m_s"): "1/3.6",
+    ("kmh", "m_s"): "1/3.6",
+    ("ms", "s"): "0.001",
+    ("us", "s"): "1e-6",
+    ("ns", "s"): "1e-9",
+}
+_MAX_NAMED = 3  # columns with similar names in one message
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
-
-
-def described(field: pa.Field, about: str, default: float | None = None) -> pa.Field:
-    """Return a field with its description, and the default that replaces a missing column."""
-    metadata = {_ABOUT: about.encode()}
-    if default is not None:
-        metadata[_DEFAULT] = str(default).encode()
-    return field.with_metadata(metadata)
-
-
-def description_of(field: pa.Field) -> str:
-    """Return the description of a field; empty if it has none."""
-    return (field.metadata or {}).get(_ABOUT, b"").decode()
-
-
-def default_of(field: pa.Field) -> float | None:
-    """Return the default of a missing column; None if the column is required."""
-    text = (field.metadata or {}).get(_DEFAULT)
-    return None if text is None else float(text)
 
 
 def table_path(folder: Path, name: str) -> Path:
@@ -156,13 +168,13 @@ def read_open_table(
     if missing := [name for name, values in found.items() if values is None]:
         remedy = f"`mapfusion docs formats` describes the columns of a {kind} table"
         if here := [name for name in missing if name in similar]:
-            remedy = renaming({name: similar[name] for name in here})
+            remedy = _renaming({name: similar[name] for name in here})
         elif kind == "landmark_map" and {"cov_xx_m2", "cov_yy_m2"} <= set(missing):
             remedy = "`--sigma 0.05` states one standard deviation for all landmarks, in metres"
         raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")
     if similar:
         reason = "columns with unknown names are ignored"
-        raise InputError(f"{path}: {renaming(similar)}, or remove it: {reason}")
+        raise InputError(f"{path}: {_renaming(similar)}, or remove it: {reason}")
     if planar:
         attributes = {"planar": "true"} | attributes
     plain = [pa.field(field.name, field.type) for field in table_schema]
@@ -176,16 +188,16 @@ def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, s
     Similar names differ only in letter case, blanks, hyphens or the unit. Every usual name of a
     height is similar to z_m, since data without z_m would be read as planar.
     """
-    known = {plain_name(field.name): field.name for field in table_schema}
-    known = {UNIT.sub("", name): field for name, field in known.items()} | known
+    known = {_plain_name(field.name): field.name for field in table_schema}
+    known = {_UNIT.sub("", name): field for name, field in known.items()} | known
     if "z_m" in table_schema.names and "z_m" not in names:
         known |= dict.fromkeys(_HEIGHT_NAMES, "z_m")
     similar: dict[str, str] = {}
     for name in names:
         if name in table_schema.names:
             continue
-        plain = plain_name(name)
-        like = known.get(plain) or known.get(UNIT.sub("", plain))
+        plain = _plain_name(name)
+        like = known.get(plain) or known.get(_UNIT.sub("", plain))
         if like is not None and like not in names:
             similar.setdefault(like, name)
     return similar
@@ -212,7 +224,7 @@ def _require_dialect(path: Path, data: bytes, table_schema: pa.Schema) -> None:
     """Raise InputError if the first line of a CSV file has another separator, or holds no names."""
     first = data.split(b"\n", 1)[0].decode("utf-8-sig", "replace").strip()
     for separator, called in _SEPARATORS.items():
-        names = {plain_name(each.strip("\"'")) for each in first.split(separator)}
+        names = {_plain_name(each.strip("\"'")) for each in first.split(separator)}
         if len(names) > 1 and names & set(table_schema.names):
             raise InputError(f"{path}: is separated by {called}; write it with commas")
     cells = [each for each in re.split(r"[,;\s]+", first.replace('"', "")) if each]
@@ -530,3 +542,35 @@ def require_appearance(path: Path, table: pa.Table) -> None:
         found = f"number {k} is {descriptor[row, k]} in row {row}"
         remedy = "give finite numbers, or leave the whole cell empty"
         raise InputError(f"{path}: column descriptor: {found}; {remedy}")
+
+
+def _plain_name(name: str) -> str:
+    """Return a name in lower case, with an underscore for each blank or hyphen."""
+    return re.sub(r"[\s-]+", "_", name.strip().lower())
+
+
+def _renaming(similar: Mapping[str, str]) -> str:
+    """Return what to do with columns of similar names, given by the known name.
+
+    Numbers in another unit must be converted, not only renamed.
+    """
+    converted, renamed = [], []
+    for name, there in similar.items():
+        unit, needed = _unit_of(there), _unit_of(name)
+        factor, called = _CONVERSIONS.get((unit, needed)), _UNIT_NAMES.get(unit, unit)
+        if factor:
+            converted.append(f"{there} is in {called}: multiply by {factor} and name it {name}")
+        elif unit and unit != needed:
+            converted.append(f"{there} is in {called}: convert it and name it {name}")
+        else:
+            renamed.append(f"{there} to {name}")
+    asked = [f"rename column {' and '.join(renamed[:_MAX_NAMED])} (mind the unit)"]
+    more = ", ..." if max(len(renamed), len(converted)) > _MAX_NAMED else ""
+    return "; ".join([*converted[:_MAX_NAMED], *(asked if renamed else [])]) + more
+
+
+def _unit_of(name: str) -> str:
+    """Return the unit at the end of a column's name, in one spelling; empty if there is none."""
+    match = _UNIT.search(_plain_name(name))
+    unit = match[0].strip("_[]() ") if match else ""
+    return _SPELLINGS.get(unit, unit)

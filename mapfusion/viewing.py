@@ -22,6 +22,7 @@ from mapfusion.files import (
     Write,
     column,
     columns,
+    described,
     float_fields,
     named_columns,
     read_table,
@@ -30,8 +31,6 @@ from mapfusion.files import (
 )
 from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se2 import wrap
-from mapfusion.robot_log import RobotLog
-from mapfusion.tables import described
 
 BEARINGS = 16  # sectors of the field of view
 RANGES = 8  # range steps up to the greatest range
@@ -140,9 +139,9 @@ class LogSightings(NamedTuple):
     height_m: Float
 
     @classmethod
-    def of(cls, log: RobotLog, n: int | None = None) -> "LogSightings":
-        """Return the coordinates of all observations of a log, or of the first n."""
-        frame, (x, y, z) = log.iteration[:n], log.observations.position_m[:n].T
+    def of(cls, frame: np.ndarray, position_m: Float) -> "LogSightings":
+        """Return the coordinates of observations (n,) at positions (n, 3) in the robot frame."""
+        x, y, z = position_m.T
         return cls(frame, np.arctan2(y, x), np.hypot(x, y), z.copy())
 
     def viewing(self, landmark: np.ndarray, path: Float, source_observation: np.ndarray) -> Viewing:
@@ -171,19 +170,25 @@ class LogSightings(NamedTuple):
 
 
 def viewing_of_log(
-    log: RobotLog, landmark: np.ndarray, path: Float, source_observation: np.ndarray
+    frame: np.ndarray,
+    position_m: Float,
+    landmark: np.ndarray,
+    path: Float,
+    source_observation: np.ndarray,
 ) -> Viewing:
     """Return the viewing evidence of a map that was built from a log.
 
     Args:
-        log: a log with at least T frames.
+        frame: (K,) frame of each observation of a log with at least T frames.
+        position_m: (K, 3) positions of the observations in the robot frame.
         landmark: (n,) landmark of each of the log's first observations, as the row of the
             observation that created the landmark; negative for none.
         path: (T, 3) poses of the first T frames in the map frame.
         source_observation: (N,) row of the observation that created each landmark of the map.
     """
-    n_seen = int(np.searchsorted(log.iteration, len(path)))
-    return LogSightings.of(log, n_seen).viewing(landmark, path, source_observation)
+    n_seen = int(np.searchsorted(frame, len(path)))
+    sightings = LogSightings.of(frame[:n_seen], position_m[:n_seen])
+    return sightings.viewing(landmark, path, source_observation)
 
 
 def bearing_bin(bearing_rad: Float, field: FieldOfView) -> np.ndarray:

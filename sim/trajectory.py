@@ -29,6 +29,7 @@ from mapfusion.geometry.numerics import Float, require_finite, require_shape
 from mapfusion.geometry.se3 import in_space
 from mapfusion.parameters import Range, require_in_range
 
+TRAJECTORY_FILE = "trajectory.parquet"  # in the folder of a drive
 _WHEEL_FIELDS = ["left_wheel_rad", "right_wheel_rad"]
 _TILT_FIELDS = ["roll_rad", "pitch_rad"]
 _LEVEL_FIELDS = [

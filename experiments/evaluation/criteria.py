@@ -127,6 +127,17 @@ def _of_robot_pair(rows: pd.DataFrame, column: str) -> pd.Series:
     return rows.groupby(keys)[column].transform("max")
 
 
+def repetition_spread_m(rows: pd.DataFrame) -> float:
+    """Return the 10-90 % range of one aligner's translation error over repetitions.
+
+    Errors are before refinement, of repetitions that gave an estimate. The result is the median
+    over seeds, robot pairs and iterations.
+    """
+    keys = [name for name in (*_ROBOT_PAIR, "iteration") if name in rows]
+    groups = rows.groupby(keys)["translation_error_m"]
+    return float((groups.quantile(0.9) - groups.quantile(0.1)).median())
+
+
 @dataclass(frozen=True)
 class NothingMerged:
     """Run in which no two maps were merged.

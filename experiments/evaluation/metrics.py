@@ -32,6 +32,7 @@ from experiments.evaluation.criteria import (
     merged_robots,
     nothing_merged,
     path_rms,
+    repetition_spread_m,
     rich,
     rms,
     summarise_alignments,
@@ -253,17 +254,6 @@ def lead_over_others(tables: Tables, aligner: str) -> float:
 def scatter_m(tables: Tables, aligner: str) -> float:
     """Return `repetition_spread_m` of an aligner for rich pairs."""
     return repetition_spread_m(rich(_of(tables["errors"], aligner)))
-
-
-def repetition_spread_m(rows: pd.DataFrame) -> float:
-    """Return the 10-90 % range of one aligner's translation error over repetitions.
-
-    Errors are before refinement, of repetitions that gave an estimate. The result is the median
-    over seeds, robot pairs and iterations.
-    """
-    keys = [name for name in ("run_id", *_PAIR, "iteration") if name in rows]
-    groups = rows.groupby(keys)["translation_error_m"]
-    return float((groups.quantile(0.9) - groups.quantile(0.1)).median())
 
 
 @metric(false_merges="")

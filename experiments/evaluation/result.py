@@ -331,10 +331,19 @@ def write_result(
         make_timings = others.pop("timings")
         for name, make in others.items():
             write_table(name, make)
-        _write_maps(run, folder / "maps")
+        maps = folder / "maps"
+        for name, landmarks in run.last_maps(team.iteration).items():
+            write_map(maps / f"{name}.parquet", landmarks)
+        for robot in run.pipeline.robots:
+            smooth, last = run.store.path(robot.smooth), robot.n_frames - 1
+            if last in read_smoothed_path(smooth):
+                _put_map(map_files(smooth, last)[0], maps / f"{robot.name}.smoothed.parquet")
+        if fuser := run.pipeline.fusers.get(run.scenario.merge.fuser):
+            for k, fused in enumerate(fused_map_files(run.store.path(fuser)), start=1):
+                _put_map(fused, maps / ("fused.parquet" if k == 1 else f"fused.{k}.parquet"))
     # Figures add their times to `timings` later, so the list of files does not include this table.
     names = [*of_figures, *others]
-    files = [folder / "scenario.json", folder / "world.json", *(folder / "maps").glob("*")]
+    files = [folder / "scenario.json", folder / "world.json", *maps.glob("*")]
     files += [tables.table_path(folder, name) for name in names]
     write_table("timings", make_timings)
     written = {"tables": sorted([*names, "timings"]), "files": file_entries(folder, files)}
@@ -367,18 +376,6 @@ def measure_aligners(run: EvaluatedRun) -> None:
             timing = run.timings[pair.a.name, pair.b.name]
             remove_abandoned(path.parent)
             tables.write(path, "aligner_timings", timing.rows())
-
-
-def _write_maps(run: EvaluatedRun, folder: Path) -> None:
-    for name, landmarks in run.last_maps(run.team.iteration).items():
-        write_map(folder / f"{name}.parquet", landmarks)
-    for robot in run.pipeline.robots:
-        smooth, last = run.store.path(robot.smooth), robot.n_frames - 1
-        if last in read_smoothed_path(smooth):
-            _put_map(map_files(smooth, last)[0], folder / f"{robot.name}.smoothed.parquet")
-    if fuser := run.pipeline.fusers.get(run.scenario.merge.fuser):
-        for k, fused in enumerate(fused_map_files(run.store.path(fuser)), start=1):
-            _put_map(fused, folder / ("fused.parquet" if k == 1 else f"fused.{k}.parquet"))
 
 
 def _put_map(source: Path, target: Path) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from experiments.evaluation.evaluated_run import EvaluatedRun, finding_of_truth
 from experiments.pipeline.stage import Stage
 from experiments.pipeline.stages.align import estimate_row
-from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.pipeline.stages.features import render_frame
 from experiments.pipeline.stages.log import measured_odometry, measured_tilt
 from experiments.pipeline.stages.pipeline import SimulatedRobotStages, smoother_parameters
@@ -25,9 +24,9 @@ from mapfusion.align.alignment import NOT_RUN
 from mapfusion.align.correspondences import match
 from mapfusion.attitude import FILE as ATTITUDE_FILE
 from mapfusion.attitude import read_attitude
-from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import EXPORTERS, export_drive
 from mapfusion.datasets.log_consistency import Finding, gate_finding
+from mapfusion.datasets.stereo_recording import StereoDrive
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
 from mapfusion.files import write_together
@@ -49,7 +48,7 @@ from mapfusion.verification.registration import Registration
 from mapfusion.vision.depth import DepthParameters, add_noise
 from sim.rendering.frame_source import FrameSource
 from sim.stereo_head import StereoFrame
-from sim.trajectory import Trajectory, read_trajectory
+from sim.trajectory import TRAJECTORY_FILE, Trajectory, read_trajectory
 
 
 def require_simulation(scenario: AnyScenario) -> None:

@@ -25,11 +25,11 @@ from experiments.reports.inspect import unit_of
 from mapfusion import attitude, landmark_map, robot_log, viewing
 from mapfusion.align.alignment import Status
 from mapfusion.datasets.log_consistency import Finding
-from mapfusion.files import write_whole
+from mapfusion.files import default_of, description_of, write_whole
 from mapfusion.fusion.map_merging import MapAlignment, MergedMaps, advice
 from mapfusion.geometry.joint_covariance import RANK
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.tables import HEIGHT, default_of, description_of
+from mapfusion.tables import HEIGHT
 
 _SIGNIFICANT_DIGITS = 4  # in Markdown and LaTeX; CSV files have all digits
 

@@ -171,8 +171,21 @@ def images_by(name: str) -> str:
 def closing_lines(result: Path) -> tuple[str, str]:
     """Return two lines: the method to use, and the command that opens the report."""
     errors = tables.read(tables.table_path(result, "errors"), "errors")
-    if errors.empty:
-        advice = _advice_without_truth(result)
+    if errors.empty:  # no truth: name the aligners whose last alignments were accepted
+        estimates = tables.read(tables.table_path(result, "estimates"), "estimates")
+        advice = "Method to use: unknown. There are no two maps to align."
+        if len(estimates):
+            last = at_the_end(estimates)
+            last = last[last["repetition"] == 0]
+            accepted = last.groupby("aligner", sort=False)["accepted"].agg(["sum", "count"])
+            n_most, n_pairs = int(accepted["sum"].max()), int(accepted["count"].max())
+            most = accepted.index[accepted["sum"] == n_most].tolist()
+            advice = (
+                f"Method to use: {listed(most)} had {n_most} of {n_pairs} pairs of maps accepted; "
+                "no truth is known, so errors are not."
+            )
+            if not n_most:
+                advice = "Method to use: unknown. No alignment was accepted, and no truth is known."
     else:
         timings = tables.read(tables.table_path(result, "aligner_timings"), "aligner_timings")
         run = errors.assign(run_id="this", scenario="this", seed=0)
@@ -203,25 +216,6 @@ def method_advice(found: Recommendation) -> str:
         verb = "does" if len(found.equals) == 1 else "do"
         hint = f"{listed(found.equals)} {verb} as well as far as this run can tell. {hint}"
     return f"Method to use: {name}. {how}. {hint}"
-
-
-def _advice_without_truth(result: Path) -> str:
-    """Say in one line which aligners' last alignments were accepted."""
-    estimates = tables.read(tables.table_path(result, "estimates"), "estimates")
-    if estimates.empty:
-        return "Method to use: unknown. There are no two maps to align."
-    last = at_the_end(estimates)
-    last = last[last["repetition"] == 0]
-    accepted = last.groupby("aligner", sort=False)["accepted"].agg(["sum", "count"])
-    n_pairs = int(accepted["count"].max())
-    most = accepted.index[accepted["sum"] == accepted["sum"].max()].tolist()
-    n_most = int(accepted["sum"].max())
-    if not n_most:
-        return "Method to use: unknown. No alignment was accepted, and no truth is known."
-    return (
-        f"Method to use: {listed(most)} had {n_most} of {n_pairs} pairs of maps accepted; "
-        "no truth is known, so errors are not."
-    )
 
 
 def _filter_beside_smoothed(errors: pd.DataFrame, smoothed: pd.DataFrame) -> pd.DataFrame:

@@ -3,7 +3,7 @@
 import itertools
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -282,39 +282,36 @@ def print_guarantee(found: Guarantee) -> None:
     shown |= columns("d", n_right="right\nanswers") | columns(".1%", accepted="accepted\n95 %")
     note = f"at most: Clopper-Pearson, one-sided, confidence {confidence}; false: any method merges"
     print_frame(found.shares, shown, "Runs with a false merge", note)
-    print_lines(_guarantee_lines(found, confidence))
-
-
-def _guarantee_lines(found: Guarantee, confidence: str) -> Iterator[str]:
-    """Yield the certified threshold, and what limits it, in words."""
-    aim = f"at most {found.alpha:.2%} of runs have a false merge (confidence {confidence})"
+    # The certified threshold, and what limits it.
     best, n_runs = found.certified, len(found.answers.runs)
     if best is None:
         needed = clean_runs_needed(found.alpha, found.delta)
         k = int(found.thresholds["n_false_runs"].iloc[0]) if len(found.thresholds) else 0
         why = f"{k} of {n_runs} runs are false at the highest threshold"
-        yield f"no threshold is certified: {why}; {needed} runs without a false one are needed"
+        lines = [f"no threshold is certified: {why}; {needed} runs without a false one are needed"]
     else:
-        yield f"lowest certified align.evidence.least_ratio: {best['least_ratio']:.4g}; {aim}"
+        aim = f"at most {found.alpha:.2%} of runs have a false merge (confidence {confidence})"
+        lines = [f"lowest certified align.evidence.least_ratio: {best['least_ratio']:.4g}; {aim}"]
         if best["n_right"]:
             share = interval(*best[["accepted", "accepted_low", "accepted_high"]], layout=".1%")
-            yield f"  right answers accepted with it: {share} of {best['n_right']}"
+            lines.append(f"  right answers accepted with it: {share} of {best['n_right']}")
     if found.least_ratio > 1:
-        yield (
+        lines.append(
             f"made with least_ratio {found.least_ratio:g}: lower thresholds cannot be judged; "
             "runs with --set align.evidence.least_ratio=1 tell"
         )
     if n := found.answers.n_with_any_ratio:
         why = "maps without viewing evidence, or tables of an earlier version"
-        yield f"accepted with any threshold: {n} answers ({why})"
+        lines.append(f"accepted with any threshold: {n} answers ({why})")
     if seeds := found.answers.shared_seeds:
         what = f"seed {seeds[0]}" + (f" and {len(seeds) - 1} more" if seeds[1:] else "")
-        yield (
+        lines.append(
             f"{what}: of several scenarios, whose worlds may have parts in common; bounds over all "
             "scenarios need a seed of its own for each run"
         )
     if found.n_failed:
-        yield f"failed and not counted: {found.n_failed} runs"
+        lines.append(f"failed and not counted: {found.n_failed} runs")
+    print_lines(lines)
 
 
 def _print_rates(

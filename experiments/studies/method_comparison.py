@@ -22,10 +22,10 @@ from experiments.evaluation.criteria import (
     error_over_oracle,
     has_common_ground,
     methods_in,
+    repetition_spread_m,
     rich,
     summarise_alignments,
 )
-from experiments.evaluation.metrics import repetition_spread_m
 from experiments.evaluation.tables import SHOWN
 from experiments.studies import intervals
 from experiments.studies.intervals import (

@@ -27,12 +27,12 @@ from experiments.evaluation.criteria import (
     has_common_ground,
     mergeable,
     merged_robots,
+    repetition_spread_m,
     right_refined,
     summarise_alignments,
 )
 from experiments.evaluation.loop_closures import WINDOW_FRAMES, LoopClosure, loop_closures
 from experiments.evaluation.map_errors import last_fused
-from experiments.evaluation.metrics import repetition_spread_m
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields
 from experiments.studies.intervals import RUN, Clusters, median_interval
 from experiments.studies.run_tables import Runs

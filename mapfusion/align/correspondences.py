@@ -70,24 +70,19 @@ def nearest_descriptors(
         InputError: the descriptors are of different kinds.
     """
     require_one_kind([(each.called, each.descriptor_kind) for each in (map_a, map_b)])
-    # distances of vectors far from the origin would lose digits
-    are_usurf = map_a.descriptor_kind == map_b.descriptor_kind == USURF
-    centre = None if are_usurf else _centre(map_a)
+    centre = None
+    if not map_a.descriptor_kind == map_b.descriptor_kind == USURF:
+        # distances of vectors far from the origin would lose digits: subtract their mean
+        assert map_a.descriptor is not None
+        known = map_a.descriptor[~np.isnan(map_a.descriptor).any(axis=1)]
+        mean = known.mean(axis=0, dtype=np.float64) if len(known) else np.zeros(known.shape[1])
+        centre = mean.astype(np.float32)
     a, b = _Side.of(map_a, _ABSENT, 0.0, centre), _Side.of(map_b, -_ABSENT, floor_m2, centre)
     for rows in a.blocks(height_bound):
         columns = b.of_heights(*a.interval(rows, height_bound), height_bound)
         product = a.descriptor[rows] @ b.descriptor[columns].T
         _take_nearer(product, rows, columns, a, b, height_bound, elsewhere_m)
     return a.nearest, a.distance2, b.nearest
-
-
-def _centre(landmarks: LandmarkMap) -> np.ndarray:
-    """Return the mean descriptor (D,) of a map; zero if it has none."""
-    assert landmarks.descriptor is not None
-    known = ~np.isnan(landmarks.descriptor).any(axis=1)
-    if not known.any():
-        return np.zeros(landmarks.descriptor.shape[1], np.float32)
-    return landmarks.descriptor[known].mean(axis=0, dtype=np.float64).astype(np.float32)
 
 
 class _Side(NamedTuple):

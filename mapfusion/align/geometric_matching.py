@@ -447,8 +447,11 @@ class PlacedSearch:
         i, j, share = near[:, 0], rows_b[near[:, 1]], 1.0
         if len(i) and self._has_heights:
             rise, reach2 = a.z[i] - b.z[j], a.most_z_m2[i] + b.most_z_m2[j]
-            if math.isnan(up_m):
-                up_m = _densest(rise, math.sqrt(np.median(reach2)))
+            if math.isnan(up_m):  # median of the densest interval of this length
+                length, ordered = 2 * math.sqrt(np.median(reach2)), np.sort(rise)
+                ends = np.searchsorted(ordered, ordered + length, side="right")
+                first = int(np.argmax(ends - np.arange(len(ordered))))
+                up_m = float(np.median(ordered[first : ends[first]]))
             agree = (rise - up_m) ** 2 <= reach2
             share = (np.count_nonzero(agree) + 1) / (len(i) + 1)
             i, j, distance = i[agree], j[agree], distance[agree]
@@ -524,14 +527,6 @@ def attributes_of_pairs_agree(
     unlike = (a.category[i] >= 0) & (b.category[j] >= 0) & (a.category[i] != b.category[j])
     off = np.abs(a.size_m[i] - b.size_m[j])
     return ~unlike & ~(off > size_tolerance * np.fmax(a.size_m[i], b.size_m[j]))
-
-
-def _densest(values: Float, reach: float) -> float:
-    """Return the median of the values (n,) in the densest interval of length 2 reach."""
-    ordered = np.sort(values)
-    inside = np.searchsorted(ordered, ordered + 2 * reach, side="right") - np.arange(len(ordered))
-    first = int(np.argmax(inside))
-    return float(np.median(ordered[first : first + inside[first]]))
 
 
 _CANDIDATES = 48  # bins that are refitted

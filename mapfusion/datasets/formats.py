@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from mapfusion.errors import InputError
 
 if TYPE_CHECKING:
-    from mapfusion.datasets.export import StereoDrive
-    from mapfusion.datasets.stereo_recording import ReadYaml, StereoRecording
+    from mapfusion.datasets.stereo_recording import ReadYaml, StereoDrive, StereoRecording
 
 
 AttitudeSource = Literal["auto", "mount", "pictures", "floor", "imu", "odometry"]

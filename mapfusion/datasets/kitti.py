@@ -38,20 +38,18 @@ from mapfusion.datasets.camera_calibration import (
     StereoCalibration,
     require_rigid,
 )
-from mapfusion.datasets.export import (
-    OnFrame,
-    StereoDrive,
-    write_dead_reckoning,
-    write_picture,
-    write_text,
-)
 from mapfusion.datasets.levelling import MountSettings, level_mount
 from mapfusion.datasets.stereo_recording import (
+    OnFrame,
     PictureFile,
     ReadYaml,
     Shot,
+    StereoDrive,
     StereoRecording,
     pair_shots,
+    write_dead_reckoning,
+    write_picture,
+    write_text,
 )
 from mapfusion.datasets.text_files import (
     NS,

@@ -16,8 +16,7 @@ A folder without odometry holds one such folder for each robot. Their landmarks 
 above.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,6 +34,7 @@ from mapfusion.files import (
     POSITION_FIELDS,
     column,
     columns,
+    described,
     float_fields,
     point_fields,
     points_from,
@@ -56,7 +56,6 @@ from mapfusion.tables import (
     APPEARANCE_FIELDS,
     NO_LABEL,
     appearance_from,
-    described,
     read_open_table,
     require_appearance,
     table_path,
@@ -223,18 +222,28 @@ def _import_robots(
     """Write the logs of the robots in a folder; `read` returns the measurements of one."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a recording with odometry.csv)")
-    robots = [each for each in (folder, *sorted(folder.iterdir())) if _holds_odometry(each)]
+    folders = (folder, *sorted(folder.iterdir()))
+    robots = [each for each in folders if table_path(each, "odometry").is_file()]
     if not robots:
         missing = "no odometry.csv or odometry.parquet, nor in a folder below"
         raise InputError(f"{folder}: {missing}; see `mapfusion docs point_logs`")
     made = []
     for robot in robots[:1] if robots[0] == folder else robots:
-        with _naming_the_page():
+        try:
             measured, odometry = read(robot), table_path(robot, "odometry")
-            clock_s = _clock(robot, measured.time_s, settings.frame_s)
-            log = log_on_clock(
-                robot.resolve().name, clock_s, _read_odometry(odometry, measured.time_s), measured
-            )
+            # Times of the frames: those of the measurements, or equally spaced ones.
+            clock_s, frame_s = np.unique(measured.time_s), settings.frame_s
+            if frame_s:
+                span_s = measured.time_s[-1] - measured.time_s[0]
+                if not span_s / frame_s < MAX_FRAMES:
+                    limit = (
+                        f"more than {MAX_FRAMES} frames of {frame_s:g} s; are its times seconds?"
+                    )
+                    raise InputError(f"{robot}: measurements over {span_s:g} s are {limit}")
+                steps = np.arange(int(np.ceil(span_s / frame_s)) + 1)
+                clock_s = measured.time_s[0] + frame_s * steps
+            poses_at = _read_odometry(odometry, measured.time_s)
+            log = log_on_clock(robot.resolve().name, clock_s, poses_at, measured)
             _require_radians(odometry, log, clock_s, measured)
             poses, points = table_path(robot, "truth_poses"), None
             T_world_robot = _read_true_poses(poses, clock_s, settings) if poses.is_file() else None
@@ -243,6 +252,8 @@ def _import_robots(
             if survey is not None:
                 points = _true_points(survey, log.observations.label)
             made.append((destination / log.robot, log, T_world_robot, points))
+        except InputError as error:
+            raise InputError(f"{error}; see `mapfusion docs point_logs`") from error
     for path, log, T_world_robot, points in made:
         write_log(path, log)
         for outdated in TRUTH_FILES:  # of an earlier import into the same folder
@@ -276,19 +287,6 @@ def _require_radians(path: Path, log: RobotLog, clock_s: Float, measured: Measur
     name, unit = ("theta_rad", "degrees") if has_poses else (_VELOCITY_FIELDS[1], "degrees/s")
     said = f"holds {unit}: only then the odometry agrees with the observations"
     raise InputError(f"{path}: column {name}: {said}; multiply it by pi/180")
-
-
-@contextmanager
-def _naming_the_page() -> Iterator[None]:
-    """Add the page that describes the tables to the message of an InputError."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{error}; see `mapfusion docs point_logs`") from error
-
-
-def _holds_odometry(folder: Path) -> bool:
-    return table_path(folder, "odometry").is_file()
 
 
 def _read_timed(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
@@ -377,19 +375,6 @@ def points_of_ranges(
     along_and_across[:, 1, 1] = (range_m * bearing_sigma_rad) ** 2
     covariance[:, :2, :2] = direction @ along_and_across @ np.swapaxes(direction, 1, 2)
     return position, covariance
-
-
-def _clock(robot: Path, time_s: Float, frame_s: float) -> Float:
-    """Return the times of the frames, shape (T,), for measurements at `time_s`."""
-    if not frame_s:
-        clock_s = np.unique(time_s)
-    else:
-        n = (time_s[-1] - time_s[0]) / frame_s
-        if not n < MAX_FRAMES:
-            limit = f"more than {MAX_FRAMES} frames of {frame_s:g} s; are its times seconds?"
-            raise InputError(f"{robot}: measurements over {time_s[-1] - time_s[0]:g} s are {limit}")
-        clock_s = time_s[0] + frame_s * np.arange(int(np.ceil(n)) + 1)
-    return clock_s
 
 
 def log_on_clock(

@@ -28,10 +28,16 @@ from mapfusion.datasets.camera_calibration import (
     StereoCalibration,
     read_stereo_calibration,
 )
-from mapfusion.datasets.export import OnFrame, StereoDrive
 from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.levelling import MountSettings, level_mount, upright
-from mapfusion.datasets.stereo_recording import ReadYaml, Shot, StereoRecording, pair_shots
+from mapfusion.datasets.stereo_recording import (
+    OnFrame,
+    ReadYaml,
+    Shot,
+    StereoDrive,
+    StereoRecording,
+    pair_shots,
+)
 from mapfusion.datasets.text_files import NS, TimedPoses
 from mapfusion.errors import InputError, did_you_mean, one_line
 from mapfusion.files import PART, temporary_prefix, write_whole

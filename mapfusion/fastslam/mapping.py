@@ -131,7 +131,8 @@ def run_log(
         landmarks = replace(slam.best_map(min_count), name=log.robot, calibration=log.calibration)
         source, path = slam.best_associations(), slam.best_path()
         if viewing:
-            evidence = viewing_of_log(log, source, path, landmarks.source_observation)
+            seen = log.iteration, log.observations.position_m
+            evidence = viewing_of_log(*seen, source, path, landmarks.source_observation)
             landmarks = replace(landmarks, viewing=evidence)
         if attitude is not None and not log.planar:
             # The attitude's uncertainty adds to the variance of the heights.

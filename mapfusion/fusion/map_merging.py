@@ -39,7 +39,7 @@ from mapfusion.fusion.fusers import (
 from mapfusion.fusion.merge import merge
 from mapfusion.fusion.team_graph import EdgeStatus
 from mapfusion.geometry.numerics import Float
-from mapfusion.geometry.se2 import motion_sigma
+from mapfusion.geometry.se2 import motion_sigma, rms_distance_m
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.plotting import Plan, fused_plan, pair_plan, plot_plans
 from mapfusion.verification.false_alarms import Acceptance
@@ -54,7 +54,6 @@ from mapfusion.verification.rivals import (
     SupportedMotion,
     distinct_motions,
     is_mirrored,
-    rms_distance_m,
 )
 from mapfusion.verification.verdict import PairEvidence
 

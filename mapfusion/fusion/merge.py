@@ -92,22 +92,18 @@ def merge(
     """
     _require_valid_pairs(maps, pairs)
     require_one_kind([(each.called, each.descriptor_kind) for each in maps])
-    origins, height = [origin_of(each) for each in maps], _heights(len(maps), pairs)
+    origins, height = [origin_of(each) for each in maps], np.zeros(len(maps))
+    by_heights = [p for p in pairs if p.alignment.ok and p.alignment.heights is not None]
+    offset = [p.alignment.heights.used_offset_m for p in by_heights]  # type: ignore[union-attr]
+    if np.any(offset):
+        sigma = np.array([p.alignment.heights.sigma_m for p in by_heights])  # type: ignore[union-attr]
+        of_pair = np.array([(p.a, p.b) for p in by_heights])
+        height = level_heights(len(maps), of_pair, np.array(offset), sigma)
     local = [in_local_frame(*each) for each in zip(maps, origins, height.tolist(), strict=True)]
     pairs = [_in_local_frames(pair, origins) for pair in pairs]
     fusion = connect(local, pairs, parameters.team).fused_by(fuser or make_fuser(), parameters)
     fused = (_in_given_frames(each, local, origins, height) for each in fusion.fused)
     return replace(fusion, fused=tuple(fused))
-
-
-def _heights(n_maps: int, pairs: Sequence[AlignedPair]) -> Float:
-    """Return the height (n_maps,) that is subtracted from each map; 0 without a known offset."""
-    known = [p for p in pairs if p.alignment.ok and p.alignment.heights is not None]
-    offset = [p.alignment.heights.used_offset_m for p in known]  # type: ignore[union-attr]
-    if not np.any(offset):
-        return np.zeros(n_maps)
-    sigma = np.array([p.alignment.heights.sigma_m for p in known])  # type: ignore[union-attr]
-    return level_heights(n_maps, np.array([(p.a, p.b) for p in known]), np.array(offset), sigma)
 
 
 def _in_local_frames(pair: AlignedPair, origins: Sequence[Float]) -> AlignedPair:

@@ -1,4 +1,4 @@
-"""Numerical building blocks: kernels, 3 x 3 matrices, bit sets, bounds, generators, checks.
+"""Numerical building blocks: kernels, 3 x 3 matrices, bit sets, rows, generators, checks.
 
 BLAS threads: NumPy and SciPy each have a BLAS with its own threads, and the threads of one BLAS
 spin while the other computes. Alternating calls with small blocks, as in an envelope factorisation,
@@ -11,14 +11,19 @@ and its rounding depends on the processor.
 import math
 import zlib
 from collections.abc import Callable
+from dataclasses import fields
 from functools import cache, cached_property, partial
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Float = NDArray[np.float64]
+Arrays = TypeVar("Arrays", bound="DataclassInstance")
 
 
 class Compiled:
@@ -210,21 +215,16 @@ def times_vectors(A: Float, x: Float) -> Float:
     return A[:, :, 0] * x[:, None, 0] + A[:, :, 1] * x[:, None, 1] + A[:, :, 2] * x[:, None, 2]
 
 
+@kernel
 def times_blocks(A: Float, B: Float) -> Float:
     """Return the products (N, 3, 3) of blocks (N, 3, 3)."""
     made = np.empty(A.shape)
-    _fill_products(A, B, made)
-    return made
-
-
-@kernel
-def _fill_products(A: Float, B: Float, made: Float) -> None:
-    """Fill the products (N, 3, 3) of blocks (N, 3, 3)."""
     for i in range(len(made)):
         for r in range(3):
             x, y, z = A[i, r, 0], A[i, r, 1], A[i, r, 2]
             for q in range(3):
                 made[i, r, q] = x * B[i, 0, q] + y * B[i, 1, q] + z * B[i, 2, q]
+    return made
 
 
 def sums_by(group: np.ndarray, values: Float, n: int) -> Float:
@@ -390,6 +390,18 @@ def require_finite(name: str, values: np.ndarray) -> None:
     """Raise ValueError when `values` holds NaN or infinity."""
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name}: contains NaN or infinity")
+
+
+def with_rows(value: Arrays, rows: slice | np.ndarray) -> Arrays:
+    """Return a copy of a dataclass with some rows of each array.
+
+    The checks of the constructor are skipped, since slicing logs into frames must be fast.
+    """
+    cut = object.__new__(type(value))
+    for field in fields(value):
+        v = getattr(value, field.name)
+        vars(cut)[field.name] = v[rows] if isinstance(v, np.ndarray) else v
+    return cut
 
 
 def require_shape(name: str, values: np.ndarray, shape: tuple[int | None, ...]) -> None:

@@ -441,7 +441,8 @@ def smoothed_map(
         log.planar,
         log.robot,
     )
-    viewing = viewing_of_log(log, landmark, smoothed.estimate.path, source)
+    seen = log.iteration, log.observations.position_m
+    viewing = viewing_of_log(*seen, landmark, smoothed.estimate.path, source)
     kind = source_observation.descriptor_kind
     more = joint, viewing, log.calibration
     return LandmarkMap(point, joint.marginal_m2, *about, *more, descriptor_kind=kind)

@@ -473,22 +473,22 @@ class PairVerifier:
         Maps without repeated structure and without another motion need little evidence if the
         supporters extend over two regions or more and over several walls: the regions beside that
         which led to the motion, if there are any, must confirm it, and none may contradict it. All
-        that agrees on one wall may be a large picture. Less than two regions may be a copy that led
-        to the motion as a whole. It is then one region, which is no evidence.
+        that agrees on one wall may be a large picture, and few supporters elsewhere may be chance.
+        Less than two regions may be a copy that led to the motion as a whole. It is then one
+        region, which is no evidence.
         """
         ratio = regions.log10_evidence(evidence.shares)
         # the best of n wrong motions reaches the threshold n times as often (Boole)
         passed = ratio - math.log10(evidence.n_motions(self._bound))
-        if rival is not None or evidence.repeats(self._bound):
+        if rival is not None or evidence.repeats(self._bound) or regions.n_contradicted:
             return passed
-        if regions.n_contradicted:
-            return passed
-        p = self._bulk(alignment)
-        if (extent_m := float(np.ptp(p, axis=0).max())) < _TOUCHED * evidence.region_m:
+        least_m = _TOUCHED * evidence.region_m
+        if (extent_m := self._extent_m(alignment)) < least_m:
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
             return around.log10_evidence(evidence.shares)
         unconfirmed = len(regions) > 1 and ratio < DECISIVE
-        return passed if unconfirmed or self._is_one_wall(p) else math.inf
+        small = np.ptp(self._bulk(alignment)[1], axis=0).max() < least_m
+        return passed if unconfirmed or small or self._is_one_wall(alignment) else math.inf
 
     def _doubt(
         self,
@@ -518,13 +518,16 @@ class PairVerifier:
         # No structure repeats and no other motion fits: a contradicting region is reason for doubt.
         if regions.n_contradicted:
             return f"{{told}}, too few beside {regions.n_contradicted} that are missing from one"
-        p = self._bulk(alignment)
-        if np.ptp(p, axis=0).max() >= _TOUCHED * evidence.region_m:
-            if self._is_one_wall(p):
-                return "{told}, too few if all that agrees lies on one wall and could be a picture"
-            return "{told}, too few to confirm it"
-        what = f"all that agrees lies within {_TOUCHED * evidence.region_m:.2g} m"
-        return f"{what} and could be a copy; too few regions around confirm it"
+        least_m = _TOUCHED * evidence.region_m
+        if extent_m < least_m:
+            what = f"all that agrees lies within {least_m:.2g} m"
+            return f"{what} and could be a copy; too few regions around confirm it"
+        if np.ptp(self._bulk(alignment)[1], axis=0).max() < least_m:
+            what = f"nearly all that agrees lies within {least_m:.2g} m"
+            return f"{{told}}, too few if {what} and could be a copy"
+        if self._is_one_wall(alignment):
+            return "{told}, too few if all that agrees lies on one wall and could be a picture"
+        return "{told}, too few to confirm it"
 
     def _others(self, T_a_b: Float, evidence: PairEvidence) -> list[RivalMotion]:
         """Return the rivals that differ from a motion."""
@@ -537,21 +540,32 @@ class PairVerifier:
         """Return the longer side of the bounding box of the supporters."""
         return float(np.ptp(self._pairs.p_b[alignment.inlier, :2], axis=0).max(initial=0.0))
 
-    def _bulk(self, alignment: Alignment) -> Float:
-        """Return the supporters (n, 2) nearest to their median, without those of chance."""
-        p = self._pairs.p_b[alignment.inlier, :2]
-        away_m = np.linalg.norm(p - np.median(p, axis=0), axis=1)
-        return p[away_m <= np.quantile(away_m, _BULK)]
+    def _bulk(self, alignment: Alignment) -> tuple[Float, Float]:
+        """Return the supporters in each map, without those farthest from their median.
 
-    def _is_one_wall(self, p: Float) -> bool:
-        """Return True if supporters (n, 2) lie on one line, as those of a picture on a wall do.
+        Few of them may agree by chance.
 
-        The line is their principal axis. Two standard deviations across it are at most `gate_m`,
-        which covers the drift.
+        Returns:
+            Positions in map a and in map b, the same supporters in both.
         """
-        centred = p - p.mean(axis=0)
-        across_m2 = np.linalg.eigvalsh(centred.T @ centred / len(p))[0]
-        return bool(2 * np.sqrt(max(across_m2, 0.0)) <= self._settings.evidence.gate_m)
+        used = self._pairs[alignment.inlier]
+        p_a, p_b = used.p_a[:, :2], used.p_b[:, :2]
+        away_m = np.linalg.norm(p_b - np.median(p_b, axis=0), axis=1)
+        near = away_m <= np.quantile(away_m, _BULK)
+        return p_a[near], p_b[near]
+
+    def _is_one_wall(self, alignment: Alignment) -> bool:
+        """Return True if most supporters lie on one line, as those of a picture on a wall do.
+
+        The line is their principal axis. Two standard deviations across it are at most `gate_m`.
+        One map suffices: drift bends a wall.
+        """
+        for p in self._bulk(alignment):
+            centred = p - p.mean(axis=0)
+            across_m2 = np.linalg.eigvalsh(centred.T @ centred / len(p))[0]
+            if 2 * np.sqrt(max(across_m2, 0.0)) <= self._settings.evidence.gate_m:
+                return True
+        return False
 
     def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
         """Return True if most of the smaller map agrees and lies within the size of a room."""

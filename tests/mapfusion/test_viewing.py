@@ -55,7 +55,7 @@ def test_a_field_of_view_ends_at_quantiles(n: int) -> None:
     observations = Observations(position, np.tile(np.eye(3), (n, 1, 1)))
     log = RobotLog("R", False, np.zeros(1), np.zeros((1, 3)), np.zeros(n, int), observations)
     none = np.empty(0, dtype=np.int64)
-    field = viewing_of_log(log, np.full(n, -1), np.zeros((1, 3)), none).field
+    field = viewing_of_log(log.iteration, position, np.full(n, -1), np.zeros((1, 3)), none).field
     bearing = np.arctan2(position[:, 1], position[:, 0])
     np.testing.assert_array_equal(field.bearing_rad, np.quantile(bearing, stray))
     range_m = np.hypot(position[:, 0], position[:, 1])

@@ -12,7 +12,7 @@ from sim.driver import DriverSettings, drive, require_drivable
 from sim.floorplan import FloorPlan, Wall
 from sim.routes import Route
 from sim.textures import Texture
-from sim.trajectory import BodySway, Trajectory, write_trajectory
+from sim.trajectory import TRAJECTORY_FILE, BodySway, Trajectory, write_trajectory
 from sim.world import write_faces
 
 Look = tuple[str, bool]  # look of a wall, and True if the wall is mirrored
@@ -58,7 +58,6 @@ def run_faces(settings: FacesSettings, job: Job) -> None:
 
 
 FACES_STAGE = StageKind("faces", "paint the walls", run_faces)
-TRAJECTORY_FILE = "trajectory.parquet"
 
 
 @dataclass(frozen=True)

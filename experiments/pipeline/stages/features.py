@@ -17,7 +17,6 @@ import numpy as np
 import pyarrow as pa
 
 from experiments.pipeline.stage import Job, StageKind
-from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from mapfusion.camera import StereoCamera
 from mapfusion.descriptors import USURF, kind_from, pack_bits, stated_metric, unpack_bits
 from mapfusion.files import (
@@ -34,14 +33,13 @@ from mapfusion.files import (
     write_table,
     write_whole,
 )
-from mapfusion.geometry.numerics import Float, generator
-from mapfusion.robot_log import with_rows
+from mapfusion.geometry.numerics import Float, generator, with_rows
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
 from mapfusion.vision.tracking import PATCH_SIDE_PX, Features
 from sim.renderer import Renderer
 from sim.rendering.frame_source import FrameSource, truth_behind
 from sim.stereo_head import RadiometricNoise, StereoFrame
-from sim.trajectory import read_trajectory
+from sim.trajectory import TRAJECTORY_FILE, read_trajectory
 
 # Frames per task: about two seconds of work, so an interrupted run loses little.
 FRAMES_PER_CHUNK = 20

@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 
 from experiments.pipeline.stage import Job, StageKind
-from experiments.pipeline.stages.drive import TRAJECTORY_FILE
 from experiments.pipeline.stages.features import read_features
 from experiments.pipeline.store import link_or_copy
 from experiments.pipeline.tables import TRACKS, write_rows
@@ -23,7 +22,7 @@ from mapfusion.robot_log import (
 from mapfusion.vision.attitude_filter import AttitudeEstimator, AttitudeMeasurement
 from mapfusion.vision.front_end import FrontEndParameters, Observer, concatenate_observations
 from sim.odometry import OdometryNoise, add_noise, calibrated_track_m, encoder_increments
-from sim.trajectory import AttitudeNoise, Trajectory, read_trajectory
+from sim.trajectory import TRAJECTORY_FILE, AttitudeNoise, Trajectory, read_trajectory
 
 _LABEL = "track features"
 _LOGGED = ("observations.parquet", "truth_points.parquet")  # files of both stages

@@ -43,9 +43,9 @@ from mapfusion.files import (
     schema,
     write_table,
 )
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, with_rows
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
-from mapfusion.robot_log import RobotLog, first_frames, read_log, with_rows
+from mapfusion.robot_log import RobotLog, first_frames, read_log
 from mapfusion.smoother.smooth import SmootherParameters, smooth, smoothed_map, with_path_errors
 from mapfusion.viewing import LogSightings
 
@@ -331,11 +331,11 @@ class Snapshots(Mapping[int, LandmarkMap]):
             origin, seen = landmarks.source_observation, log.observations
             viewing = None
             if self._viewing:  # along the path from which the map was computed
-                evaluated, poses = self._paths
+                sightings, evaluated, poses = self._viewed
                 path = poses[slice(*np.searchsorted(evaluated, [iteration, iteration + 1]))]
                 n_seen = int(np.searchsorted(log.iteration, iteration + 1))
                 owner = self.associations.at(iteration, n_seen)
-                viewing = self._sight_lines.viewing(owner, path, origin)
+                viewing = sightings.viewing(owner, path, origin)
             made = replace(
                 landmarks,
                 descriptor=None if seen.descriptor is None else seen.descriptor[origin],
@@ -354,18 +354,16 @@ class Snapshots(Mapping[int, LandmarkMap]):
         return self._made[iteration]
 
     @cached_property
-    def _sight_lines(self) -> LogSightings:
-        return LogSightings.of(self._log)
-
-    @cached_property
     def associations(self) -> Associations:
         """Landmark of each of the log's observations."""
         return Associations.read(self._slam)
 
     @cached_property
-    def _paths(self) -> tuple[np.ndarray, Float]:
+    def _viewed(self) -> tuple[LogSightings, np.ndarray, Float]:
+        """Sightings of the log; evaluated iteration and pose of each row of the paths."""
+        seen = LogSightings.of(self._log.iteration, self._log.observations.position_m)
         table, _ = read_table(self._slam / "paths.parquet", PATHS)
-        return column(table, "evaluated"), columns(table, POSE_FIELDS)
+        return seen, column(table, "evaluated"), columns(table, POSE_FIELDS)
 
 
 @functools.lru_cache(maxsize=ROBOTS_KEPT)

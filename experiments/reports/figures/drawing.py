@@ -11,7 +11,6 @@ import io
 import pkgutil
 import time
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -209,13 +208,9 @@ def _digest(files: Iterable[Path]) -> str:
 def _code(name: str) -> str:
     """Return the digest of the source of a figure and of the versions of its libraries."""
     sources = source_hash(imported_sources(f"{__package__}.{_REGISTRY[name].module}", __name__))
-    return hashlib.sha256("\n".join([sources, *_versions()]).encode()).hexdigest()
-
-
-@cache
-def _versions() -> list[str]:
-    drawing = [version(name) for name in ("matplotlib", "pandas", "pillow")]
-    return [*library_versions().values(), *drawing]
+    drawing = [version(each) for each in ("matplotlib", "pandas", "pillow")]
+    known = "\n".join([sources, *library_versions().values(), *drawing])
+    return hashlib.sha256(known.encode()).hexdigest()
 
 
 def _files(result: Path, name: str) -> list[Path]:

@@ -213,9 +213,25 @@ def draw_aligner_time(data: ResultTables) -> Figure:
         step = _BARS_APART * float(timings[column].max()) / max(len(shown), 1)
         for place, name in enumerate(shown):
             known = timed[name][timed[name][column] != UNKNOWN]
-            if len(known):
-                shift = step * (place - (len(shown) - 1) / 2)
-                _add_times(axes, data, name, known, column, shift)
+            if known.empty:
+                continue
+            style, several = data.styles[name], data.several_runs
+            joined = len(known) if len(known) <= _MAX_JOINED and not several else TIME_GROUPS
+            bands = time_bands(known, column, joined)
+            spread = bands if several else known
+            shift = 0.0 if several else step * (place - (len(shown) - 1) / 2)
+            at = spread[column] + shift
+            ends = (at, spread["elapsed_low_s"], spread["elapsed_high_s"])
+            dots = {"color": style["color"], "marker": style["marker"], "linestyle": "none"}
+            if several:
+                axes.fill_between(*ends, color=style["color"], alpha=0.16, linewidth=0)
+                dots |= {"markersize": 1.5, "alpha": 0.3}
+            else:
+                axes.vlines(*ends, color=style["color"], linewidth=0.5, alpha=0.5, rasterized=True)
+                dots |= {"markersize": 2.5, "alpha": 0.6}
+            axes.plot(known[column] + shift, known["elapsed_s"], rasterized=True, **dots)
+            zorder = 4 if name == ORACLE else 3
+            axes.plot(bands[column], bands["elapsed_s"], label=name, zorder=zorder, **style)
         if not axes.lines:
             axes.text(0.5, 0.5, "no truth: unknown", ha="center", transform=axes.transAxes)
         axes.set(xlabel=label, yscale="log")
@@ -224,29 +240,6 @@ def draw_aligner_time(data: ResultTables) -> Figure:
     named = [(n, label) for n, label in data.labels.items() if n in timed or label != n]
     aligner_legend(figure, {label: data.styles[name] for name, label in named}, columns=5)
     return figure
-
-
-def _add_times(
-    axes: Axes, data: ResultTables, name: str, rows: pd.DataFrame, column: str, shift: float
-) -> None:
-    """Draw the times of one aligner against a column; bars are shifted along the axis."""
-    style = data.styles[name]
-    joined = len(rows) if len(rows) <= _MAX_JOINED and not data.several_runs else TIME_GROUPS
-    bands = time_bands(rows, column, joined)
-    spread = bands if data.several_runs else rows
-    at = spread[column] if data.several_runs else spread[column] + shift
-    ends = (at, spread["elapsed_low_s"], spread["elapsed_high_s"])
-    dots = {"color": style["color"], "marker": style["marker"], "linestyle": "none"}
-    if data.several_runs:
-        axes.fill_between(*ends, color=style["color"], alpha=0.16, linewidth=0)
-        dots |= {"markersize": 1.5, "alpha": 0.3}
-    else:
-        axes.vlines(*ends, color=style["color"], linewidth=0.5, alpha=0.5, rasterized=True)
-        dots |= {"markersize": 2.5, "alpha": 0.6}
-    place = rows[column] if data.several_runs else at
-    axes.plot(place, rows["elapsed_s"], rasterized=True, **dots)
-    zorder = 4 if name == ORACLE else 3
-    axes.plot(bands[column], bands["elapsed_s"], label=name, zorder=zorder, **style)
 
 
 def draw_fusers(data: ResultTables) -> Figure:

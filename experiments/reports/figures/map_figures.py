@@ -19,7 +19,7 @@ from mpl_toolkits.mplot3d.proj3d import proj_transform
 
 from experiments.evaluation.loop_closures import WINDOW_FRAMES, loop_closures
 from experiments.pipeline.stages.align import unpacked
-from experiments.reports.figures import floor_plan as plan
+from experiments.reports.figures import style as plan
 from experiments.reports.figures.result_tables import (
     FusedPairs,
     NothingToDraw,
@@ -27,13 +27,14 @@ from experiments.reports.figures.result_tables import (
     ResultTables,
     of_pair,
 )
-from experiments.reports.figures.style import BLACK, GRAY, PAGE_WIDTH_IN, PURPLE
+from experiments.reports.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 from mapfusion.files import POSITION_FIELDS
 from mapfusion.geometry.numerics import Float
 from mapfusion.plotting import (
     ELLIPSE_BOUND,
     FUSED_COLOUR,
     LEVEL_TEXT,
+    PURPLE,
     add_ellipses,
     ellipse_handle,
     semi_axes,
@@ -89,7 +90,8 @@ def draw_two_maps(data: ResultTables) -> Figure:
     for axes, robot in zip(panels, robots, strict=True):
         position, covariance = maps[robot]
         path, colour, own = data.path_of(robot)[: k + 1], data.colours[robot], particles[robot]
-        walls = plan.start_plan(axes, data, robot)
+        walls = data.walls_in_frame_of(robot)
+        plan.start_plan(axes, robot, walls)
         points = {"marker": ".", "markersize": 1.5, "color": colour, "zorder": 2}
         plan.add_points(axes, position, label="landmarks", **points)
         ellipses = {"edgecolors": colour, "linewidths": 0.4, "alpha": 0.6, "zorder": 2}
@@ -358,7 +360,7 @@ def draw_aligned_maps(data: ResultTables) -> Figure:
     part = choose_zoom(pairs.position_m, pairs.covariance_m2)
     (x, y), side = part.corner_m, part.side_m
     for axes, rows, scale in ((overview, slice(None), 0.3), (zoom, part.whole, 1.0)):
-        plan.start_plan(axes, data, data.fused_frame)
+        plan.start_plan(axes, data.fused_frame, data.walls_in_frame_of(data.fused_frame))
         position, covariance = pairs.position_m[:, rows], pairs.covariance_m2[:, rows]
         parents = list(np.stack(list(position[:2, :, :2]), axis=1))
         lines = {"colors": GRAY, "linewidths": 0.6, "rasterized": True}
@@ -452,7 +454,8 @@ def draw_fused_map(data: ResultTables) -> Figure:
         raise NothingToDraw("the fused map is empty")
     figure = Figure(figsize=(PAGE_WIDTH_IN, PAGE_WIDTH_IN))
     axes = figure.subplots()
-    walls = plan.start_plan(axes, data, data.fused_frame)
+    walls = data.walls_in_frame_of(data.fused_frame)
+    plan.start_plan(axes, data.fused_frame, walls)
     kinds = []
     for place, (robot, colour) in enumerate(data.colours.items()):
         own = (fused["n_parents"] == 1) & (fused["robot_a"] == robot)

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.evaluation.loop_closures import WINDOW_FRAMES, LoopClosure, loop_closures
-from experiments.reports.figures import floor_plan as plan
+from experiments.reports.figures import style as plan
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, read_png
 from experiments.reports.figures.style import BLACK, GRAY, PAGE_WIDTH_IN
 
@@ -195,7 +195,8 @@ def _about_moments(data: ResultTables, moments: Moments | None) -> str:
 
 def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -> None:
     """Draw the path of one robot and its enlarged particle sets."""
-    path, walls = data.path_of(robot), plan.start_plan(axes, data, robot)
+    path, walls = data.path_of(robot), data.walls_in_frame_of(robot)
+    plan.start_plan(axes, robot, walls)
     axes.plot(*path.T, color=GRAY, linewidth=0.7, zorder=2)
     style = {"marker": ".", "markersize": 1.0, "color": data.colours[robot], "zorder": 3}
     clouds = data.of_robot("clouds", robot)  # ordered by iteration

@@ -209,17 +209,8 @@ def contents_of(path: Path) -> dict[str, Any]:
         charts = {"errors": None, "success": None, "times": time_figure(times, styles)}
         absent = [name for name, label in data.labels.items() if label != name]
         own |= {"charts": own["charts"] | charts, "absent": absent, "outcomes": ()}
-        claims: list[dict[Any, Any]] = []
-        return (
-            own
-            | common
-            | {
-                "no_truth": True,
-                "ranking": None,
-                "styles": styles,
-                "claims": claims,
-            }
-        )
+        shown = {"no_truth": True, "ranking": None, "styles": styles, "claims": ()}
+        return own | common | shown
     assert reduced is not None
     maps = reduced.maps
     if data is None:
@@ -248,6 +239,9 @@ def contents_of(path: Path) -> dict[str, Any]:
         "times": time_figure(times, styles),
     }
     own |= {"charts": own["charts"] | charts, "absent": reduced.absent}
+    # The table of the paper's claims, for runs of the paper's experiment.
+    is_paper = bool(set(SCENARIOS) & set(runs.described["scenario"]))
+    claims = claims_table(compare_with_paper([runs])) if is_paper else pd.DataFrame()
     return (
         own
         | common
@@ -257,16 +251,9 @@ def contents_of(path: Path) -> dict[str, Any]:
             "n_robot_pairs": len(maps[["scenario", "robot_a", "robot_b"]].drop_duplicates()),
             "settings": setting_columns(maps),
             "styles": styles,
-            "claims": _claims(runs),
+            "claims": claims.to_dict("records"),
         }
     )
-
-
-def _claims(runs: Runs) -> list[dict[Any, Any]]:
-    """Return the table of the paper's claims for runs of the paper's experiment; else nothing."""
-    if not set(SCENARIOS) & set(runs.described["scenario"]):
-        return []
-    return claims_table(compare_with_paper([runs])).to_dict("records")
 
 
 def _page_styles(aligners: Sequence[str]) -> dict[str, dict[str, str]]:

@@ -16,12 +16,11 @@ import plotly.graph_objects as go
 
 from experiments.pipeline.stages.align import unpacked
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
-from experiments.reports.figures.style import ORANGE
 from experiments.reports.formatting import metres, radians
 from experiments.reports.report.charts import NEUTRAL, Attributes, Styles, escaped, faint, thinned
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
-from mapfusion.plotting import LEVEL_TEXT, semi_axes
+from mapfusion.plotting import LEVEL_TEXT, ORANGE, semi_axes
 
 MAP_TABLES = ("map_history", "true_pairs", "clouds", "paths")
 MAP_TABLES += ("correspondences", "fused_history", "estimates")

@@ -10,9 +10,9 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL
-from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import export_drive, read_recording
 from mapfusion.datasets.rosbag import RosbagSettings, decode_image, lookup_transform
+from mapfusion.datasets.stereo_recording import StereoDrive
 from mapfusion.errors import InputError
 from tests.mapfusion.datasets.written_layouts import (
     CAMERA,

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from mapfusion.camera import StereoCamera
-from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import EXPORTERS, export_drive, read_recording, settings_class
 from mapfusion.datasets.levelling import MountSettings
 from mapfusion.datasets.stereo_import import Imported, RecordingPart, StereoImport
-from mapfusion.datasets.stereo_recording import StereoRecording
+from mapfusion.datasets.stereo_recording import StereoDrive, StereoRecording
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2, se3
 from mapfusion.vision.front_end import (

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mapfusion.camera import StereoCamera
-from mapfusion.datasets.export import StereoDrive
 from mapfusion.datasets.formats import export_drive, read_recording
 from mapfusion.datasets.levelling import MountSettings
 from mapfusion.datasets.stereo_import import RecordingPart, StereoImport
+from mapfusion.datasets.stereo_recording import StereoDrive
 from mapfusion.datasets.tum_rgbd import TumRgbdSettings
 from mapfusion.errors import InputError
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters

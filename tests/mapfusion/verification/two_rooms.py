@@ -83,7 +83,7 @@ def mapped(
     )
     kept = count >= 3
     source = first[kept]
-    viewing = viewing_of_log(log, first[own], path, source)
+    viewing = viewing_of_log(log.iteration, position, first[own], path, source)
     there = owner_row[source]
     place = p_map[there] + rng.normal(0, noise_m, (len(there), 3)) * [1, 1, 0]
     look = wall.look[there] + rng.normal(0, 0.02, (len(there), 64))
