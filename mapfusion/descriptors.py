@@ -38,7 +38,7 @@ USURF_MEDIAN = 0.8
 # Ratio of the references of two maps from which on their numbers have different units. Maps of one
 # method differ by a few percent.
 _OTHER_UNIT = 4.0
-_ONE_METHOD = "compute both by one method, or remove the column `descriptor`"
+_ONE_METHOD = "compute both by one method, or remove the descriptors of one map"
 _METRIC, _NAME, _REFERENCE = "descriptor_metric", "descriptor_name", "descriptor_reference"
 
 

@@ -6,6 +6,7 @@ only to draw.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -36,19 +37,30 @@ _MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
 _ELLIPSE_SHARE = 1 / 60  # of the view, for the semi-axis of a typical ellipse
 _GAP = 0.15  # between maps that are not aligned, as a share of the width of the first
 _MARKERS = ("o", "^", "v", "x", "d", "*")
-_PAGE_WIDTH_IN, _SMALL_ROW_IN, _TEXT_IN, _LABELS_IN = 8.0, 2.8, 1.3, 0.6
+_PAGE_WIDTH_IN, _EDGE_IN = 8.0, 0.1
+_LEFT_IN, _BELOW_IN = 0.7, 0.5  # of an axes: its ticks and labels
+_TITLE_LINE_IN, _HEADING_LINE_IN, _LEGEND_ROW_IN = (
+    0.15,
+    0.155,
+    0.19,
+)  # of type of at most 8.5 points
 _LARGEST_RATIO, _LEAST_RATIO = 1.3, 0.35  # of height to width of the large plan
 _SMALL_PER_ROW = 3
-_WRAP = 105  # characters of a line of the heading
+# Characters a line, of which the widest usual text fits the page: the heading, the titles of the
+# large and of a small plan, and the legend in one column, in two and in three.
+_WRAP, _TITLE_WRAP, _SMALL_TITLE_WRAP = 118, 105, 34
+_LEGEND_WRAPS = (100, 50, 34)
+# Field of a plan, colour, width and style of its lines; those drawn last lie above the others.
+_LINKS = (("rejected", REJECTED_COLOUR, 0.5, "dotted"), ("accepted", ACCEPTED_COLOUR, 1.2, "solid"))
+_LINK_NAMES = {"rejected": "rejected", "accepted": "supporting"}
+_TITLE_POINTS, _SMALL_TITLE_POINTS = 8.5, 7.5
 _RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # part of Matplotlib: the same on every machine
     "font.size": 8.0,
-    "axes.titlesize": 8.5,
     "axes.grid": True,
     "axes.axisbelow": True,
     "grid.alpha": 0.35,
     "grid.linewidth": 0.4,
-    "figure.constrained_layout.use": True,
 }
 
 
@@ -144,7 +156,8 @@ def fused_plan(
     for k, each in enumerate(maps):
         rows = np.flatnonzero((parents[:, k] >= 0) & ~several)
         if len(rows):
-            parts.append(part_of(landmarks, frame, k, f"of {each.name} alone: {len(rows)}", rows))
+            name = f"of {each.name} alone: {len(rows)} of {len(each)}"
+            parts.append(part_of(landmarks, frame, k, name, rows))
     rows = np.flatnonzero(several)
     common = part_of(landmarks, frame, 0, f"fused from several maps: {len(rows)}", rows)
     parts.append(common._replace(colour=FUSED_COLOUR, marker="s"))
@@ -187,62 +200,134 @@ def ellipses_text(factor: int) -> str:
 
 
 def plot_plans(plans: Sequence[Plan], heading: str) -> Figure:
-    """Draw plans: the first one large, the others in rows below it; the heading is above."""
-    import textwrap
+    """Draw plans: the first one large, the others in rows below it; the heading is above.
 
+    Places are computed from the numbers of lines: automatic layouts neglect that axes of equal
+    scales shrink, and then titles overlap the heading.
+    """
     import matplotlib.style
     from matplotlib.figure import Figure
 
     with matplotlib.style.context(["default", _RC]):
         first, *others = plans
-        low, high = bounds(first)
-        ratio = np.clip((high - low)[1] / (high - low)[0], _LEAST_RATIO, _LARGEST_RATIO)
-        n_rows = -(-len(others) // _SMALL_PER_ROW)
         lines = textwrap.wrap(heading, _WRAP)
-        heights = [ratio * (_PAGE_WIDTH_IN - _LABELS_IN), *[_SMALL_ROW_IN] * n_rows]
-        figure = Figure(figsize=(_PAGE_WIDTH_IN, sum(heights) + _TEXT_IN))
-        figure.suptitle("\n".join(lines), x=0.01, ha="left", fontsize=8.5)
-        n_columns = max(min(len(others), _SMALL_PER_ROW), 1)
-        grid = figure.add_gridspec(n_rows + 1, n_columns, height_ratios=heights)
-        axes = figure.add_subplot(grid[0, :])
         factor = magnification(first)
-        _draw(axes, first, 1.0, factor)
-        handles = [*axes.get_legend_handles_labels()[0], ellipse_handle(FUSED_COLOUR, factor)]
-        figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
-        for k, plan in enumerate(others):
-            place = grid[1 + k // _SMALL_PER_ROW, k % _SMALL_PER_ROW]
-            _draw(figure.add_subplot(place), plan, 0.6, factor)
+        handles = _legend(plans, factor)
+        longest = max(len(str(handle.get_label())) for handle in handles)
+        n_columns = sum(longest <= wrap for wrap in _LEGEND_WRAPS) or 1
+        legend_in = -(-len(handles) // n_columns) * _LEGEND_ROW_IN + _EDGE_IN
+
+        low, high = bounds(first)
+        wide_in = _PAGE_WIDTH_IN - _LEFT_IN - 2 * _EDGE_IN
+        ratio = np.clip((high - low)[1] / (high - low)[0], _LEAST_RATIO, _LARGEST_RATIO)
+        small_in = _PAGE_WIDTH_IN / _SMALL_PER_ROW - _LEFT_IN - _EDGE_IN
+        rows = [[(first, _TITLE_WRAP, wide_in, ratio * wide_in)]]
+        for k in range(0, len(others), _SMALL_PER_ROW):
+            row = others[k : k + _SMALL_PER_ROW]
+            rows.append([(plan, _SMALL_TITLE_WRAP, small_in, small_in) for plan in row])
+
+        boxes, top_in = [], _EDGE_IN + len(lines) * _HEADING_LINE_IN  # from the upper edge
+        for row in rows:
+            titles = [wrapped(plan.title, wrap) for plan, wrap, *_ in row]
+            top_in += 2 * _EDGE_IN + _TITLE_LINE_IN * max(t.count("\n") + 1 for t in titles)
+            for k, ((plan, _, width_in, height_in), title) in enumerate(
+                zip(row, titles, strict=True)
+            ):
+                left_in = _LEFT_IN + k * (width_in + _LEFT_IN + _EDGE_IN)
+                boxes.append((plan, title, left_in, top_in, width_in, height_in))
+            top_in += row[0][-1] + _BELOW_IN
+        page = np.array([_PAGE_WIDTH_IN, top_in + legend_in])
+
+        figure = Figure(figsize=(page[0], page[1]))
+        at = _EDGE_IN / page
+        figure.suptitle(
+            "\n".join(lines), x=at[0], y=1 - at[1], ha="left", va="top", fontsize=_TITLE_POINTS
+        )
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 0.0), "borderaxespad": 0.3}
+        figure.legend(handles=handles, ncols=n_columns, frameon=False, **place)
+        for plan, title, left_in, top_in, width_in, height_in in boxes:
+            corner, size = np.array([left_in, page[1] - top_in - height_in]), [width_in, height_in]
+            axes = figure.add_axes((*(corner / page), *(size / page)))  # type: ignore[arg-type]
+            _draw(axes, plan, title, (width_in, height_in), 1.0 if plan is first else 0.6, factor)
     return figure
 
 
-def _draw(axes: Axes, plan: Plan, scale: float, factor: int) -> None:
-    """Draw one plan; `scale` shrinks its markers and lines, `factor` enlarges its ellipses."""
+def wrapped(title: str, width: int) -> str:
+    """Break the lines of a title that are longer than `width` characters."""
+    return "\n".join("\n".join(textwrap.wrap(line, width)) for line in title.splitlines())
+
+
+def _legend(plans: Sequence[Plan], factor: int) -> list[Line2D]:
+    """Return one entry for each look in the plans; numbers are those of the first plan."""
+    from matplotlib.lines import Line2D
+
+    first, handles = plans[0], list[Line2D]()
+    for name, colour, width, style in _LINKS:
+        ends = getattr(first, name)
+        if any(len(getattr(plan, name)) for plan in plans):
+            label = f"{_LINK_NAMES[name]} correspondence" + (f"s: {len(ends)}" if len(ends) else "")
+            # dotted lines as thin as in a plan are not legible in a legend
+            look: dict[str, Any] = {"color": colour, "linewidth": max(width, 1.0)}
+            look["linestyle"] = style
+            handles.append(Line2D([], [], label=label, **look))
+    if any(len(plan.accepted) for plan in plans):
+        label = "middle of a supporting correspondence"
+        handles.append(Line2D([], [], label=label, **_ring(1.0)))
+    shown = dict[tuple[str, str], Part]()
+    for plan in plans:
+        for part in plan.parts:
+            shown.setdefault((part.colour, part.marker), part)
+    longest = max(_LEGEND_WRAPS)
+    for part in shown.values():
+        label = part.name if len(part.name) <= longest else f"…{part.name[1 - longest :]}"
+        handles.append(Line2D([], [], label=label, **_marker(part, 1.0)))
+    return [*handles, ellipse_handle(FUSED_COLOUR, factor)]
+
+
+def _ring(scale: float) -> dict[str, Any]:
+    """Return the look of the rings around supporting correspondences."""
+    look = {"marker": "o", "markersize": 10 * scale, "linestyle": "none", "color": ACCEPTED_COLOUR}
+    return look | {"markerfacecolor": "none", "markeredgewidth": scale}
+
+
+def _marker(part: Part, scale: float) -> dict[str, Any]:
+    """Return the look of the landmarks of a part."""
+    face = part.colour if part.marker == "x" else "none"
+    look = {"marker": part.marker, "markersize": 4.0 * scale, "linestyle": "none"}
+    return look | {"color": part.colour, "markeredgewidth": 0.8 * scale, "markerfacecolor": face}
+
+
+def _draw(
+    axes: Axes, plan: Plan, title: str, size_in: tuple[float, float], scale: float, factor: int
+) -> None:
+    """Draw one plan.
+
+    Args:
+        axes: axes of the plan.
+        plan: what is drawn.
+        title: its title in lines.
+        size_in: width and height of the axes, which the view fills.
+        scale: factor of the sizes of markers and lines.
+        factor: factor of the ellipses.
+    """
     from matplotlib.collections import LineCollection
 
-    for ends, name, colour, width, style in (
-        (plan.rejected, "rejected", REJECTED_COLOUR, 0.4, "dotted"),
-        (plan.accepted, "supporting", ACCEPTED_COLOUR, 1.2, "solid"),
-    ):
-        if len(ends):
-            label = f"{name} correspondences: {len(ends)}"
-            look: dict[str, Any] = {"colors": colour, "linewidths": width * scale}
-            look |= {"linestyles": style, "label": label, "zorder": 2}
-            axes.add_collection(LineCollection(list(ends), **look), autolim=False)
+    for name, colour, width, style in _LINKS:
+        look = {"colors": colour, "linewidths": width * scale, "linestyles": style, "zorder": 2}
+        axes.add_collection(LineCollection(list(getattr(plan, name)), **look), autolim=False)
     if len(plan.accepted):  # ends that coincide have no visible line
-        ring: dict[str, Any] = {"marker": "o", "markersize": 10 * scale, "linestyle": "none"}
-        ring |= {"markerfacecolor": "none", "markeredgewidth": scale, "color": ACCEPTED_COLOUR}
-        ring["label"] = "middle of a supporting correspondence"
-        axes.plot(*plan.accepted.mean(axis=1).T, **ring, zorder=2)
+        axes.plot(*plan.accepted.mean(axis=1).T, **_ring(scale), zorder=2)
     for part in plan.parts:
         look = {"edgecolors": part.colour, "linewidths": 0.6 * scale, "alpha": 0.7, "zorder": 3}
         add_ellipses(axes, part.position_m, factor**2 * part.covariance_m2, **look)
-        look = {"marker": part.marker, "markersize": 4.0 * scale, "linestyle": "none"}
-        look |= {"markerfacecolor": "none" if part.marker != "x" else part.colour, "zorder": 4}
-        look |= {"color": part.colour, "markeredgewidth": 0.8 * scale, "label": part.name}
-        axes.plot(*part.position_m.T, **look)
-    (x0, y0), (x1, y1) = bounds(plan)
+        axes.plot(*part.position_m.T, **_marker(part, scale), zorder=4)
+    low, high = bounds(plan)
+    metres_an_inch = float(((high - low) / size_in).max())
+    middle, half = (low + high) / 2, metres_an_inch * np.array(size_in) / 2
+    (x0, y0), (x1, y1) = middle - half, middle + half
     axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x (m)", ylabel="y (m)")
-    axes.set_title(plan.title)
+    centre = (1 - _LEFT_IN / size_in[0]) / 2  # of the axes with its labels, which has more room
+    axes.set_title(title, x=centre, fontsize=_TITLE_POINTS if scale == 1.0 else _SMALL_TITLE_POINTS)
 
 
 def semi_axes(covariance_m2: Float, level: float = _LEVEL) -> tuple[Float, Float, Float]:

@@ -313,7 +313,8 @@ def _rows_of_numbers(path: Path, table: pa.Table, field: pa.Field) -> pa.Array:
         there = ~values.is_null().to_numpy(zero_copy_only=False)
         flat = pc.call_function("list_flatten", [values]).cast(pa.float64()).fill_null(np.nan)
         matrix[there] = flat.to_numpy(zero_copy_only=False).reshape(-1, width)
-    flat = pa.array(matrix.ravel().astype(field.type.value_type.to_pandas_dtype()))
+    with np.errstate(over="ignore"):  # infinite numbers are refused by their cell
+        flat = pa.array(matrix.ravel().astype(field.type.value_type.to_pandas_dtype()))
     return pa.FixedSizeListArray.from_arrays(flat, type=field.type)
 
 

@@ -255,7 +255,9 @@ def why_too_few(
     for landmarks in (map_a, map_b):
         if len(landmarks) == 0:
             return f"{landmarks.called} is empty"
-    few = f"{n_pairs} correspondences, at least {needed} are needed"
+    few = f"{n_pairs} correspondences"
+    if n_pairs:  # else no method has enough, and all say the same
+        few += f", at least {needed} are needed"
     return f"{few}: {shortage}" if shortage else few
 
 

@@ -428,8 +428,9 @@ def match(
     if map_a.descriptor is None or map_b.descriptor is None:
         described, labelled = (map_b, map_a) if map_a.descriptor is None else (map_a, map_b)
         return _no_pairs(
-            f"{described.called} has descriptors, {labelled.called} only labels; give both "
-            "maps descriptors, or both labels, or neither to one to match by geometry"
+            f"{described.called} has descriptors, {labelled.called} only labels: give both "
+            "maps descriptors, or both labels; without either in one map they are matched by "
+            "geometry"
         )
     offset_m, free = 0.0, None
     if math.isfinite(height_bound) and not one_floor:

@@ -137,7 +137,8 @@ def _read_folder(folder: Path, times: Path) -> list[Shot]:
             elif _IN_S.fullmatch(path.stem):
                 time_ns.append(parse_time_ns(path, 1, path.stem, NS))
             else:
-                reason = "is named by no time (nanoseconds, or seconds with a decimal point)"
+                reason = "is named by no time (nanoseconds of 15 digits or more, or seconds with a "
+                reason += "decimal point)"
                 raise InputError(f"{path}: {reason}; give the times in {times.name}")
         order = np.argsort(time_ns, kind="stable").tolist()  # 9.5.png precedes 10.0.png
         paths, time_ns = [paths[k] for k in order], [time_ns[k] for k in order]

@@ -64,6 +64,9 @@ from mapfusion.tables import (
 PosesAt = Callable[[Float], Float]
 MAX_FRAMES = 1_000_000  # eleven days at one frame a second
 _LONGEST_HOLD_S = 1.0  # before the first and after the last pose the robot is taken to stand still
+# Time between two rows of odometry over that between two measurements. Milliseconds and shorter
+# units give more, and then no two rows lie within the measurements.
+_LARGEST_STEP = 300.0
 _LARGEST_BEARING = 2 * np.pi  # conventions are -pi to pi and 0 to 2 pi; degrees lie beyond
 _VELOCITY_FIELDS = ["speed_m_s", "turn_rate_rad_s"]
 _POLAR_FIELDS = ["range_m", "bearing_rad"]
@@ -239,7 +242,8 @@ def _import_robots(
                     raise InputError(f"{robot}: measurements over {span_s:g} s are {limit}")
                 steps = np.arange(int(np.ceil(span_s / frame_s)) + 1)
                 clock_s = measured.time_s[0] + frame_s * steps
-            log = log_on_clock(robot.resolve().name, clock_s, _read_odometry(odometry), measured)
+            poses_at = _read_odometry(odometry, measured.time_s)
+            log = log_on_clock(robot.resolve().name, clock_s, poses_at, measured)
             _require_radians(odometry, log, clock_s, measured)
             poses, points = table_path(robot, "truth_poses"), None
             T_world_robot = _read_true_poses(poses, clock_s, settings) if poses.is_file() else None
@@ -275,7 +279,7 @@ def _require_radians(path: Path, log: RobotLog, clock_s: Float, measured: Measur
     """
     if not _contradicts_itself(log):
         return
-    in_degrees = _read_odometry(path, np.pi / 180)
+    in_degrees = _read_odometry(path, measured.time_s, np.pi / 180)
     if _contradicts_itself(log_on_clock(log.robot, clock_s, in_degrees, measured)):
         return
     table, _ = _read_timed(path, ODOMETRY)
@@ -414,11 +418,12 @@ def log_on_clock(
     return RobotLog(robot, measured.planar, times, increments, frame, observations, **extras)
 
 
-def _read_odometry(path: Path, radians: float = 1.0) -> PosesAt:
+def _read_odometry(path: Path, measured_s: Float, radians: float = 1.0) -> PosesAt:
     """Read the odometry of a robot and return its poses as a function of time.
 
     Args:
         path: of the table.
+        measured_s: times of the measurements, which tell times and turn rates in other units.
         radians: unit of its angles, in radians.
     """
     table, _ = _read_timed(path, ODOMETRY)
@@ -437,6 +442,19 @@ def _read_odometry(path: Path, radians: float = 1.0) -> PosesAt:
     repeated = np.flatnonzero(np.diff(time_s) <= 0)
     if len(repeated):
         raise InputError(f"{path}: column time_s: repeats in row {int(repeated[0]) + 1}")
+
+    if len(moments_s := np.unique(measured_s)) > 1:
+        step_s = float(np.median(np.diff(moments_s)))
+        row_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+        within = np.count_nonzero((time_s >= moments_s[0]) & (time_s <= moments_s[-1]))
+        if within < 2 < len(time_s) and row_s > _LARGEST_STEP * step_s:
+            found = f"rows are {row_s:.3g} s apart, and measurements {step_s:.3g} s"
+            raise InputError(f"{path}: column time_s: {found}; are its times in seconds?")
+        turn = step_s * float(np.median(np.abs(velocities[:, 1]))) if given[1] else 0.0
+        if turn > np.pi:
+            found = f"the robot turns by {turn:.3g} rad between two measurements (median); "
+            found += "if it holds degrees/s, multiply it by pi/180"
+            raise InputError(f"{path}: column {_VELOCITY_FIELDS[1]}: {found}")
 
     def poses_at(wanted_s: Float) -> Float:
         beyond = np.abs(wanted_s - np.clip(wanted_s, time_s[0], time_s[-1])) > _LONGEST_HOLD_S

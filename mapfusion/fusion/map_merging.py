@@ -63,6 +63,8 @@ if TYPE_CHECKING:  # results are printed and written without data frames and fig
 
     MapLike = LandmarkMap | str | os.PathLike[str] | pd.DataFrame
 
+# Ratio of the sigmas at the origin and at the overlap from which on T_a_b alone misleads.
+_LEVER = 30
 _MOST_RIVALS = 3  # motions beside the estimate; pictures of more are not legible
 _MOST_PAIRS = 6  # of maps in a picture, two rows of plans
 # What a user can do about an alignment that is not accepted.
@@ -158,7 +160,8 @@ class MapAlignment:
             return ""
         a, b, refinement = self.map_a.name, self.map_b.name, self._refinement
         if is_mirrored(self.ready.pairs, self._acceptance, refinement, self.matching):
-            image = "look like mirror images of each other: check the sign of y and theta"
+            image = "look like mirror images of each other: check the signs of y and "
+            image += "theta, and the order of x and y"
             return f"{a} and {b} {image}"
         if unit := common_unit(self.map_a, self.map_b, self.matching, refinement):
             return f"{a} and {b} fit each other as maps in {unit}: write both in metres"
@@ -170,6 +173,23 @@ class MapAlignment:
         if self.accepted or self.status in NOT_RUN:
             return ""
         return self.ready.pairs.note(int(np.count_nonzero(self.inlier))) or self.cause
+
+    @property
+    def far_away(self) -> str:
+        """Say what a motion of maps far from their origin means; empty if it is near."""
+        overlap = self.registered.refined.overlap
+        if overlap is None:
+            return ""
+        sigma_m, at_overlap_m = (motion_sigma(S)[0] for S in (self.covariance, overlap.covariance))
+        if sigma_m < max(_LEVER * at_overlap_m, DISTINCT_M):
+            return ""
+        name, (dx, dy) = self.map_b.name, overlap.p_a - overlap.p_b
+        away_km = np.linalg.norm(overlap.p_b) / 1e3
+        return (
+            f"The overlap lies {away_km:.1f} km from the origin of {name}, where T_a_b has a sigma "
+            f"of {sigma_m:.0f} m; at the overlap it moves {name} by "
+            f"({dx:.3f} m, {dy:.3f} m)."
+        )
 
     @cached_property
     def other_motions(self) -> list[SupportedMotion]:
@@ -196,8 +216,10 @@ class MapAlignment:
         why = _sentence(f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}")
         heights = self.registered.refined.heights
         asks = reason.endswith("?") and not self.hint  # for a likely cause, such as another unit
-        if asks or (heights is not None and heights.loses_pairs):  # the reason says what to do
-            return why
+        described = [each.descriptor is not None for each in (self.map_a, self.map_b)]
+        unlike = not len(self.correspondences) and described[0] != described[1]
+        if asks or unlike or (heights is not None and heights.loses_pairs):
+            return why  # the reason says what to do
         return f"{why} {_sentence(self.hint or _REMEDIES[self.status])}"
 
     @property
@@ -233,7 +255,7 @@ class MapAlignment:
             title = f"{status}: {self.map_b.name} drawn beside {self.map_a.name}"
         motions = [(title, self.T_a_b, self.inlier)]
         for each in self.other_motions:
-            title = f"another motion: {motion_text(each.T_a_b)},\n"
+            title = f"another motion:\n{motion_text(each.T_a_b)},\n"
             title += f"{np.count_nonzero(each.inlier)} of {len(self.inlier)} correspondences"
             motions.append((title, each.T_a_b, each.inlier))
         return [self.plan(title, np.zeros(3), T, inlier) for title, T, inlier in motions]
@@ -323,6 +345,8 @@ def advice(found: Sequence[MapAlignment]) -> str:
         agree = "all" if len(accepted) == len(found) else f"{len(accepted)} of"
         text += f", and {agree} {len(found)} methods agree"
     text += "."
+    if best.far_away:
+        text += f" {best.far_away}"
     return f"{text} Note: {_sentence(best.reason)}" if best.reason else text
 
 
@@ -484,6 +508,7 @@ class MergedMaps:
             if np.isnan(T_a).any() or np.isnan(T_b).any():
                 T_a, T_b = np.zeros(3), found.T_a_b
                 title = f"{title}, not merged"
+            title += f",\n{np.count_nonzero(found.inlier)} of {len(found.inlier)} correspondences"
             plans.append(found.plan(title, T_a, T_b, found.inlier, (a, b)))
         return plans
 

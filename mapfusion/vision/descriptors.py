@@ -52,6 +52,7 @@ class USurf:
     """Upright SURF, 64 numbers (see `surf.py`)."""
 
     metric: Metric = USURF.metric
+    length = USURF.length
 
     def describe(self, image: np.ndarray, uv_px: Float, scale_px: Float) -> np.ndarray:
         """Compute descriptors of unit norm; zero where the window is flat."""
@@ -69,6 +70,7 @@ class Sift:
     """SIFT of OpenCV, 128 numbers, upright."""
 
     metric: Metric = "euclidean"
+    length = 128
 
     def __init__(self) -> None:
         self._sift = cv2.SIFT.create(nOctaveLayers=_SIFT_LAYERS, sigma=_SIFT_SIGMA_PX)
@@ -96,6 +98,7 @@ class Orb:
     """ORB of OpenCV, 256 bits, upright."""
 
     metric: Metric = "hamming"
+    length = 256
 
     def __init__(self) -> None:
         self._orb = cv2.ORB.create(nlevels=1, edgeThreshold=0, patchSize=_ORB_SIDE_PX)
@@ -131,7 +134,16 @@ def _in_order(kept: Any, found: np.ndarray, n: int) -> np.ndarray:
     return ordered
 
 
-DESCRIBERS: dict[str, type] = {"usurf": USurf, "sift": Sift, "orb": Orb}
+DESCRIBERS: dict[str, type[USurf | Sift | Orb]] = {"usurf": USurf, "sift": Sift, "orb": Orb}
+
+
+def descriptor_bytes(name: str) -> int:
+    """Return the memory of a descriptor as a vector of a log (see `mapfusion.descriptors`).
+
+    Descriptors of other packages count as the longest of ours: nothing of them is run to know it.
+    """
+    known = [DESCRIBERS[name]] if name in DESCRIBERS else DESCRIBERS.values()
+    return max(each.length for each in known) * np.dtype(np.float32).itemsize
 
 
 def target_of(name: str) -> str:

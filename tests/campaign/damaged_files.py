@@ -148,7 +148,8 @@ _WORDS = [*(b"", b"x", b"nan", b"inf", b"-1", b"0", b"1e300", b"-1e18", b"1e-320
 _WORDS += [b"18446744073709551616", b"9223372036854775808", b"-9223372036854775809", b"1e9", b"1.5"]
 _VERSIONS: list[Any] = [99, 0, -1, 2**64, "1", 1.0, True, None, [1]]
 # Half of all damages: what was written so.
-WRITTEN = {".json": _json, ".parquet": _table, ".npy": _array, ".csv": _text, ".dat": _text}
+WRITTEN = {".json": _json, ".parquet": _table, ".npy": _array}
+WRITTEN |= dict.fromkeys((".csv", ".dat", ".txt", ".tum", ".yaml"), _text)
 
 
 def explore(seed: str, each: int, folder: Path) -> Found:

@@ -13,9 +13,19 @@ from experiments.evaluation import tables
 from experiments.evaluation.tables import read_provenance
 from experiments.pipeline.store import StageFolder, require_undamaged
 from experiments.reports.figures.result_tables import ResultTables
+from experiments.scenario.yaml_files import read_calibration
 from experiments.studies.run_tables import find_runs
 from experiments.studies.sweep_tables import JoinedTables, SweepDataset, SweepRun
+from mapfusion.datasets.export import write_picture
 from mapfusion.datasets.mrclam import MrclamSettings, import_mrclam
+from mapfusion.datasets.point_logs import (
+    PointsSettings,
+    RangesSettings,
+    import_points,
+    import_ranges,
+)
+from mapfusion.datasets.tum_rgbd import TumRgbdSettings, read_tum_rgbd
+from mapfusion.descriptors import DescriptorKind
 from mapfusion.files import write_json
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map
 from mapfusion.robot_log import (
@@ -70,6 +80,7 @@ def doors_of_others(folder: Path) -> list[Door]:
         text = "".join(" ".join(map(str, row)) + "\n" for row in rows)
         (recording / f"{name}.dat").write_text(text)
     settings = MrclamSettings()
+    points, ranges = _point_logs(folder, rng)
     plan = FloorPlan((Wall(np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4]]), 0.3),))
     write_faces(folder, plan, rng)
     imported = partial(import_mrclam, recording, folder / "imported", settings)
@@ -77,8 +88,85 @@ def doors_of_others(folder: Path) -> list[Door]:
         Door(plain, partial(read_map, plain)),
         *(Door(log / f"{name}.csv", partial(read_log, log)) for name in ("frames", "observations")),
         *(Door(recording / f"{name}.dat", imported) for name in tables),
+        *points,
+        *ranges,
+        *_rgbd(folder, rng),
+        _bits(folder, spread, rng),
         Door(folder / CORNERS, partial(read_corners, folder / CORNERS)),
     ]
+
+
+def _point_logs(folder: Path, rng: np.random.Generator) -> tuple[list[Door], list[Door]]:
+    """Write logs of points, and of ranges and bearings, with their truth."""
+    time_s = np.arange(6.0)
+    pose = pd.DataFrame({"time_s": time_s, "x_m": 0.2 * time_s, "y_m": 0.0, "theta_rad": 0.1})
+    velocity = pd.DataFrame({"time_s": time_s, "speed_m_s": 0.2, "turn_rate_rad_s": 0.1})
+    seen, n = np.repeat(time_s, 2), 12
+    point = {"x_m": rng.uniform(1, 3, n), "y_m": rng.normal(size=n), "label": np.arange(n) % 4}
+    polar = {"range_m": rng.uniform(1, 3, n), "bearing_rad": rng.normal(size=n)}
+    polar |= {f"descriptor_{k}": rng.normal(size=n) for k in range(3)}
+    surveyed = {"label": range(4), "x_m": rng.normal(size=4), "y_m": 1.0, "z_m": 0.0}
+    tables = {
+        "points": {"odometry": pose, "points": pd.DataFrame({"time_s": seen, **point})},
+        "ranges": {"odometry": velocity, "ranges": pd.DataFrame({"time_s": seen, **polar})},
+    }
+    noise = RangesSettings(range_sigma_m=0.1, bearing_sigma_rad=0.01)
+    read: dict[str, Callable[[Path, Path], list[Path]]] = {
+        "points": partial(import_points, settings=PointsSettings(sigma_m=0.1)),
+        "ranges": partial(import_ranges, settings=noise),
+    }
+    found = dict[str, list[Door]]()
+    for kind, own in tables.items():
+        recording, truth = folder / f"log of {kind}", {"truth_poses": pose}
+        truth |= {"landmarks": pd.DataFrame(surveyed)} if kind == "points" else {}
+        recording.mkdir()
+        for name, table in (own | truth).items():
+            table.to_csv(recording / f"{name}.csv", index=False)
+        imported = partial(read[kind], recording, folder / f"{kind} imported")
+        found[kind] = [Door(recording / f"{name}.csv", imported) for name in own | truth]
+    return found["points"], found["ranges"]
+
+
+def _rgbd(folder: Path, rng: np.random.Generator) -> list[Door]:
+    """Write recordings in the TUM RGB-D layout, with separate lists and with one."""
+    found = list[Door]()
+    camera = "cam0:\n  camera_model: pinhole\n  intrinsics: [20.0, 20.0, 15.5, 11.5]\n"
+    camera += "  distortion_model: none\n  resolution: [32, 24]\n"
+    pose = "".join(f"{k / 10:.1f} {0.1 * k:.1f} 0 0 0 0 0 1\n" for k in range(4))
+    lists = {f"{kind}.txt": "" for kind in ("rgb", "depth")}
+    both = ""
+    for k in range(3):
+        lists["rgb.txt"] += f"{k / 10:.1f} colour{k}.png\n"
+        lists["depth.txt"] += f"{k / 10 + 0.01:.2f} depth{k}.png\n"
+        both += f"{k / 10:.1f} colour{k}.png {k / 10 + 0.01:.2f} depth{k}.png\n"
+    for name, own in (("lists", lists), ("one list", {"associations.txt": both})):
+        recording = folder / f"TUM {name}"
+        texts = own | {"groundtruth.txt": pose, "odometry.tum": pose, "calibration.yaml": camera}
+        recording.mkdir()
+        for file, text in texts.items():
+            (recording / file).write_text(text)
+        for k in range(3):
+            levels = rng.integers(0, 256, (24, 32, 3), np.uint8)
+            write_picture(recording / f"colour{k}.png", levels)
+            depth = rng.integers(5000, 15000, (24, 32), np.uint16)
+            write_picture(recording / f"depth{k}.png", depth)
+
+        def read(recording: Path = recording) -> Any:
+            made = read_tum_rgbd(recording, TumRgbdSettings(), read_calibration)
+            pictures = [load() for each in made.pictures for load in each]
+            return made.time_ns, pictures, made.truth, made.odometry, made.calibration
+
+        files = (*texts, "colour1.png", "depth1.png")
+        found += [Door(recording / file, read) for file in files]
+    return found
+
+
+def _bits(folder: Path, place: pd.DataFrame, rng: np.random.Generator) -> Door:
+    """Write a map with packed binary descriptors, as other programs do."""
+    path, looks = folder / "bits.csv", rng.integers(0, 256, (len(place), 4))
+    names = pd.Index([f"descriptor_hamming_{k}" for k in range(4)])
+    place.join(pd.DataFrame(looks, columns=names)).to_csv(path, index=False)
+    return Door(path, partial(read_map, path))
 
 
 def _points(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +187,18 @@ def _logs(folder: Path, rng: np.random.Generator) -> list[Door]:
     path = folder / "map.parquet"
     counts = np.arange(n, dtype=np.int32) + 1
     write_map(path, LandmarkMap(*_points(rng, n), counts, counts.astype(np.int64), look))
+    orb, kind = folder / "orb.parquet", DescriptorKind("hamming", 256, "orb")
+    bits = rng.integers(0, 256, (n, 32), np.uint8)
+    packed = LandmarkMap(
+        *_points(rng, n), counts, counts.astype(np.int64), bits, descriptor_kind=kind
+    )
+    write_map(orb, packed)
+    described = folder / "orb log"
+    seen = Observations(*_points(rng, n), bits, descriptor_kind=kind)
+    write_log(described, RobotLog("R2", False, np.arange(4.0), odometry, iteration, seen))
     return [
+        Door(orb, partial(read_map, orb)),
+        Door(described / "observations.parquet", partial(read_log, described)),
         *(Door(each, partial(read_log, log)) for each in measured),
         *(Door(each, partial(read_truth, log)) for each in true),
         Door(path, partial(read_map, path)),

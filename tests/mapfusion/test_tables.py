@@ -87,6 +87,13 @@ def test_descriptors_in_csv(tmp_path, rng):
     np.testing.assert_allclose(landmarks.descriptor, look, rtol=1e-6)
 
 
+def test_a_number_too_large_for_single_precision_is_named(tmp_path, rng):
+    look = pd.DataFrame(rng.normal(size=(N, 4)), columns=[f"descriptor_{i}" for i in range(4)])
+    look.loc[3, "descriptor_2"] = 1e300
+    with pytest.raises(InputError, match="column descriptor: number 2 is inf in row 3"):
+        read_map(write(plain_map(rng).join(look), tmp_path / "m.csv"))
+
+
 def test_descriptors_are_counted_from_0_or_1_without_gaps(tmp_path, rng):
     look = rng.normal(size=(N, 70))
     for first in (0, 1):

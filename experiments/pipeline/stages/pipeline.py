@@ -13,9 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
-
-import pyarrow.parquet as pq
+from typing import Any, NamedTuple
 
 from experiments.pipeline.stage import RecordedLog, Stage, StageKind, in_dependency_order
 from experiments.pipeline.stages import align, drive, features, fuse, log, slam, smooth
@@ -25,7 +23,6 @@ from experiments.scenario.settings import (
     AnyScenario,
     Recording,
     Scenario,
-    SimulatedScenario,
     Simulation,
 )
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section
@@ -33,8 +30,7 @@ from mapfusion.errors import InputError
 from mapfusion.fusion.fusers import FUSERS, make_fuser, name_order, target_of
 from mapfusion.robot_log import read_log
 from mapfusion.smoother.smooth import SmootherParameters
-from mapfusion.tables import is_csv, table_path
-from mapfusion.vision.descriptors import DESCRIBERS
+from mapfusion.vision.descriptors import DESCRIBERS, descriptor_bytes
 from mapfusion.vision.descriptors import target_of as descriptor_target
 from mapfusion.vision.front_end import FrontEndParameters
 from sim.renderer import renderer_name, require_pybullet
@@ -43,10 +39,22 @@ from sim.textures import STYLES
 
 @dataclass(frozen=True)
 class RobotStages:
-    """Stages from one robot's log to its maps."""
+    """Stages from one robot's log to its maps.
+
+    Attributes:
+        name: name of the robot.
+        n_frames: frames of the log.
+        n_observations: observations of the log, at most.
+        descriptor_bytes: memory of the descriptor of an observation.
+        log: stage of the log.
+        slam: stage of the filter.
+        smooth: stage of the smoother.
+    """
 
     name: str
     n_frames: int
+    n_observations: int
+    descriptor_bytes: int
     log: Stage | RecordedLog
     slam: Stage
     smooth: Stage
@@ -173,6 +181,7 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
     before = {"drive": driven, "faces": _stage(drive.FACES_STAGE, scenario, world, own=to_paint)}
     n_frames, drawn_by = scenario.drive.frames, renderer_name(render.renderer)
     vision, unread = scenario.vision, FrontEndParameters()
+    size = n_frames, n_frames * vision.harris.max_corners, descriptor_bytes(vision.descriptor)
     found_by = ("harris", "stereo", "descriptor", "usurf")
     finding = replace(unread, **{name: getattr(vision, name) for name in found_by})
     tracking = replace(vision, **{name: getattr(unread, name) for name in found_by})
@@ -202,20 +211,19 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
         )
         mapped = _slam(scenario, logged)
         smoothed = _smooth(scenario, logged, mapped, n_frames, n_frames)
-        yield SimulatedRobotStages(
-            robot.name, n_frames, logged, mapped, smoothed, extracted, tracked
-        )
+        yield SimulatedRobotStages(robot.name, *size, logged, mapped, smoothed, extracted, tracked)
 
 
 def _recorded(scenario: Recording) -> Iterable[RobotStages]:
     """Yield the stages of robots with recorded logs, whose names must be valid file names."""
-    robots: dict[str, tuple[int, RecordedLog]] = {}
+    robots: dict[str, _ReadLog] = {}
     for folder in map(Path, scenario.logs):
         frames = folder / "frames.parquet"
         files = ((path.name, path.stat()) for path in sorted(folder.glob("*")))
         stamps = tuple((name, stat.st_mtime_ns, stat.st_size) for name, stat in files)
-        recorded, name, n_frames = _read_recorded(folder, stamps)
-        if not n_frames:
+        read = _read_recorded(folder, stamps)
+        name = read.robot
+        if not read.n_frames:
             raise InputError(f"{folder}: frames.parquet holds no frame")
         if not re.fullmatch(NAME_PATTERN, name):
             raise InputError(f"{frames}: robot is named {name!r}, expected {NAME_PATTERN}")
@@ -223,22 +231,35 @@ def _recorded(scenario: Recording) -> Iterable[RobotStages]:
             raise InputError(f"{frames}: robot is named {name}, a name of the evaluation's own")
         if name in robots:
             raise InputError(f"{frames}: robot {name} is in another log already")
-        robots[name] = n_frames, recorded
-    n_most = max(n_frames for n_frames, _ in robots.values())
-    for name, (n_frames, recorded) in robots.items():
+        robots[name] = read
+    n_most = max(read.n_frames for read in robots.values())
+    for name, (recorded, _, n_frames, n_observations, n_bytes) in robots.items():
         mapped = _slam(scenario, recorded)
         smoothed = _smooth(scenario, recorded, mapped, n_frames, n_most)
-        yield RobotStages(name, n_frames, recorded, mapped, smoothed)
+        size = n_frames, n_observations, n_bytes
+        yield RobotStages(name, *size, recorded, mapped, smoothed)
+
+
+class _ReadLog(NamedTuple):
+    """Recorded log, its robot's name, and its size as in `RobotStages`."""
+
+    log: RecordedLog
+    robot: str
+    n_frames: int
+    n_observations: int
+    descriptor_bytes: int
 
 
 @lru_cache(maxsize=256)  # all runs of a sweep have the same logs
-def _read_recorded(folder: Path, _: object) -> tuple[RecordedLog, str, int]:
-    """Return a recorded log, its robot's name and number of frames.
+def _read_recorded(folder: Path, _: object) -> _ReadLog:
+    """Read a recorded log.
 
     The second argument is the state of the files: a changed log is read again.
     """
     log = read_log(folder)
-    return RecordedLog(folder), log.robot, len(log)
+    descriptor, n = log.observations.descriptor, len(log.observations)
+    n_bytes = 0 if descriptor is None else descriptor.nbytes // max(n, 1)
+    return _ReadLog(RecordedLog(folder), log.robot, len(log), n, n_bytes)
 
 
 def _slam(scenario: Scenario, logged: Stage | RecordedLog) -> Stage:
@@ -348,8 +369,10 @@ def _fusers(
 _GB = 1e9
 _PROCESS_BYTES = 300e6  # worker with numerical libraries and compiled kernels
 # A landmark has a mean (3 numbers), a covariance (6) and a count for each particle, and a slot with
-# a descriptor. The factor 1.5 is for the old half while arrays are doubled.
-_ROW_BYTES, _SLOT_BYTES = 1.5 * (9 * 8 + 4), 1.5 * 400
+# as much, a label, and numbers and boxes of eight bytes, beside the descriptor. The factor is for
+# the old half while arrays are doubled.
+_DOUBLED = 1.5
+_ROW_BYTES, _SLOT_BYTES = 9 * 8 + 4, (9 * 8 + 4) + 4 + 8 * 8
 # Share of the corners of a frame that become new landmarks: 0.5 to 2 % in the suite.
 _NEW_SHARE = 0.02
 _POSE_BYTES = 3 * 8 + 4  # per particle and frame: pose and ancestor
@@ -357,8 +380,8 @@ _ASSOCIATION_BYTES = 4  # per particle and observation: landmark
 # Both are stored for all M particles only since their common ancestor. That is at most 2 M
 # resamplings ago on average, with ten frames or more between two resamplings.
 _FRAMES_A_PARTICLE = 30
-# Observation of a log: position, covariance, descriptor, label, pixels, frame.
-_OBSERVATION_BYTES = 3 * 8 + 9 * 8 + 64 * 4 + 4 + 3 * 4 + 4
+# Observation of a log beside its descriptor: position, covariance, label, pixels, frame.
+_OBSERVATION_BYTES = 3 * 8 + 9 * 8 + 4 + 3 * 4 + 4
 # Two images with depth, noise and corner responses need 60 to 80 bytes per pixel.
 _PIXEL_BYTES = 100
 # The renderer's copy of a texel, and the memory per texel while a face is painted.
@@ -433,25 +456,18 @@ def needs(pipeline: Pipeline) -> Iterator[Need]:
 def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
     """Yield the memory of the filter with its log, and of the evaluated maps."""
     settings = scenario.slam.filter
-    n_frames = n_observations = robot.n_frames
-    where = "drive.frames"
-    if isinstance(robot.log, RecordedLog):
-        path = table_path(robot.log.path, "observations")
-        if is_csv(path):
-            with path.open("rb") as file:
-                n_observations = max(sum(1 for _ in file) - 1, 0)
-        else:
-            n_observations = pq.read_metadata(path).num_rows
-        where = "logs"
-    elif isinstance(scenario, SimulatedScenario):
-        n_observations = n_frames * scenario.vision.harris.max_corners
+    n_frames, n_observations = robot.n_frames, robot.n_observations
+    where = "logs" if isinstance(robot.log, RecordedLog) else "drive.frames"
     n_landmarks, late = _NEW_SHARE * n_observations, 1.0  # share of frames with distinct particles
     if settings.resample_fraction > 0:
         late = min(1.0, _FRAMES_A_PARTICLE * settings.n_particles / max(n_frames, 1))
     a_particle = late * (
-        n_landmarks * _ROW_BYTES + n_observations * _ASSOCIATION_BYTES + n_frames * _POSE_BYTES
+        _DOUBLED * n_landmarks * _ROW_BYTES
+        + n_observations * _ASSOCIATION_BYTES
+        + n_frames * _POSE_BYTES
     )
-    once = n_observations * _OBSERVATION_BYTES + n_landmarks * _SLOT_BYTES
+    once = n_observations * (_OBSERVATION_BYTES + robot.descriptor_bytes)
+    once += _DOUBLED * n_landmarks * (_SLOT_BYTES + robot.descriptor_bytes)
     of_particles = settings.n_particles * a_particle
     setting = "slam.filter.n_particles" if of_particles > once else where
     why = f"{n_observations} observations in {n_frames} frames"

@@ -109,7 +109,7 @@ def test_a_mirrored_map_is_named_once_and_no_other(
     described: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     a, b, c = described
-    note = "a and c look like mirror images of each other: check the sign of y and theta"
+    note = "a and c look like mirror images of each other: check the signs of y and theta"
     assert command(capsys, "align", a, c, "--aligner", "ransac", "--aligner", "gnc").out.count(
         note
     ) == (1)

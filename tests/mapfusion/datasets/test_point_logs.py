@@ -188,13 +188,35 @@ def test_odometry_in_degrees_is_refused(
     settings = {"points": PointsSettings, "ranges": RangesSettings}[kind]
     noise = {"points": {"sigma_m": 0.05}, "ranges": {"range_sigma_m": 0.05}}[kind]
     noise |= {"bearing_sigma_rad": 0.01} if kind == "ranges" else {}
-    said = f"column {name}: holds {unit}: .*multiply it by pi/180; see `mapfusion docs point_logs`"
+    said = f"column {name}: .*holds {unit}.*multiply it by pi/180; see `mapfusion docs point_logs`"
     with pytest.raises(InputError, match=said) as refused:
         import_recording(
             kind, tmp_path / "R1", tmp_path / "logs", settings(frame_s=frame_s, **noise)
         )
     assert str(path) in str(refused.value)
     assert not (tmp_path / "logs").exists()
+
+
+def test_turn_rates_in_degrees_are_refused_without_labels(tmp_path: Path) -> None:
+    write_recording(tmp_path / "R1", {}, "ranges", labels=False)
+    path = tmp_path / "R1" / "odometry.csv"
+    table = pd.read_csv(path)
+    import_recording("ranges", tmp_path / "R1", tmp_path / "right", NOISE["ranges"])
+    table.assign(turn_rate_rad_s=np.degrees(table["turn_rate_rad_s"])).to_csv(path, index=False)
+    with pytest.raises(InputError, match=r"turn_rate_rad_s: the robot turns by 7\.16 rad between"):
+        import_recording("ranges", tmp_path / "R1", tmp_path / "logs", NOISE["ranges"])
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e6, 1e9])
+def test_odometry_with_times_in_another_unit_is_refused(factor: float, tmp_path: Path) -> None:
+    write_recording(tmp_path / "R1", {}, "ranges")
+    path, time_s = tmp_path / "R1" / "odometry.csv", np.arange(0.0, 20.5, 0.5)
+    velocity = {"speed_m_s": RADIUS_M * TURN_RAD_S, "turn_rate_rad_s": TURN_RAD_S}
+    table = pd.DataFrame({"time_s": time_s * factor}).assign(**velocity)
+    table.to_csv(path, index=False)
+    said = r"column time_s: rows are \S+ s apart, and measurements 0.5 s; are its times in seconds"
+    with pytest.raises(InputError, match=said):
+        import_recording("ranges", tmp_path / "R1", tmp_path / "logs", NOISE["ranges"])
 
 
 def test_a_refused_table_names_the_page(tmp_path: Path) -> None:

@@ -1,15 +1,20 @@
 """Alignment and merge of maps in one call, what the results say, and what is drawn of them."""
 
 import io
+import itertools
+import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
+from matplotlib.figure import Figure
 from PIL import Image
 
 import mapfusion
@@ -17,7 +22,7 @@ from mapfusion.align.alignment import Status
 from mapfusion.fusion.map_merging import MapAlignment, advice, best_alignment
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap, write_map
-from mapfusion.plotting import ELLIPSE_BOUND, bounds, largest_magnification
+from mapfusion.plotting import ELLIPSE_BOUND, GREEN, bounds, largest_magnification, plot_plans
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
 T_A_B = np.array([3.0, -1.0, 0.5])
@@ -121,6 +126,34 @@ def test_the_advice_says_what_to_use_and_how_sure_it_is(found: MapAlignment) -> 
     assert "of other" in said
 
 
+def test_the_advice_on_maps_far_from_their_origin_says_how_they_move_where_they_are() -> None:
+    far = np.array([465e3, 5250e3, 0.0])
+    a, b = two_maps()
+    assert not mapfusion.align_maps(a, b).far_away
+    own = se2.transform_points(T_A_B, b.position_m)  # of the same frame as a, but for 0.1 m
+    moved = [
+        replace(a, position_m=a.position_m + far),
+        replace(b, position_m=own + far - [0.1, 0, 0]),
+    ]
+    found = mapfusion.align_maps(*moved)
+    said = found.advice
+    assert "The overlap lies 5270.6 km from the origin of south, where T_a_b has a sigma" in said
+    told = re.search(r"at the overlap it moves south by \((.*) m, (.*) m\)", said)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(0.1, abs=0.02)
+    assert float(told[2]) == pytest.approx(0.0, abs=0.02)
+
+
+def test_maps_with_descriptors_and_labels_are_told_what_they_lack() -> None:
+    a, b = two_maps()
+    labelled = replace(
+        b, descriptor=None, descriptor_kind=None, label=np.arange(60, dtype=np.int32)
+    )
+    found = mapfusion.align_maps(a, labelled)
+    assert found.refusal.endswith("they are matched by geometry.")
+    assert found.reason.startswith("0 correspondences: map north has descriptors, map south only")
+
+
 def with_status(found: MapAlignment, status: Status, reason: str) -> MapAlignment:
     verdict = replace(found.registered.verdict, status=status, reason=reason)
     return replace(found, registered=found.registered._replace(verdict=verdict))
@@ -208,7 +241,7 @@ def test_rivals_are_the_motions_that_were_made() -> None:
     assert n_pairs <= len(found.inlier)  # a correspondence supports one of them
     plans = found.plans()
     assert len(plans) == 2
-    assert "another motion: (" in plans[1].title
+    assert "another motion:\n(" in plans[1].title
 
 
 def test_a_plan_shows_each_landmark_and_correspondence_once(found: MapAlignment) -> None:
@@ -270,6 +303,67 @@ def test_the_legend_tells_the_enlargement_of_the_ellipses(found: MapAlignment) -
     np.testing.assert_allclose(np.asarray(collection.get_widths(), float), factor * own, rtol=1e-9)
     assert largest_magnification(1.0, 12.0) == 10
     assert largest_magnification(5.0, 1.0) == 1
+
+
+def legend_of(figure: Figure) -> dict[str, Any]:
+    """Return the entries of the legend, by their texts."""
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    return dict(zip(texts, legend.legend_handles, strict=True))
+
+
+def test_the_legend_of_a_merge_explains_the_looks_of_all_plans() -> None:
+    merged = mapfusion.merge_maps(two_maps())
+    figure = merged.plot()
+    entries = legend_of(figure)
+    (ring,) = [
+        entry for text, entry in entries.items() if text == "middle of a supporting correspondence"
+    ]
+    drawn = [line for axes in figure.axes[1:] for line in axes.lines if line.get_color() == GREEN]
+    assert len(drawn) == 1  # the rings of the only pair of maps
+    assert np.size(drawn[0].get_xdata()) == merged.alignments[0, 1].inlier.sum()
+    for look in ("get_marker", "get_color", "get_markerfacecolor"):
+        assert getattr(ring, look)() == getattr(drawn[0], look)()
+    assert not [line for line in figure.axes[0].lines if line.get_color() == GREEN]
+    # the fused map has no landmark of one map alone: its legend would lack both maps
+    a, _ = two_maps()
+    same = mapfusion.merge_maps([a, replace(a, name="again")]).plot()
+    assert {"north: 60 landmarks", "again: 60 landmarks"} <= set(legend_of(same))
+
+
+@pytest.mark.parametrize("n_others", [0, 1, 5])
+def test_long_texts_overlap_nothing(found: MapAlignment, n_others: int) -> None:
+    first, name = found.plans()[0], "the_map_of_a_robot_with_a_long_name_" * 4
+    parts = tuple(part._replace(name=f"{name}: 60 landmarks") for part in first.parts)
+    long = first._replace(title=f"refused: {name} in the frame of {name}:\nby ransac", parts=parts)
+    figure = plot_plans([long] * (n_others + 1), "a reason that takes very many words; " * 40)
+    figure.draw_without_rendering()
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    (heading,) = figure.texts
+    shown = [each.get_tightbbox(renderer) for each in (heading, *figure.legends, *figure.axes)]
+    boxes = [box for box in shown if box is not None]
+    assert len(boxes) == n_others + 3
+    for box, other in itertools.combinations(boxes, 2):
+        assert not box.overlaps(other)
+    for box in boxes:
+        assert box.x0 >= 0
+        assert box.y0 >= 0
+        assert box.x1 <= figure.bbox.width
+        assert box.y1 <= figure.bbox.height
+
+
+def test_a_plan_fills_its_axes_and_shows_its_view(found: MapAlignment) -> None:
+    first = found.plans()[0]
+    figure = plot_plans([first] * 2, "")
+    low, high = bounds(first)
+    for axes in figure.axes:
+        (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+        wide, tall = axes.bbox.width, axes.bbox.height
+        assert (x1 - x0) / wide == pytest.approx((y1 - y0) / tall)  # equal scales
+        assert x0 <= low[0] + 1e-9
+        assert x1 >= high[0] - 1e-9
+        assert y0 <= low[1] + 1e-9
+        assert y1 >= high[1] - 1e-9
 
 
 def test_matplotlib_and_pandas_are_imported_only_to_draw_and_convert() -> None:

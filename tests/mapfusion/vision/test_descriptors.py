@@ -12,7 +12,7 @@ from mapfusion.camera import StereoCamera
 from mapfusion.descriptors import USURF, median_distance
 from mapfusion.errors import InputError
 from mapfusion.vision import descriptors, surf
-from mapfusion.vision.descriptors import DESCRIBERS, NamedDescriber, target_of
+from mapfusion.vision.descriptors import DESCRIBERS, NamedDescriber, descriptor_bytes, target_of
 from mapfusion.vision.front_end import (
     FrontEnd,
     FrontEndParameters,
@@ -57,6 +57,8 @@ def test_every_corner_has_a_descriptor_in_its_place(
     describer, (uv, scale) = NamedDescriber(name), corners(rng)
     found, kind = describer.describe(image, uv, scale)
     assert found.shape == (60, kind.length)
+    assert kind.length == DESCRIBERS[name].length
+    assert descriptor_bytes(name) == found.nbytes / 60
     order = rng.permutation(60)
     again, _ = describer.describe(image, uv[order], scale[order])
     np.testing.assert_array_equal(again, found[order])

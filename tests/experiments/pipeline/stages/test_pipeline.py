@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments.pipeline.stages.pipeline import build_pipeline, memory_bytes, needs, require_memory
@@ -9,6 +10,7 @@ from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from mapfusion.errors import InputError
 from mapfusion.fastslam.landmarks import allocate
+from mapfusion.robot_log import Observations, RobotLog, write_log
 from tests.helpers.tiny_scenario import assert_refused, command
 
 
@@ -75,6 +77,41 @@ def test_the_filter_needs_what_its_rows_take(tiny_path: Path) -> None:
     per_landmark = sum(part.nbytes for part in own) / 256
     n_observations = 44 * 110
     assert two - one > 0.02 * n_observations * per_landmark
+
+
+def test_observations_need_what_their_descriptors_take(tiny_path: Path) -> None:
+    """A log of 256 bits has as many floats in memory; U-SURF has 64."""
+    few, name = "slam.filter.n_particles=1", "drive.frames"
+    size = ("drive.frames=1000", "vision.harris.max_corners=200", few)
+    needed = {
+        each: need(tiny_path, f"vision.descriptor={each}", *size)[name]
+        for each in ("usurf", "sift", "orb")
+    }
+    n_observations = 1000 * 200
+    for each, length in (("sift", 128), ("orb", 256)):
+        more = needed[each] - needed["usurf"]
+        assert more == pytest.approx(n_observations * (length - 64) * 4, rel=0.05)
+
+
+@pytest.mark.parametrize("length", [0, 64, 768])
+def test_recorded_observations_need_what_their_descriptors_take(
+    length: int, tmp_path: Path
+) -> None:
+    rng, n = np.random.default_rng(0), 3000
+    looks = rng.normal(size=(n, length)).astype(np.float32) if length else None
+    position, covariance = rng.normal(size=(n, 3)), np.tile(np.eye(3), (n, 1, 1))
+    seen = Observations(position, covariance, looks, label=np.arange(n, dtype=np.int32))
+    logs = [tmp_path / name for name in ("R1", "R2")]
+    for folder in logs:
+        frames = np.repeat(np.arange(30), n // 30)
+        write_log(
+            folder, RobotLog(folder.name, False, np.arange(30.0), np.zeros((30, 3)), frames, seen)
+        )
+    path = tmp_path / "recorded.yaml"
+    path.write_text(f"schema_version: 1\nname: recorded\nlogs: [{logs[0]}, {logs[1]}]\n")
+    own = seen.position_m.nbytes + seen.covariance_m2.nbytes + n * 4 * length
+    needed = need(path, "slam.filter.n_particles=1")["logs"]
+    assert own < needed < 2 * own
 
 
 def test_a_long_drive_needs_a_row_for_what_was_seen_lately(tiny_path: Path) -> None:
