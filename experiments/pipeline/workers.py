@@ -140,6 +140,10 @@ class Workers:
                 context.set_forkserver_preload(modules)
                 self._others = {*multiprocessing.active_children()}
                 self._pool = ProcessPoolExecutor(self._jobs, context, initializer=_start_worker)
+                # Python's pool notices the death of a process only after a result that follows its
+                # start. An empty task starts each process and gives such a result.
+                for _ in range(self._jobs):
+                    self._pool.submit(os.getpid)
             self._pending[self._pool.submit(function, *arguments)] = tag
 
     @property

@@ -18,7 +18,7 @@ from experiments.pipeline.workers import blocked_interrupts, save_defect, worker
 from mapfusion.errors import InputError
 from tests.helpers import acting
 from tests.helpers.tiny_scenario import command
-from tests.helpers.waiting import has_ended, wait_until
+from tests.helpers.waiting import PATIENCE_S, has_ended, wait_until
 
 
 def raised(work: Callable[[], object]) -> BaseException:
@@ -140,6 +140,25 @@ def test_a_killed_worker_is_told_in_one_line() -> None:
         pool.submit("task", _die)
         with pytest.raises(InputError, match="killed from outside"):
             list(pool.completed())
+
+
+def _work_until(end: Path) -> None:
+    end.with_suffix(".begun").touch()
+    wait_until(end.exists)
+
+
+def test_a_killed_worker_is_told_though_the_others_work_on(tmp_path: Path) -> None:
+    end = tmp_path / "end"
+    with workers(2) as pool:
+        pool.submit("long", _work_until, end)
+        assert wait_until(end.with_suffix(".begun").exists)
+        pool.submit("killed", _die)
+        late = threading.Timer(PATIENCE_S / 2, end.touch)  # ends the test if it is not told
+        late.start()
+        with pytest.raises(InputError, match="killed from outside"):
+            list(pool.completed())
+        late.cancel()
+        assert not end.exists()
 
 
 READY = """
