@@ -16,7 +16,6 @@ from experiments.reports.figures.result_tables import ResultTables
 from experiments.scenario.yaml_files import read_calibration
 from experiments.studies.run_tables import find_runs
 from experiments.studies.sweep_tables import JoinedTables, SweepDataset, SweepRun
-from mapfusion.datasets.export import write_picture
 from mapfusion.datasets.mrclam import MrclamSettings, import_mrclam
 from mapfusion.datasets.point_logs import (
     PointsSettings,
@@ -24,6 +23,7 @@ from mapfusion.datasets.point_logs import (
     import_points,
     import_ranges,
 )
+from mapfusion.datasets.stereo_recording import write_picture
 from mapfusion.datasets.tum_rgbd import TumRgbdSettings, read_tum_rgbd
 from mapfusion.descriptors import DescriptorKind
 from mapfusion.files import write_json
