@@ -431,11 +431,7 @@ def require_points(position_m: np.ndarray, covariance_m2: np.ndarray, planar: bo
     except np.linalg.LinAlgError:
         # the smallest eigenvalue that differs from zero in 64 bits
         low, high = np.linalg.eigvalsh(used)[:, [0, -1]].T
-        _refuse(
-            "covariance_m2",
-            low <= np.finfo(float).eps * high,
-            "not positive definite (variances must be above 0)",
-        )
+        _refuse("covariance_m2", low <= np.finfo(float).eps * high, "not positive definite")
 
 
 def require_no_twins(name: str, *columns: np.ndarray) -> None:
