@@ -31,7 +31,7 @@ _CODES = {
     "worker": {2, 0},
 }
 # What differs between any two runs: times, and when it was.
-_DIFFER = {*TIMED, "run_times", "fig06_aligner_time", "provenance"}
+_DIFFER = {*TIMED, "run_times", "fig06_aligner_time", "drawn", "provenance"}
 _ATTEMPTS = "attempts"  # the sweep's notes of deaths
 
 
