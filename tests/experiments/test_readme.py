@@ -5,6 +5,7 @@ import shlex
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 from typer.main import get_command
@@ -71,14 +72,17 @@ def test_own_maps_are_aligned_and_merged_also_by_an_own_aligner(
     exec(compile(maps, "README", "exec"), {})
     (tmp_path / "mine.py").write_text(aligner)
     assert len(read_map(tmp_path / "fused.csv")) == 60
-    assert "Use T_a_b = (2.000 m, 1.000 m, 0.0000 rad)" in capsys.readouterr().out
+    used = re.match(r"Use T_a_b = \((.*) m, (.*) m, (.*) rad\)", capsys.readouterr().out)
+    assert used is not None
+    # south is rounded to 0.1 m: 30 landmarks leave some millimetres
+    np.testing.assert_allclose([float(each) for each in used.groups()], [2, 1, 0], atol=0.02)
     inline = [shlex.split(each)[1:] for each in INLINE]
     own = [words for words in [*inline, *COMMANDS] if words[0] in ("align", "merge")]
     assert [words[0] for words in own] == ["align", "merge", "align"]
     for words in own:
         reply = command(capsys, *words)
         assert reply.code == 0, reply.err
-    assert re.search(r"^Nearest +accepted +2\.0\d+ +1\.0\d+", reply.out, re.MULTILINE)
+    assert re.search(r"^Nearest +accepted +(2\.0|1\.9)\d+ +(1\.0|0\.9)\d+", reply.out, re.MULTILINE)
     assert len(read_map(tmp_path / "fused.parquet")) == 60
     for name in ("fused.png", "aligned.html"):
         assert (tmp_path / name).stat().st_size > 10_000

@@ -22,9 +22,10 @@ def test_the_worked_example_maps_the_trees(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     text = PAGE.read_text(encoding="utf-8")
-    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    from_degrees, program = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names: dict[str, np.ndarray] = {}
     exec(program, names)
+    assert "np.radians(table[column])" in from_degrees
     lines = [line for line in text.splitlines() if line.startswith("mapfusion ")]
     imported, mapped = (command(capsys, *shlex.split(line)[1:]) for line in lines)
     assert (imported.code, mapped.code) == (0, 0)
