@@ -59,6 +59,9 @@ def test_a_run_maps_aligns_and_reports_with_every_descriptor(
     errors = pd.read_parquet("out/tables/errors.parquet")
     last = errors[errors["iteration"] == errors["iteration"].max()]
     assert len(last) > 0
+    if name in ("sift", "orb"):  # the plug-in's few corners of one small room may stay ambiguous
+        assert reply.complaints == []
+        assert last["accepted"].any()
     assert last["refined_translation_error_m"].max() < 0.1
     assert command(capsys, "report", "out").code == 0
     assert Path("out/report.html").stat().st_size > 10_000
