@@ -34,6 +34,7 @@ from mapfusion.datasets.relative_motion import (
     Motions,
     motions_of_poses,
     observed_spans,
+    tracked_by_position,
 )
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float, chi_square_bound
@@ -256,7 +257,9 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
             with them by construction.
         noise: stated noise of the odometry.
     """
-    spans = observed_spans(log)
+    seen = log.observations
+    named = any(each is not None for each in (seen.label, seen.track, seen.descriptor))
+    spans = observed_spans(log if named else tracked_by_position(log))
     mistakes = odometry_mistakes(log.odometry)
     subject = "the odometry contradicts the motion that the observations show"
     finding = disagreement("odometry", subject, spans, Stated(mistakes[""], noise), mistakes)
@@ -265,7 +268,7 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
         noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
         if not (noisier and _agrees_on_average(spans[0], noisier)):
             return LogConsistency((finding,), (), found)
-    jumps = tuple(find_jumps(log, spans[0], noise))
+    jumps = tuple(find_jumps(log, spans[0], noise)) if named else ()
     return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found)
 
 

@@ -2,9 +2,13 @@
 
 A motion is observed if two frames show the same points: a least-squares fit of these points gives
 the motion and its covariance. Motions of odometry or truth are differences of poses.
+
+Points without labels, tracks and descriptors are tracked by their positions, as nearest neighbours
+in consecutive frames (`tracked_by_position`).
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +34,10 @@ _MIN_PLANAR_LINKS = 2  # to determine a planar motion; their distance is checked
 # Factors tried on stated covariances, and the number of frames for the trial: observations whose
 # covariances are in a wrong unit still determine the motion.
 _COVARIANCE_FACTORS, _TRIAL_FRAMES = (1.0, 1e2, 1e4, 1e6), 40
+# Largest distance of a point to its nearest neighbour in the next frame, over the distance to the
+# second nearest one: Lowe's ratio test, stricter than for descriptors since a wrong neighbour may
+# be close.
+_NEIGHBOUR_RATIO = 0.5
 
 
 class Motions(NamedTuple):
@@ -104,6 +112,38 @@ def links(
     similar = similarity.max(axis=1) > 1 - most**2 / 2
     mutual = similar & (back[other] == np.arange(len(a)))
     return a[mutual], b[other[mutual]]
+
+
+def tracked_by_position(log: RobotLog) -> RobotLog:
+    """Return the log with tracks of points that are nearest neighbours in consecutive frames.
+
+    The neighbours are sought twice: at the positions that the odometry predicts, and at those of a
+    robot that does not move. A wrong odometry gives few neighbours, which seldom agree with one
+    motion. The tracks are those with more points that agree; the odometry is preferred.
+    """
+    tracks = [_tracks(log, motion) for motion in (log.odometry, np.zeros_like(log.odometry))]
+    tracked = [replace(log, observations=replace(log.observations, track=t)) for t in tracks]
+    return max(tracked, key=lambda each: int(observed_spans(each)[0].n_agree.sum()))
+
+
+def _tracks(log: RobotLog, motion: Float) -> np.ndarray:
+    """Return the track of each observation, shape (N,), given the motions (T, 3) between frames."""
+    from scipy.spatial import KDTree
+
+    starts, position = log.frame_starts(), log.observations.position_m
+    track = np.arange(len(position))
+    for frame in range(1, len(log)):
+        a, b = (np.arange(starts[k], starts[k + 1]) for k in (frame - 1, frame))
+        if not len(a) or not len(b):
+            continue
+        before, after = position[a], position[b].copy()
+        after[:, :2] = after[:, :2] @ rotation(motion[frame, 2]).T + motion[frame, :2]
+        distance, nearest = KDTree(before).query(after, k=2)
+        _, back = KDTree(after).query(before)
+        clear = distance[:, 0] < _NEIGHBOUR_RATIO * distance[:, 1]
+        clear[clear] &= back[nearest[clear, 0]] == np.flatnonzero(clear)
+        track[b[clear]] = track[a[nearest[clear, 0]]]
+    return track
 
 
 def _planar_motion(

@@ -46,6 +46,11 @@ def sound() -> RobotLog:
     return circling_log()
 
 
+def without_names(log: RobotLog) -> RobotLog:
+    """Return the log without labels, so that only positions tell which points are the same."""
+    return replace(log, observations=replace(log.observations, label=None))
+
+
 def filtered(log: RobotLog, covariance: Float | None = None) -> Frame:
     last = len(log) - 1
     *_, end = run_log(log, LABELS, np.random.default_rng(0), [last], 3, covariance, viewing=False)
@@ -63,10 +68,12 @@ def error_m(log: RobotLog, covariance: Float | None = None) -> float:
     return float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))))
 
 
+@pytest.mark.parametrize("labelled", [True, False])
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistakes_are_named(name: str, sound: RobotLog) -> None:
+def test_mistakes_are_named(name: str, labelled: bool, sound: RobotLog) -> None:
     change, words = MISTAKES[name]
-    found = check_log(replace(sound, odometry=change(sound.odometry)), NOISE)
+    log = replace(sound, odometry=change(sound.odometry))
+    found = check_log(log if labelled else without_names(log), NOISE)
     assert [each.kind for each in found.findings] == ["odometry"]
     for word in words:
         assert word in found.findings[0].text
@@ -85,6 +92,20 @@ def test_observations_in_millimetres_are_named(sound: RobotLog) -> None:
         assert "the observed ones millimetres" in finding.text
 
 
+def test_mirrored_and_swapped_observations_without_labels_are_named(sound: RobotLog) -> None:
+    bare = without_names(sound)
+    seen = bare.observations
+    mistakes = {
+        "heading has the other sign": [1, -1, 1] * seen.position_m,
+        "y points ahead": seen.position_m[:, [1, 0, 2]],
+        "are the observed ones millimetres": 1000 * seen.position_m,
+    }
+    for words, position in mistakes.items():
+        log = replace(bare, observations=replace(seen, position_m=position))
+        (finding,) = check_log(log, NOISE).findings
+        assert words in finding.text
+
+
 def test_odometry_of_another_run_is_told(sound: RobotLog) -> None:
     turns = 0.15 * np.sign(np.sin(np.arange(len(sound)) / 3))
     other = np.column_stack([np.full(len(sound), 0.1), np.zeros(len(sound)), turns])
@@ -101,15 +122,16 @@ def test_sound_logs_are_left_as_they_are(noise: float) -> None:
         assert not found.findings
         covariance = np.zeros((len(log), 3, 3))
         assert without_jumps(log, found.jumps, covariance) == (log, covariance)
+        assert not check_log(without_names(log), NOISE).findings
 
 
 def test_robots_that_stand_turn_or_go_straight_are_sound() -> None:
     still, ahead = np.zeros((40, 3)), np.tile([0.1, 0, 0], (40, 1))
     turning = np.tile([0, 0, 0.05], (40, 1))
     for steps in (still, ahead, turning, np.concatenate([still[:20], ahead[:20]])):
-        assert not check_log(
-            circling_log(40, 0.002, poses=poses_from_increments(steps)), NOISE
-        ).findings
+        log = circling_log(40, 0.002, poses=poses_from_increments(steps))
+        for each in (log, without_names(log)):
+            assert not check_log(each, NOISE).findings
 
 
 @pytest.mark.parametrize("name", JUMPS)
