@@ -34,14 +34,18 @@ from experiments.evaluation.single_steps import alignment_row
 from experiments.evaluation.tables import SHOWN, read_provenance
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
-from experiments.reports.formatting import listed, metres, percent, radians, two_digits
 from experiments.reports.layout import (
     NO_ESTIMATE,
     columns,
+    listed,
+    metres,
+    percent,
     print_frame,
     print_lines,
     print_skipped,
     print_table,
+    radians,
+    two_digits,
 )
 from experiments.studies.method_comparison import Recommendation, aligner_summary, recommend
 from experiments.studies.statistics import ROBOT_PAIR, error_bands

@@ -16,7 +16,7 @@ import plotly.graph_objects as go
 
 from experiments.pipeline.stages.align import unpacked
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
-from experiments.reports.formatting import metres, radians
+from experiments.reports.layout import metres, radians
 from experiments.reports.report.charts import NEUTRAL, Attributes, Styles, escaped, faint, thinned
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
