@@ -162,11 +162,6 @@ def print_plan(plan: RunPlan, results: Path, jobs: int) -> None:
     )
 
 
-def image_source(result: Path) -> str:
-    """Say who drew the images of a result's cameras."""
-    return images_by(str(read_provenance(result / "provenance.json").get("renderer", "unknown")))
-
-
 def images_by(name: str) -> str:
     """Say who draws images, by the name of the renderer in a result."""
     return name.replace(NAMES["tiny"], f"PyBullet's {NAMES['tiny']}")
@@ -317,7 +312,8 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
     print_lines(f"  {line}" for line in (*team, *edge_lines(table("team_edges"))))
     drawn = [] if skipped_figures is None else [f"Figures: {result / 'figures'}"]
     print_lines(["   ".join([*drawn, f"Tables: {result / 'tables'}"])])
-    print_lines([f"Images of the cameras: {image_source(result)}"])
+    renderer = read_provenance(result / "provenance.json").get("renderer", "unknown")
+    print_lines([f"Images of the cameras: {images_by(str(renderer))}"])
     print_skipped(skipped_figures or ())
 
 

@@ -217,7 +217,17 @@ def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibrat
     lenses = []
     for side, info in (("left", left), ("right", right)):
         try:
-            lenses.append(_raw_lens(info))
+            K, model = _matrix(info, "K", (3, 3)), str(info.distortion_model)
+            if model not in _DISTORTIONS:
+                known = ", ".join(name for name in _DISTORTIONS if name)
+                raise InputError(f"distortion_model {model!r} is unknown; known: {known}")
+            coefficients = _matrix(info, "D", (-1,))
+            if model == "rational_polynomial" and not coefficients[5:].any():
+                coefficients = coefficients[:5]
+            distortion = _DISTORTIONS[model] if coefficients.any() else "none"
+            own = tuple(coefficients.tolist()) if distortion != "none" else ()
+            size = (int(info.width), int(info.height))
+            lenses.append(Lens(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own))
         except InputError as error:
             raise InputError(f"camera_info of the {side} camera: {error}") from error
     return StereoCalibration(lenses[0], lenses[1], T_left_right)
@@ -275,21 +285,6 @@ def _rectified_lens(info: Any) -> Lens:
     P = _matrix(info, "P", (3, 4))
     size = (int(info.width), int(info.height))
     return Lens(size, (P[0, 0], P[1, 1]), (P[0, 2], P[1, 2]))
-
-
-def _raw_lens(info: Any) -> Lens:
-    """Return the camera of raw pictures."""
-    K, model = _matrix(info, "K", (3, 3)), str(info.distortion_model)
-    if model not in _DISTORTIONS:
-        known = ", ".join(name for name in _DISTORTIONS if name)
-        raise InputError(f"distortion_model {model!r} is unknown; known: {known}")
-    coefficients = _matrix(info, "D", (-1,))
-    if model == "rational_polynomial" and not coefficients[5:].any():
-        coefficients = coefficients[:5]
-    distortion = _DISTORTIONS[model] if coefficients.any() else "none"
-    own = tuple(coefficients.tolist()) if distortion != "none" else ()
-    size = (int(info.width), int(info.height))
-    return Lens(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own)
 
 
 @dataclass(frozen=True)
