@@ -645,7 +645,21 @@ class _Messages:
             bag.write(connections[topic], time_ns, data)
 
         times = (drive.time_ns + _FIRST_NS).tolist()
-        put("/tf_static", times[0], self._static_transforms(times[0]))
+        # mounts of the cameras
+        found = []
+        for number, eye in enumerate(_SIDES):
+            T = self._drive.mount(number)
+            q = se3.quaternions(T[None])[0].tolist()
+            moved = self._new(
+                "geometry_msgs/Transform",
+                self._new("geometry_msgs/Vector3", *T[:3, 3].tolist()),
+                self._new("geometry_msgs/Quaternion", *q),
+            )
+            of_mount = self._header(times[0], _BASE)
+            found.append(
+                self._new("geometry_msgs/TransformStamped", of_mount, f"{eye}_optical", moved)
+            )
+        put("/tf_static", times[0], self._new("tf2_msgs/TFMessage", found))
         still = self._new("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
         twist = self._new("geometry_msgs/Twist", still, still)
         twist = self._new("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
@@ -700,20 +714,3 @@ class _Messages:
         q = se3.quaternions(T[None])[0].tolist()
         point = self._new("geometry_msgs/Point", *T[:3, 3].tolist())
         return self._new("geometry_msgs/Pose", point, self._new("geometry_msgs/Quaternion", *q))
-
-    def _static_transforms(self, time_ns: int) -> Any:
-        """Return the TFMessage of the camera mounts."""
-        found = []
-        for camera, side in enumerate(_SIDES):
-            T = self._drive.mount(camera)
-            q = se3.quaternions(T[None])[0].tolist()
-            moved = self._new(
-                "geometry_msgs/Transform",
-                self._new("geometry_msgs/Vector3", *T[:3, 3].tolist()),
-                self._new("geometry_msgs/Quaternion", *q),
-            )
-            header = self._header(time_ns, _BASE)
-            found.append(
-                self._new("geometry_msgs/TransformStamped", header, f"{side}_optical", moved)
-            )
-        return self._new("tf2_msgs/TFMessage", found)
