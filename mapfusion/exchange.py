@@ -82,6 +82,42 @@ def read_ply(path: Path, what: str) -> pa.Table:
         InputError: the file is missing, damaged or has no vertices with plain properties.
     """
     data = _bytes_of(path, what)
+    order, n_text, properties, comments, start = _ply_header(path, data)
+    try:
+        n = int(n_text)
+        if order:
+            row = np.dtype([(name, order + _TYPES[kind]) for kind, name in properties])
+            rows = np.frombuffer(data, row, n, start)
+            values = {
+                name: rows[name].astype(row[name].newbyteorder("=")) for _, name in properties
+            }
+        else:
+            cells = [line.split() for line in data[start:].decode("ascii").splitlines()[:n]]
+            if len(cells) < n or any(len(each) != len(properties) for each in cells):
+                raise ValueError(f"expected {n} lines of {len(properties)} numbers")
+            matrix = np.array(cells, np.float64).reshape(n, len(properties))
+            values = {name: matrix[:, k] for k, (_, name) in enumerate(properties)}
+    except (ValueError, IndexError, TypeError) as error:
+        raise InputError(f"{path}: not readable as PLY ({error})") from error
+    known = {short: name for name, short in _VERTEX_NAMES.items()}
+    flat = _PLANAR in comments
+    kept = {
+        known.get(name, name): column
+        for name, column in values.items()
+        if not (flat and (name == "z" or (name.startswith("cov_") and "z" in name)))
+    }
+    names = [each.removeprefix(_NAME) for each in comments if each.startswith(_NAME)]
+    metadata = {"mapfusion.name": names[0]} if names else None
+    return pa.table(kept).replace_schema_metadata(metadata)
+
+
+def _ply_header(path: Path, data: bytes) -> tuple[str, str, list[list[str]], list[str], int]:
+    """Parse the header of a PLY file.
+
+    Returns:
+        Byte order of numbers, empty for ASCII; number of vertices as written; type and name of each
+        property; comments; and the position of the first vertex.
+    """
     lines, start = list[str](), 0
     while not lines or lines[-1] != "end_header":
         end = data.find(b"\n", start, start + _MAX_HEADER_BYTES)
@@ -99,33 +135,9 @@ def read_ply(path: Path, what: str) -> pa.Table:
     properties = [each[1:] for each in words[elements[0] + 1 : last] if each[0:1] == ["property"]]
     if not all(len(each) == 2 and each[0] in _TYPES for each in properties) or not properties:
         raise InputError(f"{path}: a property of the vertices is no single number")
-    try:
-        n = int(words[elements[0]][2])
-        if order:
-            row = np.dtype([(name, order + _TYPES[kind]) for kind, name in properties])
-            rows = np.frombuffer(data, row, n, start)
-            values = {
-                name: rows[name].astype(row[name].newbyteorder("=")) for _, name in properties
-            }
-        else:
-            cells = [line.split() for line in data[start:].decode("ascii").splitlines()[:n]]
-            if len(cells) < n or any(len(each) != len(properties) for each in cells):
-                raise ValueError(f"expected {n} lines of {len(properties)} numbers")
-            matrix = np.array(cells, np.float64).reshape(n, len(properties))
-            values = {name: matrix[:, k] for k, (_, name) in enumerate(properties)}
-    except (ValueError, IndexError, TypeError) as error:
-        raise InputError(f"{path}: not readable as PLY ({error})") from error
     comments = [" ".join(each[1:]) for each in words if each[0:1] == ["comment"]]
-    known = {short: name for name, short in _VERTEX_NAMES.items()}
-    flat = _PLANAR in comments
-    kept = {
-        known.get(name, name): column
-        for name, column in values.items()
-        if not (flat and (name == "z" or (name.startswith("cov_") and "z" in name)))
-    }
-    names = [each.removeprefix(_NAME) for each in comments if each.startswith(_NAME)]
-    metadata = {"mapfusion.name": names[0]} if names else None
-    return pa.table(kept).replace_schema_metadata(metadata)
+    n_text = " ".join(words[elements[0]][2:3])  # empty if it is missing
+    return order, n_text, properties, comments, start
 
 
 def _bytes_of(path: Path, what: str) -> bytes:

@@ -194,11 +194,6 @@ def magnification(plan: Plan) -> int:
     return largest_magnification(typical_m, _ELLIPSE_SHARE * float((high - low).max()))
 
 
-def ellipses_text(factor: int) -> str:
-    """Return the legend of ellipses that are drawn enlarged by a factor."""
-    return f"{LEVEL_TEXT} ellipses, {f'{factor} x enlarged' if factor > 1 else 'to scale'}"
-
-
 def plot_plans(plans: Sequence[Plan], heading: str) -> Figure:
     """Draw plans: the first one large, the others in rows below it; the heading is above.
 
@@ -366,4 +361,5 @@ def ellipse_handle(colour: str, factor: int = 1) -> Line2D:
     from matplotlib.lines import Line2D
 
     style = {"marker": "o", "markerfacecolor": "none", "markersize": 7, "linestyle": "none"}
-    return Line2D([], [], color=colour, label=ellipses_text(factor), **style)
+    label = f"{LEVEL_TEXT} ellipses, {f'{factor} x enlarged' if factor > 1 else 'to scale'}"
+    return Line2D([], [], color=colour, label=label, **style)

@@ -300,9 +300,32 @@ class _Driver:
             self._holding_for |= each.waits_for(came, now, clearance_m)
 
     def control(self, time_s: float, pose: Pose, others: Iterable[_Other]) -> None:
-        """Perform one control step, given the poses of all robots."""
+        """Perform one control step, given the poses of all robots.
+
+        Raises:
+            InputError: the robot is stuck.
+        """
         settings = self._settings
-        self._update_progress(time_s, pose)
+        # progress: on arrival the next waypoint is selected
+        distance = self._distance_m(pose)
+        if not self.finished and distance < settings.arrival_m:
+            self._target += 1
+            self._visited += 1
+            if self._target == len(self._waypoints_m):
+                self.finished = not self._route.loop
+                self._target = 0
+            self._nearest_m, self.progress_s = np.inf, time_s
+            distance = self._distance_m(pose)
+        if self.finished or self._holding_for or distance < self._nearest_m - PROGRESS_M:
+            self._nearest_m, self.progress_s = distance, time_s
+        if time_s - self.progress_s > settings.patience_s:
+            why = "waits for another robot" if self.yields_to is not None else "is stuck"
+            raise InputError(
+                f"robot {self._route.robot}: {why} at {format_point(pose)} since t = "
+                f"{self.progress_s:.1f} s, on the way to waypoint {self._target + 1} "
+                f"{format_point(self._waypoints_m[self._target])}"
+            )
+
         stands = self.finished or time_s < settings.stand_s or bool(self._holding_for)
         speed, turn = (0.0, 0.0) if stands else self._desired_speeds(pose)
         self.yields_to = self._blocking_robot(pose, others) if speed > 0 else None
@@ -315,27 +338,6 @@ class _Driver:
         difference = self._turn_rad_s * SKID_TRACK_M / 2
         left, right = self._speed_m_s - difference, self._speed_m_s + difference
         self._robot.drive(left / WHEEL_RADIUS_M, right / WHEEL_RADIUS_M)
-
-    def _update_progress(self, time_s: float, pose: Pose) -> None:
-        """Select the next waypoint on arrival; raise InputError if the robot is stuck."""
-        distance = self._distance_m(pose)
-        if not self.finished and distance < self._settings.arrival_m:
-            self._target += 1
-            self._visited += 1
-            if self._target == len(self._waypoints_m):
-                self.finished = not self._route.loop
-                self._target = 0
-            self._nearest_m, self.progress_s = np.inf, time_s
-            distance = self._distance_m(pose)
-        if self.finished or self._holding_for or distance < self._nearest_m - PROGRESS_M:
-            self._nearest_m, self.progress_s = distance, time_s
-        if time_s - self.progress_s > self._settings.patience_s:
-            why = "waits for another robot" if self.yields_to is not None else "is stuck"
-            raise InputError(
-                f"robot {self._route.robot}: {why} at {format_point(pose)} since t = "
-                f"{self.progress_s:.1f} s, on the way to waypoint {self._target + 1} "
-                f"{format_point(self._waypoints_m[self._target])}"
-            )
 
     def _distance_m(self, pose: Pose) -> float:
         return math.dist(self._waypoints_m[self._target], pose[:2])

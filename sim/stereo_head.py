@@ -167,11 +167,22 @@ def _render(
     view = np.eye(4)
     view[:3, :3] = [-left, up, -ahead]
     view[:3, 3] = -view[:3, :3] @ T[:3, 3]
+    # The principal point is at pixel (width - 1) / 2. OpenGL samples pixel i at the coordinate
+    # i + 1/2 of a viewport with size `width`. TinyRenderer samples it at i, so the centre of its
+    # frustum would be at width / 2; the matrix corrects this offset of half a pixel.
+    off_px = 1 - 2 * (0.0 if tiny else 0.5)
+    width, height, f = camera.width_px, camera.height_px, camera.focal_px
+    matrix = np.zeros((4, 4))
+    matrix[0, 0], matrix[0, 2] = 2 * f / width, off_px / width
+    matrix[1, 1], matrix[1, 2] = 2 * f / height, off_px / height
+    matrix[2, 2] = -(FAR_M + NEAR_M) / (FAR_M - NEAR_M)
+    matrix[2, 3] = -2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
+    matrix[3, 2] = -1
     _, _, rgba, buffer, _ = p.getCameraImage(
         camera.width_px,
         camera.height_px,
         viewMatrix=view.T.ravel().tolist(),  # column by column
-        projectionMatrix=_projection_matrix(camera, sampled_at_px=0.0 if tiny else 0.5),
+        projectionMatrix=matrix.T.ravel().tolist(),
         shadow=0,
         # ambient light only: a wall looks the same from all sides
         lightAmbientCoeff=1.0,
@@ -207,21 +218,3 @@ def body_pose(T_world_robot: ArrayLike) -> Float:
 def _mounting(camera: StereoCamera, y_m: float) -> Float:
     """Return T_robot_camera (4, 4)."""
     return pose(camera.camera_axes, camera.p_robot_eye(y_m))
-
-
-def _projection_matrix(camera: StereoCamera, sampled_at_px: float) -> list[float]:
-    """Return the projection matrix of an exact pinhole camera, column by column.
-
-    The principal point is at pixel (width - 1) / 2. OpenGL samples pixel i at the coordinate
-    i + 1/2 of a viewport with size `width`. TinyRenderer samples it at i, so the centre of its
-    frustum would be at width / 2; the matrix corrects this offset of half a pixel.
-    """
-    off_px = 1 - 2 * sampled_at_px
-    width, height, f = camera.width_px, camera.height_px, camera.focal_px
-    matrix = np.zeros((4, 4))
-    matrix[0, 0], matrix[0, 2] = 2 * f / width, off_px / width
-    matrix[1, 1], matrix[1, 2] = 2 * f / height, off_px / height
-    matrix[2, 2] = -(FAR_M + NEAR_M) / (FAR_M - NEAR_M)
-    matrix[2, 3] = -2 * FAR_M * NEAR_M / (FAR_M - NEAR_M)
-    matrix[3, 2] = -1
-    return matrix.T.ravel().tolist()

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 import mapfusion
-from experiments.cli import import_commands, run_commands, step_commands, study_commands
+from experiments.cli import run_commands, step_commands, study_commands
 from experiments.cli.options import (
     EXIT_BAD_INPUT,
     EXIT_DEFECT,
@@ -34,7 +34,7 @@ app = typer.Typer(
 )
 for commands in (run_commands, study_commands, step_commands):
     app.add_typer(commands.app)
-app.add_typer(import_commands.app, name="import", rich_help_panel=STEPS)
+app.add_typer(step_commands.import_app, name="import", rich_help_panel=STEPS)
 
 
 def _print_version(wanted: bool) -> None:

@@ -12,7 +12,6 @@ from typing import Annotated
 
 import typer
 
-from experiments.reports.formatting import plain
 from mapfusion.errors import InputError
 
 EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
@@ -192,6 +191,8 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document in
 
 def print_to_stderr(text: str) -> None:
     """Print a message in one line, also if it quotes text with line breaks."""
+    from experiments.reports.layout import plain
+
     # `sys.stderr` replaces characters that the terminal lacks; `err=True` may open another stream
     typer.echo(f"mapfusion: {plain(' '.join(text.split()))}", file=sys.stderr)
 

@@ -82,8 +82,8 @@ def verdicts(
     from experiments.cli.options import require_folder
     from experiments.reports import layout, study_screen
     from experiments.reports.study_files import write_guarantee
+    from experiments.studies.refusal_rates import guarantee
     from experiments.studies.run_tables import find_runs
-    from experiments.studies.verdict_guarantee import guarantee
 
     require_folder(output, paths)
     found = guarantee(find_runs(paths), alpha, delta)

@@ -278,18 +278,15 @@ def missed_merges(tables: Tables, aligner: str) -> float:
     return (~criteria.mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
 
 
-def _register_metrics_of_smoothed_maps() -> None:
-    """Register metrics of alignments of smoothed maps, by the functions of the filter's maps."""
-
-    def on_smoothed(tables: Tables, aligner: str, of_aligner: Metric) -> float:
-        return of_aligner({**tables, "errors": tables["smoothed_errors"]}, aligner)
-
-    for name in SMOOTHED_METRICS:
-        function = ALIGNER_METRICS[name]
-        ALIGNER_METRICS[f"smoothed_{name}"] = partial(on_smoothed, of_aligner=function)
+def on_smoothed(tables: Tables, aligner: str, of_aligner: Metric) -> float:
+    """Return a metric of an aligner's alignments of smoothed maps."""
+    return of_aligner({**tables, "errors": tables["smoothed_errors"]}, aligner)
 
 
-_register_metrics_of_smoothed_maps()
+ALIGNER_METRICS |= {
+    f"smoothed_{name}": partial(on_smoothed, of_aligner=ALIGNER_METRICS[name])
+    for name in SMOOTHED_METRICS
+}
 
 
 def compute(name: str, tables: Tables) -> float:

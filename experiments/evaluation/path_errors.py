@@ -236,18 +236,15 @@ class PlacedPath:
     T_first_map: Float
     T_world_map: Float
 
-    def in_one_frame(self) -> tuple[Float, Float]:
-        """Return estimated poses in the fused frame and true poses in the world, shape (n, 3)."""
-        known = np.isfinite(self.truth).all(axis=1)
-        poses, truth = self.poses[known], self.truth[known]
-        return se2.compose(self.T_first_map, poses), se2.compose(self.T_world_map, truth)
-
 
 def team_ate_m(paths: Sequence[PlacedPath]) -> Float:
     """Return position errors (N,) in m of all robots after one rigid fit of all paths."""
-    estimated_and_true = zip(*(own.in_one_frame() for own in paths), strict=True)
-    path, truth = (np.concatenate(poses) for poses in estimated_and_true)
-    return ate_m(path, truth)
+    estimated, true = [], []  # in the fused frame, and in the world
+    for own in paths:
+        known = np.isfinite(own.truth).all(axis=1)
+        estimated.append(se2.compose(own.T_first_map, own.poses[known]))
+        true.append(se2.compose(own.T_world_map, own.truth[known]))
+    return ate_m(np.concatenate(estimated), np.concatenate(true))
 
 
 def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.DataFrame:

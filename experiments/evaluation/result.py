@@ -89,18 +89,6 @@ def all_tables(
     return {name: tables.as_table(name, make()) for name, make in makers if name in only}
 
 
-def ordered_for_figures(
-    makers: Mapping[str, TableMaker],
-) -> tuple[dict[str, TableMaker], dict[str, TableMaker]]:
-    """Return the makers in two groups: tables that figures read, and the other tables.
-
-    Figures are drawn while tables are written, so slow tables are at the end of the first group.
-    """
-    of_figures = (name for name in makers if name not in _IN_NO_FIGURE)
-    first = {name: makers[name] for name in sorted(of_figures, key=_SLOW.__contains__)}
-    return first, {name: makers[name] for name in _IN_NO_FIGURE}
-
-
 def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
     """Return functions that compute the tables of last maps, paths, estimates and errors."""
     settings, scenario = run.settings, run.scenario
@@ -321,9 +309,12 @@ def write_result(
                 iteration = int(path.stem.removeprefix("image_"))
                 link_or_copy(path, folder / "keyframes" / f"{robot.name}_{iteration:05d}.png")
         write_json(folder / "world.json", _world(run.scenario, team.robots))
-        of_figures, others = ordered_for_figures(
-            table_makers(run, team) | history_table_makers(run, team)
-        )
+        # Figures are drawn while tables are written: the tables that they read come first, with
+        # the slow ones at the end.
+        makers = table_makers(run, team) | history_table_makers(run, team)
+        shown = (name for name in makers if name not in _IN_NO_FIGURE)
+        of_figures = {name: makers[name] for name in sorted(shown, key=_SLOW.__contains__)}
+        others = {name: makers[name] for name in _IN_NO_FIGURE}
         for name, make in of_figures.items():
             write_table(name, make)
         write_json(folder / "scenario.json", run.scenario.resolved())

@@ -156,11 +156,6 @@ def slam(
     return SlamResult(landmarks, tuple(findings), smoothed, str(ended[-1]))
 
 
-def smoothed_path(path: Path) -> Path:
-    """Return the path of the smoothed map beside that of a filter's map."""
-    return path.with_name(f"{path.stem}.smoothed{path.suffix}")
-
-
 def save_maps(path: Path, made: SlamResult) -> list[Path]:
     """Write the filter's map and, beside it, the smoothed map; return the paths.
 
@@ -169,7 +164,7 @@ def save_maps(path: Path, made: SlamResult) -> list[Path]:
     """
     paths, writes = [path], map_writes(path, made.landmarks)
     if made.smoothed is not None:
-        paths.append(smoothed_path(path))
+        paths.append(path.with_name(f"{path.stem}.smoothed{path.suffix}"))
         writes |= map_writes(paths[-1], made.smoothed)
     try:
         write_together(writes)
@@ -397,7 +392,7 @@ def calibrate_logs(
         for source, log, robot in zip(logs, loaded, calibration.robots, strict=True):
             folder = output / log.robot
             try:
-                write_log(folder, robot.error.corrected_log(log))
+                write_log(folder, replace(log, odometry=robot.error.corrected(log.odometry)))
                 for name in (*TRUTH_FILES, ATTITUDE_FILE):
                     (folder / name).unlink(missing_ok=True)
                     if (source / name).exists():

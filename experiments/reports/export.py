@@ -20,8 +20,8 @@ from experiments.evaluation import tables
 from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.single_steps import alignment_row
 from experiments.pipeline.tables import COVARIANCE, MOTION
-from experiments.reports.formatting import plain
 from experiments.reports.inspect import unit_of
+from experiments.reports.layout import plain
 from mapfusion import attitude, landmark_map, robot_log, viewing
 from mapfusion.align.alignment import Status
 from mapfusion.datasets.log_consistency import Finding

@@ -83,7 +83,22 @@ def contents_of(path: Path) -> Contents:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if path.suffix.lower() in landmark_map.MAP_ENDINGS:
-        return _table_contents(path)
+        # by the kind in the table's metadata, or by the file's name without metadata
+        if is_alone(path):
+            return _open_table(path, _open_schema(path))
+        table = read_parquet(path, "table")
+        facts: dict[str, Any] = dict(text_attributes(path, table))
+        kind = facts.pop(_KIND, None)
+        table_schema = _CHECKED.get(kind or "")
+        if kind is None:
+            table_schema = _open_schema(path)
+            if not set(table_schema.names) & set(table.column_names):
+                raise InputError(f"{path}: none of mapfusion's (no mapfusion.kind in its metadata)")
+        if table_schema in (landmark_map.LANDMARKS, *_OPEN.values()):
+            return _open_table(path, table_schema)
+        if table_schema is not None:
+            read_table(path, table_schema)  # raises if version or columns differ
+        return _columns_of(path, str(kind), table, facts)
     if path.suffix in {".yaml", ".yml"}:
         return Contents("scenario", _brief(_resolved(path)))
     if path.suffix != ".json":
@@ -137,25 +152,6 @@ def _folder_contents(path: Path) -> Contents:
             n_rows[name] += read_parquet(file, "table").num_rows
     rows = [(name, n, n_rows[name]) for name, n in n_files.items()]
     return Contents(kind, facts, [("holds", ""), ("files", "d"), ("rows", "d")], rows)
-
-
-def _table_contents(path: Path) -> Contents:
-    """Describe a table by the kind in its metadata, or by its file's name without metadata."""
-    if is_alone(path):
-        return _open_table(path, _open_schema(path))
-    table = read_parquet(path, "table")
-    facts: dict[str, Any] = dict(text_attributes(path, table))
-    kind = facts.pop(_KIND, None)
-    table_schema = _CHECKED.get(kind or "")
-    if kind is None:
-        table_schema = _open_schema(path)
-        if not set(table_schema.names) & set(table.column_names):
-            raise InputError(f"{path}: none of mapfusion's (no mapfusion.kind in its metadata)")
-    if table_schema in (landmark_map.LANDMARKS, *_OPEN.values()):
-        return _open_table(path, table_schema)
-    if table_schema is not None:
-        read_table(path, table_schema)  # raises if version or columns differ
-    return _columns_of(path, str(kind), table, facts)
 
 
 def _columns_of(path: Path, kind: str, table: pa.Table, facts: dict[str, Any]) -> Contents:

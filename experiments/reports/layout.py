@@ -1,13 +1,15 @@
-"""Tables, lines, progress displays and listings on the terminal.
+"""Text of numbers; tables, lines, progress displays and listings on the terminal.
 
 All output goes through `_console`, which interprets no markup: texts may come from users.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +26,6 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from experiments.reports.formatting import UNKNOWN, interval, number, plain
 from mapfusion.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:  # listings without data frames skip this slow import
@@ -36,10 +37,75 @@ _WHOLE_WORD = 20  # characters; names of methods are not folded
 _LEAST_TEXT = 8  # characters of a column of text: folded names stay legible
 NO_ESTIMATE = "given: share with an estimate; without one the error is infinite"
 _GAP = 2  # characters between columns
+_SPACE = "\u00a0"  # keeps a number and its unit on one line
+UNKNOWN = "–"
 
 
 OnProgress = Callable[[str, int, int], None]
 _LINE_EVERY_S = 30.0  # between lines of progress in a log file
+
+
+def plain(text: str) -> str:
+    """Replace control and unprintable characters by their escapes in Python.
+
+    A no-break space, which Python does not count as printable, becomes a space.
+    """
+    text = text.replace(_SPACE, " ")
+    return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
+
+
+def percent(share: float) -> str:
+    """Write a share as a percentage; only exact values give 100 % and 0 %."""
+    if math.isnan(share):
+        return UNKNOWN
+    value = 100 * share
+    if 0 < value < 1:
+        return f"<{_SPACE}1{_SPACE}%"
+    if 99 < value < 100:
+        return f">{_SPACE}99{_SPACE}%"
+    return f"{value:.0f}{_SPACE}%"
+
+
+def two_digits(value: float) -> str:
+    """Write a number with about two significant digits and without its unit."""
+    if not math.isfinite(value):
+        return UNKNOWN if math.isnan(value) else str(value)
+    digits = 0 if value >= 100 else max(0, min(5, 1 - math.floor(math.log10(abs(value) or 1))))
+    return f"{value:.{digits}f}"
+
+
+def with_unit(unit: str, value: float) -> str:
+    """Write a number with two digits and its unit; unknown and infinite values have no unit."""
+    return f"{two_digits(value)}{_SPACE}{unit}" if math.isfinite(value) else two_digits(value)
+
+
+metres, radians, milliseconds = (partial(with_unit, unit) for unit in ("m", "rad", "ms"))
+
+
+def ratio(value: float) -> str:
+    """Write a ratio of two quantities."""
+    if math.isnan(value):
+        return UNKNOWN
+    return f"{value:.2f}" if value < 10 else f"{value:.0f}"
+
+
+def number(value: float, layout: str) -> str:
+    """Write a number in a format; NaN is unknown."""
+    return UNKNOWN if math.isnan(value) else format(value, layout)
+
+
+def interval(value: float, low: float, high: float, layout: str) -> str:
+    """Write a number with its interval, if known, in brackets without units."""
+    text = number(value, layout)
+    if math.isnan(low) or math.isnan(high) or (math.isinf(low) and math.isinf(high)):
+        return text
+    to = " to " if layout.startswith("+") else "–"  # signs need room between them
+    return f"{text} ({to.join(number(end, layout) for end in (low, high)).replace('%', '')})"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Join names for a sentence: "a, b and c"."""
+    return f"{', '.join(names[:-1])} and {names[-1]}" if len(names) > 1 else "".join(names)
 
 
 def _console(stderr: bool = False) -> Console:

@@ -34,14 +34,18 @@ from experiments.evaluation.single_steps import alignment_row
 from experiments.evaluation.tables import SHOWN, read_provenance
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
-from experiments.reports.formatting import listed, metres, percent, radians, two_digits
 from experiments.reports.layout import (
     NO_ESTIMATE,
     columns,
+    listed,
+    metres,
+    percent,
     print_frame,
     print_lines,
     print_skipped,
     print_table,
+    radians,
+    two_digits,
 )
 from experiments.studies.method_comparison import Recommendation, aligner_summary, recommend
 from experiments.studies.statistics import ROBOT_PAIR, error_bands
@@ -156,11 +160,6 @@ def print_plan(plan: RunPlan, results: Path, jobs: int) -> None:
             f"  It uses {basis}. Nothing was run.",
         ]
     )
-
-
-def image_source(result: Path) -> str:
-    """Say who drew the images of a result's cameras."""
-    return images_by(str(read_provenance(result / "provenance.json").get("renderer", "unknown")))
 
 
 def images_by(name: str) -> str:
@@ -313,7 +312,8 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
     print_lines(f"  {line}" for line in (*team, *edge_lines(table("team_edges"))))
     drawn = [] if skipped_figures is None else [f"Figures: {result / 'figures'}"]
     print_lines(["   ".join([*drawn, f"Tables: {result / 'tables'}"])])
-    print_lines([f"Images of the cameras: {image_source(result)}"])
+    renderer = read_provenance(result / "provenance.json").get("renderer", "unknown")
+    print_lines([f"Images of the cameras: {images_by(str(renderer))}"])
     print_skipped(skipped_figures or ())
 
 

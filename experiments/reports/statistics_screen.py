@@ -17,8 +17,7 @@ from experiments.evaluation.criteria import (
     setting_columns,
 )
 from experiments.reports import layout
-from experiments.reports.formatting import interval, number
-from experiments.reports.layout import columns
+from experiments.reports.layout import columns, interval, number
 from experiments.studies import comparison
 from experiments.studies.intervals import FEW_RUNS, MAPS_OF_ONE_RUN, RUN
 from experiments.studies.statistics import ALL_SCENARIOS, Summary

@@ -40,7 +40,10 @@ from experiments.studies.independence_trial import (
 )
 from experiments.studies.paper_claims import READINGS, VALUES, claims_table
 from experiments.studies.refusal_rates import (
+    SHARES,
+    THRESHOLDS,
     VERDICTS,
+    Guarantee,
     Rate,
     first_right_answers,
     of_any_method,
@@ -48,7 +51,6 @@ from experiments.studies.refusal_rates import (
 )
 from experiments.studies.run_tables import find_runs
 from experiments.studies.statistics import ALL_SCENARIOS, Summary, configurations, summarise
-from experiments.studies.verdict_guarantee import SHARES, THRESHOLDS, Guarantee
 from mapfusion.align.alignment import Status
 from mapfusion.errors import InputError
 from mapfusion.files import schema, write_json

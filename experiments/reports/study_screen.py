@@ -17,19 +17,27 @@ from experiments.evaluation.criteria import (
     RIGHT_WITHIN_RAD,
 )
 from experiments.evaluation.single_steps import filter_settings
-from experiments.reports.formatting import interval, two_digits
 from experiments.reports.layout import (
     NO_ESTIMATE,
     Column,
     columns,
+    interval,
     print_frame,
     print_lines,
     print_skipped,
     print_table,
+    two_digits,
 )
 from experiments.studies.independence_trial import COST_HEADINGS, STRATEGIES, shown_numbers
 from experiments.studies.paper_claims import claims_table
-from experiments.studies.refusal_rates import VERDICTS, Rate, pooled, worst
+from experiments.studies.refusal_rates import (
+    VERDICTS,
+    Guarantee,
+    Rate,
+    clean_runs_needed,
+    pooled,
+    worst,
+)
 from experiments.studies.sweep import Survey, SweepProgress
 from experiments.studies.sweep_tables import (
     ERRORS,
@@ -38,7 +46,6 @@ from experiments.studies.sweep_tables import (
     SweepRun,
     medians_over_runs,
 )
-from experiments.studies.verdict_guarantee import Guarantee, clean_runs_needed
 from mapfusion.align.alignment import Status
 from mapfusion.smoother.noise_estimation import NOISE_PARAMETERS
 from mapfusion.smoother.odometry_calibration import Calibration

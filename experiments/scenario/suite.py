@@ -145,14 +145,6 @@ def _mentions(path: Path, word: str) -> bool:
         return True  # the reader reports the error
 
 
-def shipped_scenario(name: str) -> Path:
-    """Return the file of a shipped scenario; raise InputError if the name is unknown."""
-    shipped = {path.stem: path for path in _files(SHIPPED)}
-    if name not in shipped:
-        raise InputError(f"--copy {name}: no scenario of the suite; known: {', '.join(shipped)}")
-    return shipped[name]
-
-
 def scenario_names() -> list[str]:
     """Return the names of the suite's files without their suffix, sorted."""
     return [path.stem for path in _files(None)]
@@ -290,7 +282,10 @@ def copy_to_edit(name: str) -> tuple[Path, Path]:
     from experiments.scenario.loading import schema_text  # slow imports
     from mapfusion.files import write_whole
 
-    source = shipped_scenario(name)
+    shipped = {path.stem: path for path in _files(SHIPPED)}
+    if name not in shipped:
+        raise InputError(f"--copy {name}: no scenario of the suite; known: {', '.join(shipped)}")
+    source = shipped[name]
     copy, schema = OWN / source.name, OWN / "schema.json"
     if copy.exists():
         raise InputError(f"{copy}: exists; edit it, or rename it to get the shipped one again")

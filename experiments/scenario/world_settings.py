@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from mapfusion.datasets.odometry_noise import NoiseSource
+from mapfusion.datasets.log_consistency import NoiseSource
 from mapfusion.fastslam.filter import FastSlamParameters
 from mapfusion.fusion.fusers import COMPARED, target_of
 from mapfusion.geometry.numerics import Float, generator

@@ -95,11 +95,6 @@ class Strategy:
     sends: str
     often: bool = False
 
-    @property
-    def smooths(self) -> bool:
-        """True if robots smooth their logs."""
-        return make_fuser(self.fuser).smoothed
-
     def asked(self, iterations: tuple[int, ...], at: int) -> list[int]:
         """Return the iterations with messages and fusion, for the map of iteration `at`."""
         return [k for k in iterations if k <= at] if self.often else [at]
@@ -273,7 +268,7 @@ def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     for strategy in STRATEGIES:
         for k in team.iterations:
             asked = strategy.asked(team.iterations, k)
-            smoothed_at = asked if strategy.smooths else []
+            smoothed_at = asked if make_fuser(strategy.fuser).smoothed else []
             own = []  # rows of the filter, and of the smoothing that was asked for, by robot
             for costs in robots:
                 filtered = _of(

@@ -105,26 +105,22 @@ def success_rates(
             inside = (place == number) & (used["aligner"] == aligner).to_numpy()
             if inside.any():
                 row = dict(zip(("from", "to"), limits, strict=True)) | {"aligner": aligner}
-                row |= _rates(used[inside], clusters.codes[inside])
+                # shares of this bin and method, with their intervals
+                own, codes = used[inside], clusters.codes[inside]
+                ground = has_common_ground(own).to_numpy()
+                row |= {"n_runs": own["run_id"].nunique(), "n_maps": len(own)}
+                row |= {"n_apart": int(np.count_nonzero(~ground))}
+                for name in _WITH_TEST if own["accepted"].notna().any() else _WITHOUT_TEST:
+                    known = own[name].notna().to_numpy() & (ground if name == "accepted" else True)
+                    share = low = high = np.nan
+                    if known.any():
+                        n = effective_trials(np.unique(codes[known], return_counts=True)[1])
+                        share = float(own[name][known].mean())
+                        low, high = map(float, wilson(share * n, n))
+                    row |= {name: share, f"{name}_low": low, f"{name}_high": high}
                 rows.append(row | {"unit": clusters.unit})
     rates = pd.DataFrame(rows)
     return rates.drop(columns=["from", "to"]) if by == LAST else rates
-
-
-def _rates(rows: pd.DataFrame, codes: np.ndarray) -> dict[str, Any]:
-    """Return the shares of one bin and method, with their intervals."""
-    ground = has_common_ground(rows).to_numpy()
-    found: dict[str, Any] = {"n_runs": rows["run_id"].nunique(), "n_maps": len(rows)}
-    found |= {"n_apart": int(np.count_nonzero(~ground))}
-    for name in _WITH_TEST if rows["accepted"].notna().any() else _WITHOUT_TEST:
-        known = rows[name].notna().to_numpy() & (ground if name == "accepted" else True)
-        share = low = high = np.nan
-        if known.any():
-            n = effective_trials(np.unique(codes[known], return_counts=True)[1])
-            share = float(rows[name][known].mean())
-            low, high = map(float, wilson(share * n, n))
-        found |= {name: share, f"{name}_low": low, f"{name}_high": high}
-    return found
 
 
 STAGES = {"estimated": "translation_error_m", "refined": "refined_translation_error_m"}

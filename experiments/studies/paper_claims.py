@@ -10,6 +10,7 @@ Measures read the tables of results only.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -827,21 +828,18 @@ def compare_with_paper(sources: Sequence[Runs]) -> pd.DataFrame:
         about |= {"measure": claim.measure, "unit": claim.unit, "why": claim.why}
         about |= dict(zip(("confirms_from", "confirms_to"), claim.confirms, strict=True))
         for scenario, renderer in ordered:
-            values = np.array([_value(claim, of) for of in groups[scenario, renderer].values()])
-            known = values[~np.isnan(values)]
+            values = []
+            for of in groups[scenario, renderer].values():
+                with suppress(NotMeasured):
+                    values.append(claim.of_run(of))
+            known = np.array(values, np.float64)
+            known = known[~np.isnan(known)]
             clusters = Clusters(np.arange(len(known)), len(known), RUN)
             interval = median_interval(known, clusters, generator(0, "paper claims", claim.name))
             of_group = {"scenario": scenario, "renderer": renderer, "n_runs": len(known)}
             judged = {"verdict": str(verdict(claim, *interval))}
             found.append(about | of_group | interval.columns("value") | judged)
     return pd.DataFrame(found, columns=pd.Index(VALUES.names))
-
-
-def _value(claim: Claim, of: TablesOfRun) -> float:
-    try:
-        return claim.of_run(of)
-    except NotMeasured:
-        return math.nan
 
 
 def claims_table(values: pd.DataFrame) -> pd.DataFrame:

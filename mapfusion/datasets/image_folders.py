@@ -93,7 +93,19 @@ def read_images(folder: Path, settings: ImagesSettings, read_yaml: ReadYaml) -> 
 
     pair_list = folder / settings.list
     if pair_list.is_file():
-        left, right = _read_pair_list(pair_list)
+        left, right, lines = list[Shot](), list[Shot](), list[int]()
+        for line, words in read_rows(pair_list, "pairs of pictures", ","):
+            require_columns(pair_list, line, words, "time left_file right_file")
+            taken_ns = parse_time_ns(pair_list, line, words[0], NS)
+            for file, shots in zip(words[1:], (left, right), strict=True):
+                picture = pair_list.parent / file
+                if not picture.is_file():
+                    raise InputError(f"{pair_list}, line {line}: {file}: no such file")
+                shots.append(Shot(taken_ns, file, PictureFile(picture)))
+            lines.append(line)
+        require_increasing(
+            pair_list, lines, np.array([shot.time_ns for shot in left], dtype=np.int64)
+        )
     else:
         left, right = (
             _read_folder(folder / name, folder / settings.times)
@@ -147,19 +159,3 @@ def _read_folder(folder: Path, times: Path) -> list[Shot]:
         Shot(time, f"{folder.name}/{path.name}", PictureFile(path))
         for time, path in zip(time_ns, paths, strict=True)
     ]
-
-
-def _read_pair_list(path: Path) -> tuple[list[Shot], list[Shot]]:
-    """Return the left and the right pictures of a list of pairs."""
-    left, right, lines = list[Shot](), list[Shot](), list[int]()
-    for line, words in read_rows(path, "pairs of pictures", ","):
-        require_columns(path, line, words, "time left_file right_file")
-        time_ns = parse_time_ns(path, line, words[0], NS)
-        for name, shots in zip(words[1:], (left, right), strict=True):
-            picture = path.parent / name
-            if not picture.is_file():
-                raise InputError(f"{path}, line {line}: {name}: no such file")
-            shots.append(Shot(time_ns, name, PictureFile(picture)))
-        lines.append(line)
-    require_increasing(path, lines, np.array([shot.time_ns for shot in left], dtype=np.int64))
-    return left, right

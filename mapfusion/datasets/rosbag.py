@@ -217,7 +217,17 @@ def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibrat
     lenses = []
     for side, info in (("left", left), ("right", right)):
         try:
-            lenses.append(_raw_lens(info))
+            K, model = _matrix(info, "K", (3, 3)), str(info.distortion_model)
+            if model not in _DISTORTIONS:
+                known = ", ".join(name for name in _DISTORTIONS if name)
+                raise InputError(f"distortion_model {model!r} is unknown; known: {known}")
+            coefficients = _matrix(info, "D", (-1,))
+            if model == "rational_polynomial" and not coefficients[5:].any():
+                coefficients = coefficients[:5]
+            distortion = _DISTORTIONS[model] if coefficients.any() else "none"
+            own = tuple(coefficients.tolist()) if distortion != "none" else ()
+            size = (int(info.width), int(info.height))
+            lenses.append(Lens(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own))
         except InputError as error:
             raise InputError(f"camera_info of the {side} camera: {error}") from error
     return StereoCalibration(lenses[0], lenses[1], T_left_right)
@@ -275,21 +285,6 @@ def _rectified_lens(info: Any) -> Lens:
     P = _matrix(info, "P", (3, 4))
     size = (int(info.width), int(info.height))
     return Lens(size, (P[0, 0], P[1, 1]), (P[0, 2], P[1, 2]))
-
-
-def _raw_lens(info: Any) -> Lens:
-    """Return the camera of raw pictures."""
-    K, model = _matrix(info, "K", (3, 3)), str(info.distortion_model)
-    if model not in _DISTORTIONS:
-        known = ", ".join(name for name in _DISTORTIONS if name)
-        raise InputError(f"distortion_model {model!r} is unknown; known: {known}")
-    coefficients = _matrix(info, "D", (-1,))
-    if model == "rational_polynomial" and not coefficients[5:].any():
-        coefficients = coefficients[:5]
-    distortion = _DISTORTIONS[model] if coefficients.any() else "none"
-    own = tuple(coefficients.tolist()) if distortion != "none" else ()
-    size = (int(info.width), int(info.height))
-    return Lens(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own)
 
 
 @dataclass(frozen=True)
@@ -650,7 +645,21 @@ class _Messages:
             bag.write(connections[topic], time_ns, data)
 
         times = (drive.time_ns + _FIRST_NS).tolist()
-        put("/tf_static", times[0], self._static_transforms(times[0]))
+        # mounts of the cameras
+        found = []
+        for number, eye in enumerate(_SIDES):
+            T = self._drive.mount(number)
+            q = se3.quaternions(T[None])[0].tolist()
+            moved = self._new(
+                "geometry_msgs/Transform",
+                self._new("geometry_msgs/Vector3", *T[:3, 3].tolist()),
+                self._new("geometry_msgs/Quaternion", *q),
+            )
+            of_mount = self._header(times[0], _BASE)
+            found.append(
+                self._new("geometry_msgs/TransformStamped", of_mount, f"{eye}_optical", moved)
+            )
+        put("/tf_static", times[0], self._new("tf2_msgs/TFMessage", found))
         still = self._new("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
         twist = self._new("geometry_msgs/Twist", still, still)
         twist = self._new("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
@@ -705,20 +714,3 @@ class _Messages:
         q = se3.quaternions(T[None])[0].tolist()
         point = self._new("geometry_msgs/Point", *T[:3, 3].tolist())
         return self._new("geometry_msgs/Pose", point, self._new("geometry_msgs/Quaternion", *q))
-
-    def _static_transforms(self, time_ns: int) -> Any:
-        """Return the TFMessage of the camera mounts."""
-        found = []
-        for camera, side in enumerate(_SIDES):
-            T = self._drive.mount(camera)
-            q = se3.quaternions(T[None])[0].tolist()
-            moved = self._new(
-                "geometry_msgs/Transform",
-                self._new("geometry_msgs/Vector3", *T[:3, 3].tolist()),
-                self._new("geometry_msgs/Quaternion", *q),
-            )
-            header = self._header(time_ns, _BASE)
-            found.append(
-                self._new("geometry_msgs/TransformStamped", header, f"{side}_optical", moved)
-            )
-        return self._new("tf2_msgs/TFMessage", found)

@@ -1,7 +1,7 @@
 """Stereo recordings in memory, as read and as written: image pairs over time, and other data."""
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -64,12 +64,6 @@ def grey(image: np.ndarray) -> np.ndarray:
     if image.shape[2] == 1:
         return image[:, :, 0]
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
-
-
-def unused_bits(loads: Iterable[Load]) -> int:
-    """Return the right shift of 16-bit levels after which the brightest level fits into 8 bits."""
-    brightest = max((int(grey(load()).max()) for load in loads), default=0)
-    return max(brightest.bit_length() - _BITS, 0)
 
 
 def sample_indices(n: int) -> list[int]:
@@ -149,7 +143,9 @@ class StereoRecording:
         of_light = slice(None) if self.depth is None else slice(1)
         if not self._shift:  # one shift for all pictures keeps brightness comparable
             loads = [load for n in sample_indices(len(self)) for load in self.pictures[n][of_light]]
-            self._shift.append(unused_bits(loads))
+            # the right shift after which the brightest 16-bit level fits into 8 bits
+            brightest = max((int(grey(load()).max()) for load in loads), default=0)
+            self._shift.append(max(brightest.bit_length() - _BITS, 0))
         pictures = [to_eight_bits(load(), self._shift[0]) for load in self.pictures[k][of_light]]
         left, right = pictures if self.depth is None else (*pictures, self.pictures[k][1]())
         return left, right

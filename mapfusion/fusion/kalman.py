@@ -4,7 +4,6 @@ Maps are fused one after the other. Landmarks are paired by the inliers of the a
 the remaining ones by gate and descriptor. Landmarks without a partner are kept.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from mapfusion.fusion.aligned_landmarks import (
     FusePairs,
     one_to_one,
 )
-from mapfusion.fusion.fusers import AlignedPair, Component, FusedMap, MergeParameters
+from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.geometry.numerics import Float
 
 
@@ -58,7 +57,27 @@ def fuse_landmarks_sequentially(
     fused = transformed(members[0])
     for k in members[1:]:
         other = transformed(k)
-        rows, others = _inliers(fused, k, component.pairs)
+        # Rows of the fused map and of map k that are inliers of an alignment. Contradictory pairs
+        # are resolved in the order of their descriptor distance.
+        known_rows, other_rows = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+        dissimilarity = [np.empty(0)]
+        for pair in component.pairs:
+            if k not in (pair.a, pair.b):
+                continue
+            known, index, own = pair.a, pair.inliers.index_a, pair.inliers.index_b
+            if k == pair.a:
+                known, index, own = pair.b, own, index
+            row_of = np.full(1 + index.max(initial=-1), ABSENT)
+            parent = fused.parents[:, known]
+            inside = (parent != ABSENT) & (parent < len(row_of))
+            row_of[parent[inside]] = np.flatnonzero(inside)
+            has = row_of[index] != ABSENT
+            known_rows.append(row_of[index[has]])
+            other_rows.append(own[has])
+            dissimilarity.append(pair.inliers.distance[has])
+        rows, others = one_to_one(
+            np.concatenate(known_rows), np.concatenate(other_rows), np.concatenate(dissimilarity)
+        )
         # associate the landmarks that are no inliers of an alignment
         unmatched = np.setdiff1d(np.arange(len(fused)), rows)
         unmatched_others = np.setdiff1d(np.arange(len(other)), others)
@@ -68,31 +87,6 @@ def fuse_landmarks_sequentially(
         others = np.concatenate([others, unmatched_others[more_others]])
         fused = fused.fuse_with(other, rows, others, 2 if planar else 3, fuse_pairs)
     return fused
-
-
-def _inliers(
-    fused: AlignedLandmarks, k: int, pairs: Sequence[AlignedPair]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows of the fused map and of map k that are inliers of an alignment.
-
-    Contradictory pairs are resolved in the order of their descriptor distance.
-    """
-    rows, others, dissimilarity = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty(0)]
-    for pair in pairs:
-        if k not in (pair.a, pair.b):
-            continue
-        known, index, own = pair.a, pair.inliers.index_a, pair.inliers.index_b
-        if k == pair.a:
-            known, index, own = pair.b, own, index
-        row_of = np.full(1 + index.max(initial=-1), ABSENT)
-        parent = fused.parents[:, known]
-        inside = (parent != ABSENT) & (parent < len(row_of))
-        row_of[parent[inside]] = np.flatnonzero(inside)
-        has = row_of[index] != ABSENT
-        rows.append(row_of[index[has]])
-        others.append(own[has])
-        dissimilarity.append(pair.inliers.distance[has])
-    return one_to_one(np.concatenate(rows), np.concatenate(others), np.concatenate(dissimilarity))
 
 
 def kalman_update(

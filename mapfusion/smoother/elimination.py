@@ -75,7 +75,10 @@ class ReducedPoses:
         after, before, link = place[1:], place[:-1], self.equations.link[1:]
         link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
         S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link
-        subtract_point_terms(self.obs, self.equations, self.reduced, S)
+        obs, coupling = self.obs, self.equations.coupling
+        couplings = coupling, reduced_couplings(obs, coupling, self.reduced)
+        rows, place = obs.by_landmark, obs.unknown_place
+        subtract_point_terms(rows, place, couplings, self.reduced, envelope.offset, S)
         return factor_in_envelope(S, envelope)
 
     def solve(self, factor: Factor, right: Float) -> Float:

@@ -19,7 +19,7 @@ and a step of the noise parameters (`noise_estimation`). No true poses are neede
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
@@ -89,10 +89,6 @@ class OdometryError:
         moved = odometry + np.einsum("kdc,c->kd", increment_jacobians(odometry), self.constants)
         moved[:, 2] = wrap(moved[:, 2])
         return moved
-
-    def corrected_log(self, log: RobotLog) -> RobotLog:
-        """Return the log with corrected increments."""
-        return replace(log, odometry=self.corrected(log.odometry))
 
 
 N_CONSTANTS = len(fields(OdometryError))

@@ -29,7 +29,7 @@ from mapfusion.geometry.numerics import (
     times_blocks,
     times_vectors,
 )
-from mapfusion.smoother.normal_equations import NormalEquations, PointEquations
+from mapfusion.smoother.normal_equations import PointEquations
 from mapfusion.smoother.problem import OrderedObservations
 
 
@@ -120,24 +120,8 @@ def point_covariances(obs: OrderedObservations, reduced: ReducedEquations) -> Po
     )
 
 
-def subtract_point_terms(
-    obs: OrderedObservations, equations: NormalEquations, reduced: ReducedEquations, S: Float
-) -> None:
-    """Subtract the terms of offsets and landmarks from the matrix of the poses.
-
-    Args:
-        obs: the observations.
-        equations: the normal equations.
-        reduced: the equations after the offsets are eliminated.
-        S: entries of the matrix of the unknown poses, in `obs.order.envelope`.
-    """
-    coupling, offset = equations.coupling, obs.order.envelope.offset
-    couplings = coupling, reduced_couplings(obs, coupling, reduced)
-    _subtract(obs.by_landmark, obs.unknown_place, couplings, reduced, offset, S)
-
-
 @kernel
-def _subtract(
+def subtract_point_terms(
     rows: tuple[np.ndarray, np.ndarray, np.ndarray],
     place: np.ndarray,
     couplings: tuple[Float, Float],
@@ -145,7 +129,16 @@ def _subtract(
     offset: np.ndarray,
     S: Float,
 ) -> None:
-    """Subtract the terms of each pair of observations; see `subtract_point_terms`."""
+    """Subtract the terms of offsets and landmarks from the matrix of the poses.
+
+    Args:
+        rows: `OrderedObservations.by_landmark`.
+        place: `OrderedObservations.unknown_place`.
+        couplings: those of poses and landmarks, as stated and from `reduced_couplings`.
+        reduced: the equations after the offsets are eliminated.
+        offset: offsets of the rows of the envelope.
+        S: entries of the matrix of the unknown poses, in the envelope.
+    """
     (starts, first_track, track_starts), (coupling, coupling_left) = rows, couplings
     by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
     for j in range(len(starts) - 1):

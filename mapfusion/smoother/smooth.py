@@ -154,26 +154,20 @@ def _inconsistent_pairs(
         n = before[own]
         i = np.repeat(own, n)
         j = np.arange(len(i)) - np.repeat(np.cumsum(n) - n - begin[own], n)
-        apart = _squared_distances(S[..., i] + S[..., j], off[..., i] - off[..., j]) > bound
+        # squared Mahalanobis distances from S = L D L'; 0 for singular S
+        sums, differences = S[..., i] + S[..., j], off[..., i] - off[..., j]
+        total, regular = np.zeros(sums.shape[-1]), np.ones(sums.shape[-1], dtype=bool)
+        least = [_SINGULAR * sums[r, r] for r in range(len(sums))]
+        for r in range(len(sums)):
+            regular &= sums[r, r] > least[r]
+            pivot = np.where(regular, sums[r, r], 1.0)
+            total += differences[r] ** 2 / pivot
+            share = sums[r + 1 :, r] / pivot
+            differences[r + 1 :] -= share * differences[r]
+            sums[r + 1 :, r + 1 :] -= share[:, None] * sums[r, r + 1 :]
+        apart = np.where(regular, total, 0.0) > bound
         found.append(np.stack([i[apart], j[apart]]))
     return np.concatenate(found, axis=1)
-
-
-def _squared_distances(S: Float, off: Float) -> Float:
-    """Return squared Mahalanobis distances (P,) of `off` (n, P); 0 for singular S (n, n, P).
-
-    Uses S = L D L' and overwrites both arguments.
-    """
-    total, regular = np.zeros(S.shape[-1]), np.ones(S.shape[-1], dtype=bool)
-    least = [_SINGULAR * S[k, k] for k in range(len(S))]
-    for k in range(len(S)):
-        regular &= S[k, k] > least[k]
-        pivot = np.where(regular, S[k, k], 1.0)
-        total += off[k] ** 2 / pivot
-        share = S[k + 1 :, k] / pivot
-        off[k + 1 :] -= share * off[k]
-        S[k + 1 :, k + 1 :] -= share[:, None] * S[k, k + 1 :]
-    return np.where(regular, total, 0.0)
 
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity). With a

@@ -131,10 +131,6 @@ class PairEvidence:
         """Motions between the two maps."""
         return tuple(each for each in self.motions if each.of == BETWEEN)
 
-    def n_motions(self, log10_false_alarms: float) -> int:
-        """Return the number of motions between the maps below a bound of the NFA, at least 1."""
-        return max(1, sum(each.log10_false_alarms <= log10_false_alarms for each in self.rivals))
-
     def repeats(self, log10_false_alarms: float) -> bool:
         """Return True if a motion of either map onto itself is below a bound of the NFA."""
         onto_self = (each for each in self.motions if each.of != BETWEEN)
@@ -306,7 +302,16 @@ class PairVerifier:
             regions = self.regions(alignment, evidence, evidence.region_m)
             log10_evidence = regions.log10_evidence(evidence.shares)
             told = {"log10_evidence": log10_evidence, "n_confirmed": regions.n_confirmed}
-            rival = self._best_rival(alignment, evidence)
+            # The regions count as evidence for the best other motion beyond chance, since two
+            # copies of a texture share the correspondences. Under a wrong motion the likelihood
+            # ratio of the regions exceeds 10^r with probability at most 10^-r (Markov), which
+            # lowers the NFA by r decades.
+            rivals = [
+                each
+                for each in self._others(alignment.T_a_b, evidence)
+                if each.log10_false_alarms - max(each.log10_evidence, 0.0) <= self._bound
+            ]
+            rival = max(rivals, key=lambda each: each.log10_evidence, default=None)
             passed = self._log10_ratio_passed(alignment, regions, evidence, rival)
             told |= {"n_contradicted": regions.n_contradicted, "log10_ratio_passed": passed}
             # a contradiction counts even together with the region that led to the alignment
@@ -447,20 +452,6 @@ class PairVerifier:
         none = RepeatedLandmarks.none(len(self._pairs.map_a), len(self._pairs.map_b))
         return self._viewed_maps.regions(BETWEEN, T_a_b, squares, none.joined(others))
 
-    def _best_rival(self, alignment: Alignment, evidence: PairEvidence) -> RivalMotion | None:
-        """Return the other motion beyond chance with the most evidence; None without one.
-
-        The regions count as well, since two copies of a texture share the correspondences. Under a
-        wrong motion the likelihood ratio of the regions exceeds 10^r with probability at most 10^-r
-        (Markov), which lowers the NFA by r decades.
-        """
-        rivals = [
-            each
-            for each in self._others(alignment.T_a_b, evidence)
-            if each.log10_false_alarms - max(each.log10_evidence, 0.0) <= self._bound
-        ]
-        return max(rivals, key=lambda each: each.log10_evidence, default=None)
-
     def _log10_ratio_passed(
         self,
         alignment: Alignment,
@@ -478,8 +469,9 @@ class PairVerifier:
         region, which is no evidence.
         """
         ratio = regions.log10_evidence(evidence.shares)
-        # the best of n wrong motions reaches the threshold n times as often (Boole)
-        passed = ratio - math.log10(evidence.n_motions(self._bound))
+        # the best of n motions beyond chance reaches the threshold n times as often (Boole)
+        n_motions = sum(each.log10_false_alarms <= self._bound for each in evidence.rivals)
+        passed = ratio - math.log10(max(1, n_motions))
         if rival is not None or evidence.repeats(self._bound) or regions.n_contradicted:
             return passed
         least_m = _TOUCHED * evidence.region_m
@@ -506,7 +498,9 @@ class PairVerifier:
         ratio = regions.log10_evidence(evidence.shares)
         if rival is not None and rival.log10_evidence > ratio - math.log10(settings.most_against):
             return f"{{told}}; so do {self._named(rival)}"
-        if self._is_one_place(alignment, extent_m):
+        smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
+        most = np.count_nonzero(alignment.inlier) > smaller / 2
+        if most and extent_m < settings.place_m:
             what = f"the maps show little else than this place of {extent_m:.2g} m"
             return f"{what}; what lies around it tells whether it is another's like"
         if math.log10(settings.least_ratio) <= log10_ratio_passed:
@@ -566,12 +560,6 @@ class PairVerifier:
             if 2 * np.sqrt(max(across_m2, 0.0)) <= self._settings.evidence.gate_m:
                 return True
         return False
-
-    def _is_one_place(self, alignment: Alignment, extent_m: float) -> bool:
-        """Return True if most of the smaller map agrees and lies within the size of a room."""
-        smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
-        most = np.count_nonzero(alignment.inlier) > smaller / 2
-        return bool(most) and extent_m < self._settings.evidence.place_m
 
     def _overconfidence_note(self, alignment: Alignment) -> str:
         """Say that the residuals contradict the covariances of the maps; empty if they do not.

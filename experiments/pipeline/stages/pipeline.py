@@ -429,7 +429,29 @@ def needs(pipeline: Pipeline) -> Iterator[Need]:
     """
     scenario = pipeline.scenario
     for robot in pipeline.robots:
-        yield from _of_filter(scenario, robot)
+        # the filter with its log
+        settings = scenario.slam.filter
+        n_frames, n_observations = robot.n_frames, robot.n_observations
+        where = "logs" if isinstance(robot.log, RecordedLog) else "drive.frames"
+        n_landmarks = _NEW_SHARE * n_observations
+        late = 1.0  # share of frames with distinct particles
+        if settings.resample_fraction > 0:
+            late = min(1.0, _FRAMES_A_PARTICLE * settings.n_particles / max(n_frames, 1))
+        a_particle = late * (
+            _DOUBLED * n_landmarks * _ROW_BYTES
+            + n_observations * _ASSOCIATION_BYTES
+            + n_frames * _POSE_BYTES
+        )
+        once = n_observations * (_OBSERVATION_BYTES + robot.descriptor_bytes)
+        once += _DOUBLED * n_landmarks * (_SLOT_BYTES + robot.descriptor_bytes)
+        of_particles = settings.n_particles * a_particle
+        setting = "slam.filter.n_particles" if of_particles > once else where
+        seen = f"{n_observations} observations in {n_frames} frames"
+        yield Need(of_particles + once, setting, f"{settings.n_particles} particles with {seen}")
+        # maps grow from zero, so their mean size is half that of the last one
+        n_rows = n_frames / scenario.evaluate.every * n_landmarks / 2
+        often = f"maps each {scenario.evaluate.every} of {n_frames} frames"
+        yield Need(n_rows * _EVALUATED_BYTES, "evaluate.every", often)
     if isinstance(scenario, Simulation):
         camera = scenario.camera
         pixels = camera.width_px * camera.height_px
@@ -451,31 +473,6 @@ def needs(pipeline: Pipeline) -> Iterator[Need]:
         n_bytes = _TEXEL_BYTES * (sum(faces) + sum(plans)) + _PAINTED_BYTES * painted
         why = f"walls of {sum(lengths):.0f} m around {wide:.0f} m x {deep:.0f} m, painted,"
         yield Need(n_bytes, "world.walls", why)
-
-
-def _of_filter(scenario: Scenario, robot: RobotStages) -> Iterator[Need]:
-    """Yield the memory of the filter with its log, and of the evaluated maps."""
-    settings = scenario.slam.filter
-    n_frames, n_observations = robot.n_frames, robot.n_observations
-    where = "logs" if isinstance(robot.log, RecordedLog) else "drive.frames"
-    n_landmarks, late = _NEW_SHARE * n_observations, 1.0  # share of frames with distinct particles
-    if settings.resample_fraction > 0:
-        late = min(1.0, _FRAMES_A_PARTICLE * settings.n_particles / max(n_frames, 1))
-    a_particle = late * (
-        _DOUBLED * n_landmarks * _ROW_BYTES
-        + n_observations * _ASSOCIATION_BYTES
-        + n_frames * _POSE_BYTES
-    )
-    once = n_observations * (_OBSERVATION_BYTES + robot.descriptor_bytes)
-    once += _DOUBLED * n_landmarks * (_SLOT_BYTES + robot.descriptor_bytes)
-    of_particles = settings.n_particles * a_particle
-    setting = "slam.filter.n_particles" if of_particles > once else where
-    why = f"{n_observations} observations in {n_frames} frames"
-    yield Need(of_particles + once, setting, f"{settings.n_particles} particles with {why}")
-    # maps grow from zero, so their mean size is half that of the last one
-    n_rows = n_frames / scenario.evaluate.every * n_landmarks / 2
-    often = f"maps each {scenario.evaluate.every} of {n_frames} frames"
-    yield Need(n_rows * _EVALUATED_BYTES, "evaluate.every", often)
 
 
 def memory_bytes() -> float:

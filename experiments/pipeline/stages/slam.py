@@ -12,8 +12,14 @@ import pyarrow as pa
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.tables import BOOL, FLOAT, INT, TEXT, fields, read_rows
 from mapfusion.attitude import read_attitude
-from mapfusion.datasets.log_consistency import Finding, Jump, check_log, gate_finding, without_jumps
-from mapfusion.datasets.odometry_noise import NoiseSource
+from mapfusion.datasets.log_consistency import (
+    Finding,
+    Jump,
+    NoiseSource,
+    check_log,
+    gate_finding,
+    without_jumps,
+)
 from mapfusion.datasets.relative_motion import MIN_MOTIONS
 from mapfusion.fastslam.filter import FastSlamParameters, StepResult
 from mapfusion.fastslam.mapping import association_for, run_log

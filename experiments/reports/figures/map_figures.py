@@ -165,7 +165,14 @@ def draw_correspondences(data: ResultTables) -> Figure:
     pair = next((pair for pair in data.pairs if len(data.last_correspondences(pair))), None)
     if pair is None:
         raise NothingToDraw("no correspondences between any two of the last maps")
-    position_a, position_b = (_without_outliers(data.landmarks_of(robot)[0]) for robot in pair)
+    positions = []  # outliers are NaN, so that row numbers are kept
+    for robot in pair:
+        position_m = data.landmarks_of(robot)[0]
+        low, high = np.quantile(position_m, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=0)
+        margin = _OUTLIER_MARGIN * (high - low)
+        inside = np.all((position_m >= low - margin) & (position_m <= high + margin), axis=1)
+        positions.append(np.where(inside[:, None], position_m, np.nan))
+    position_a, position_b = positions
     left, right = np.nanmin(position_a[:, 0]), np.nanmax(position_a[:, 0])
     shift_m = right - np.nanmin(position_b[:, 0]) + _GAP * (right - left)
     position_b += [shift_m, 0.0, 0.0]
@@ -193,14 +200,6 @@ def draw_correspondences(data: ResultTables) -> Figure:
     legend = figure.legend(loc="upper center", ncols=2, title=title, title_fontsize=7.5)
     _fill_page(figure, axes, legend)
     return figure
-
-
-def _without_outliers(position_m: Float) -> Float:
-    """Return positions, shape (N, 3), with outliers replaced by NaN; row numbers are kept."""
-    low, high = np.quantile(position_m, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=0)
-    margin = _OUTLIER_MARGIN * (high - low)
-    inside = np.all((position_m >= low - margin) & (position_m <= high + margin), axis=1)
-    return np.where(inside[:, None], position_m, np.nan)
 
 
 def classify_correspondences(data: ResultTables, pair: Pair) -> tuple[np.ndarray, tuple[str, str]]:

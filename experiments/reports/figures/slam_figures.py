@@ -42,7 +42,19 @@ class Moments(NamedTuple):
 
 def draw_tracks(data: ResultTables) -> Figure:
     """Draw the last consecutive key frames of one robot; colours give the age of each track."""
-    robot, frames = _consecutive_frames(data)
+    # end of the longest run of consecutive key frames of one robot
+    robot, best = "", {}
+    named = [(_KEY_FRAME.fullmatch(p.name), p) for p in (data.folder / "keyframes").glob("*.png")]
+    for each in data.robots:
+        run: dict[int, Path] = {}
+        own = {int(m["iteration"]): file for m, file in named if m and m["robot"] == each}
+        for k, file in sorted(own.items()):
+            run = (run if k - 1 in run else {}) | {k: file}
+            if len(run) > len(best):
+                robot, best = each, run
+    if not best:
+        raise NothingToDraw("no key frames were kept: no images, or none from `keep.images_at` on")
+    frames = dict(list(best.items())[-_MAX_FRAMES:])
     tracks = data.of_robot("tracks", robot)
     shown = tracks[tracks["iteration"].isin(list(frames))]
     if shown.empty:
@@ -80,22 +92,6 @@ def draw_tracks(data: ResultTables) -> Figure:
     scale = {"label": "age of the track (frames)", "ticks": MaxNLocator(integer=True)}
     figure.colorbar(colours, ax=list(panels), shrink=0.8, aspect=30, **scale)
     return figure
-
-
-def _consecutive_frames(data: ResultTables) -> tuple[str, dict[int, Path]]:
-    """Return the robot with the longest run of consecutive key frames, and the end of the run."""
-    robot, best = "", {}
-    named = [(_KEY_FRAME.fullmatch(p.name), p) for p in (data.folder / "keyframes").glob("*.png")]
-    for each in data.robots:
-        run: dict[int, Path] = {}
-        frames = {int(m["iteration"]): path for m, path in named if m and m["robot"] == each}
-        for iteration, path in sorted(frames.items()):
-            run = (run if iteration - 1 in run else {}) | {iteration: path}
-            if len(run) > len(best):
-                robot, best = each, run
-    if not best:
-        raise NothingToDraw("no key frames were kept: no images, or none from `keep.images_at` on")
-    return robot, dict(list(best.items())[-_MAX_FRAMES:])
 
 
 def draw_dispersion(data: ResultTables) -> Figure:
@@ -137,7 +133,15 @@ def draw_dispersion(data: ResultTables) -> Figure:
     else:
         robot = moments.closure.robot
         spread_m = spread[spread["robot"] == robot].set_index("iteration")["spread_m"]
-        _mark_moments(panels[robot], timeline, data.path_of(robot), spread_m, moments)
+        # mark the sets before and after the closure as A and B, on the path and the time line
+        box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
+        look: dict[str, Any] = {"textcoords": "offset points", "fontweight": "bold"}
+        boxed = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
+        for name, k, side in zip("AB", moments[1:], (9, -15), strict=True):
+            x, y = data.path_of(robot)[k]
+            panels[robot].annotate(name, xy=(x, y), xytext=(side, 9), **look, **boxed)
+            timeline.plot(k, spread_m[k], "o", color=BLACK, zorder=4)
+            timeline.annotate(name, xy=(k, spread_m[k]), xytext=(3, 3), **look)
         _draw_zooms(zooms, data, spread_m, moments)
     upper = plan.height_of_row(list(panels.values()), PAGE_WIDTH_IN * span / _GRID_COLUMNS)
     grid.set_height_ratios([upper, _LOWER_ROW_IN])
@@ -208,20 +212,6 @@ def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -
     plan.set_view(axes, path[:0], path, walls)
     scale = f", spread x{magnification}" if magnification > 1 else ""
     axes.set_title(f"{robot}: particles{scale}")
-
-
-def _mark_moments(
-    on_path: Axes, timeline: Axes, path: np.ndarray, spread_m: pd.Series, moments: Moments
-) -> None:
-    """Mark the sets before and after the closure as A and B, on the path and the time line."""
-    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
-    look: dict[str, Any] = {"textcoords": "offset points", "fontweight": "bold"}
-    boxed = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
-    for name, k, side in zip("AB", moments[1:], (9, -15), strict=True):
-        x, y = path[k]
-        on_path.annotate(name, xy=(x, y), xytext=(side, 9), **look, **boxed)
-        timeline.plot(k, spread_m[k], "o", color=BLACK, zorder=4)
-        timeline.annotate(name, xy=(k, spread_m[k]), xytext=(3, 3), **look)
 
 
 def _draw_zooms(

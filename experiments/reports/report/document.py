@@ -27,7 +27,7 @@ from experiments.evaluation.map_errors import last_fused
 from experiments.evaluation.metrics import Outcome
 from experiments.evaluation.result import require_result
 from experiments.evaluation.tables import read_provenance
-from experiments.reports import formatting
+from experiments.reports import layout
 from experiments.reports.export import write_text
 from experiments.reports.figures.drawing import FIGURES, caption
 from experiments.reports.figures.result_tables import (
@@ -416,7 +416,7 @@ def templates() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= {"text": formatting, "criteria": criteria, "shown": tables.SHOWN}
+    environment.globals |= {"text": layout, "criteria": criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
     environment.globals |= {
         "gross_m": GROSS_M,

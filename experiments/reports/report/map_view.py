@@ -16,7 +16,7 @@ import plotly.graph_objects as go
 
 from experiments.pipeline.stages.align import unpacked
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair
-from experiments.reports.formatting import metres, radians
+from experiments.reports.layout import metres, radians
 from experiments.reports.report.charts import NEUTRAL, Attributes, Styles, escaped, faint, thinned
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
@@ -260,7 +260,23 @@ class _Maps:
                 first = robot == self._data.robots[0]
                 yield _Layer(line | {"legendgroup": "true", "showlegend": first}, robot=robot)
         for pair in self._data.pairs:
-            yield from self._pairs_of_landmarks(pair)
+            # Lines of correspondences, for the first placement and the truth. Lines for all
+            # placements would make the file large: their ends are points of the world.
+            for placement in self.placements[pair]:
+                if placement not in {self.placements[pair][0], TRUTH}:
+                    continue
+                for wanted, kind in ((False, "false"), (True, "true")):
+                    look = {"width": 1.1} if wanted else {"width": 0.8, "dash": "dot"}
+                    meta = {"layer": kind, "pair": list(pair), "placement": list(placement)}
+                    lines = _line(f"{kind} correspondences", [], **look)
+                    yield _Layer(
+                        lines | {"meta": meta, "opacity": 0.9 if wanted else 0.45},
+                        lambda k, pair=pair, placement=placement, wanted=wanted: _xy(
+                            self._ends(pair, placement, k, wanted)
+                        ),
+                        pair=pair,
+                        placement=placement,
+                    )
         for robot in self._data.robots:
             yield from self._layers_of_robot(robot)
         for pair in self._data.pairs:
@@ -295,27 +311,6 @@ class _Maps:
                     lambda k, pair=pair, placement=placement: spread(
                         self._placed(pair, placement, k)
                     ),
-                )
-
-    def _pairs_of_landmarks(self, pair: Pair) -> Iterator[_Layer]:
-        """Yield lines of correspondences, for the first placement and the truth.
-
-        Lines for all placements would make the file large: their ends are points of the world.
-        """
-        for placement in self.placements[pair]:
-            if placement not in {self.placements[pair][0], TRUTH}:
-                continue
-            for wanted, kind in ((False, "false"), (True, "true")):
-                look = {"width": 1.1} if wanted else {"width": 0.8, "dash": "dot"}
-                meta = {"layer": kind, "pair": list(pair), "placement": list(placement)}
-                lines = _line(f"{kind} correspondences", [], **look)
-                yield _Layer(
-                    lines | {"meta": meta, "opacity": 0.9 if wanted else 0.45},
-                    lambda k, placement=placement, wanted=wanted: _xy(
-                        self._ends(pair, placement, k, wanted)
-                    ),
-                    pair=pair,
-                    placement=placement,
                 )
 
     def _ends(self, pair: Pair, placement: Placement, k: int, wanted: bool) -> Float:

@@ -12,8 +12,7 @@ import pytest
 
 from experiments.evaluation import tables
 from experiments.reports import layout
-from experiments.reports.formatting import plain
-from experiments.reports.layout import print_lines, print_table
+from experiments.reports.layout import plain, print_lines, print_table
 from experiments.reports.run_screen import (
     edge_lines,
     not_run_lines,

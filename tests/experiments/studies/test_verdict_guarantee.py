@@ -12,8 +12,7 @@ from scipy.stats import binom
 
 from experiments.pipeline.tables import read_rows
 from experiments.scenario.suite import parse_seeds
-from experiments.studies.run_tables import find_runs
-from experiments.studies.verdict_guarantee import (
+from experiments.studies.refusal_rates import (
     CANDIDATES,
     SHARES,
     THRESHOLDS,
@@ -24,6 +23,7 @@ from experiments.studies.verdict_guarantee import (
     lowest_certified,
     upper_bound,
 )
+from experiments.studies.run_tables import find_runs
 from tests.benchmarks.runs_without_common_ground import commands
 from tests.helpers.made_up_runs import write_result, write_sweep
 from tests.helpers.tiny_scenario import assert_refused, command

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.datasets.log_consistency import check_log
-from mapfusion.datasets.odometry_noise import estimate_odometry_noise
+from mapfusion.datasets.log_consistency import check_log, estimate_odometry_noise
 from mapfusion.datasets.relative_motion import PLANAR, Motions
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float

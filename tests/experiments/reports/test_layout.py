@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from experiments.reports.formatting import listed, metres, percent, ratio, two_digits
+from experiments.reports.layout import listed, metres, percent, ratio, two_digits
 
 
 @pytest.mark.parametrize(
