@@ -31,8 +31,8 @@ _TOLERANCES = (1.0, 0.25, 0.06, 0.015, 0.0)
 # Condition number of links at a single place, which leave the rotation undetermined.
 _MAX_CONDITION = 1e12
 _MIN_PLANAR_LINKS = 2  # to determine a planar motion; their distance is checked as well
-# Factors tried on stated covariances, and the number of frames for the trial: observations whose
-# covariances are in a wrong unit still determine the motion.
+# Factors tried on the mean of stated variances, and the number of frames for the trial. Points
+# whose covariances are in a wrong unit still determine the motion.
 _COVARIANCE_FACTORS, _TRIAL_FRAMES = (1.0, 1e2, 1e4, 1e6), 40
 # Largest distance of a point to its nearest neighbour in the next frame, over the distance to the
 # second nearest one: Lowe's ratio test, stricter than for descriptors since a wrong neighbour may
@@ -190,15 +190,20 @@ def _planar_motion(
 
 
 def _pair_motion(
-    log: RobotLog, starts: np.ndarray, first: int, second: int, factor: float
+    log: RobotLog, starts: np.ndarray, first: int, second: int, factor: float | None
 ) -> _PairMotion | None:
     """Return the motion between two frames; None if the links do not determine it.
 
-    Stated covariances are multiplied by `factor`.
+    A covariance is as stated without a factor. With a factor, the errors are equal in all
+    directions, and their variance is `factor` times the mean of the stated variances.
     """
     a, b = links(log, starts, first, second)
     seen = log.observations
-    p, S = seen.position_m, factor * seen.covariance_m2
+    p, S = seen.position_m, seen.covariance_m2
+    if factor is not None:
+        axes = np.diag([1.0, 1.0, 0.0 if log.planar else 1.0])
+        mean = np.trace(S, axis1=1, axis2=2) / np.trace(axes)
+        S = factor * mean[:, None, None] * axes
     if log.planar and len(a) >= _MIN_PLANAR_LINKS:
         return _planar_motion(p[a, :2], S[a, :2, :2], p[b, :2], S[b, :2, :2])
     if log.planar or len(a) < MIN_LINKS:
@@ -221,10 +226,11 @@ def _motion_vectors(T: Float) -> Float:
     return vectors
 
 
-def observed_motions(log: RobotLog, lag: int = 1, factor: float = 1.0) -> Motions:
+def observed_motions(log: RobotLog, lag: int = 1, factor: float | None = None) -> Motions:
     """Return the motions over every `lag` frames, for the pairs of frames that share enough points.
 
-    Stated covariances are multiplied by `factor`.
+    A factor replaces the stated covariances by equal errors in all directions, whose variance is
+    `factor` times the mean of the stated variances.
     """
     starts, frames, found = log.frame_starts(), [], list[_PairMotion]()
     for end in range(lag, len(log), lag):
@@ -263,20 +269,21 @@ def observed_spans(log: RobotLog) -> list[Motions]:
     """Return observed motions from frame to frame and over spans of 2, 4, 8, ... frames.
 
     Stated covariances that are far too small, such as covariances in a wrong unit, are enlarged
-    until the motion is determined for most frames that share points.
+    until the motion is determined for most frames that share points. They are made equal in all
+    directions: of ranges and bearings, a wrong unit affects only the ranges.
     """
-    factor = 1.0
+    factor = None
     steps = observed_motions(log)
     min_links = _MIN_PLANAR_LINKS if log.planar else MIN_LINKS
     if 2 * len(steps) < len(log) - 1:
         starts = log.frame_starts()
         tried = np.unique(np.linspace(1, len(log) - 1, _TRIAL_FRAMES).astype(int)).tolist()
         frames = [k for k in tried if len(links(log, starts, k - 1, k)[0]) >= min_links]
-        for factor in _COVARIANCE_FACTORS:
+        for factor in (None, *_COVARIANCE_FACTORS):
             found = [_pair_motion(log, starts, k - 1, k, factor) for k in frames]
             if 2 * sum(motion is not None for motion in found) >= len(frames):
                 break
-        steps = steps if factor == 1 else observed_motions(log, 1, factor)
+        steps = steps if factor is None else observed_motions(log, 1, factor)
     return [steps, *(observed_motions(log, lag, factor) for lag in _span_lengths(len(log)))]
 
 

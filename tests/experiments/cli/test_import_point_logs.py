@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +16,19 @@ from tests.helpers.tiny_scenario import command
 from tests.mapfusion.datasets.test_point_logs import write_recording
 
 PAGE = Path(__file__).parents[3] / "experiments" / "docs" / "point_logs.md"
+FROM_DEGREES, EXAMPLE = re.findall(
+    r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+)
 
 
 def test_the_worked_example_maps_the_trees(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    text = PAGE.read_text(encoding="utf-8")
-    from_degrees, program = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names: dict[str, np.ndarray] = {}
-    exec(program, names)
-    assert "np.radians(table[column])" in from_degrees
-    lines = [line for line in text.splitlines() if line.startswith("mapfusion ")]
+    exec(EXAMPLE, names)
+    page = PAGE.read_text(encoding="utf-8").splitlines()
+    lines = [line for line in page if line.startswith("mapfusion ")]
     imported, mapped = (command(capsys, *shlex.split(line)[1:]) for line in lines)
     assert (imported.code, mapped.code) == (0, 0)
     assert "60 frames" in imported.out
@@ -43,6 +45,48 @@ def test_the_worked_example_maps_the_trees(
     # Some forty sightings of 0.05 m each leave about a centimetre.
     assert np.sqrt(np.mean(np.sum(apart**2, axis=1))) < 0.03
     assert np.hypot(*T[:2]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "said"),
+    [
+        ("range_m", lambda r: 1000 * r, "are the observed ones millimetres?"),
+        ("bearing_rad", lambda b: -b, "the heading has the other sign"),
+        ("bearing_rad", lambda b: np.mod(np.pi / 2 - b, 2 * np.pi), "y points ahead"),
+    ],
+    ids=["millimetres", "mirrored", "exchanged axes"],
+)
+def test_mistakes_in_ranges_without_labels_are_told(
+    column: str,
+    change: Callable[[pd.Series], pd.Series],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(EXAMPLE, {})
+    table = pd.read_csv("orchard/ranges.csv")
+    table.assign(**{column: change(table[column])}).to_csv("orchard/ranges.csv", index=False)
+    noise = ("--param", "range_sigma_m=0.05", "--param", "bearing_sigma_rad=0.01")
+    told = command(capsys, "import", "ranges", "orchard", "-o", "logs", *noise)
+    assert told.code == 1
+    assert said in told.err
+
+
+def test_the_conversion_from_degrees(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(EXAMPLE, {})
+    monkeypatch.chdir("orchard")
+    tables = {
+        column: (f"{name}.csv", pd.read_csv(f"{name}.csv"))
+        for name, column in [("odometry", "turn_rate_rad_s"), ("ranges", "bearing_rad")]
+    }
+    for column, (file, table) in tables.items():
+        table.assign(**{column: np.degrees(table[column])}).to_csv(file, index=False)
+    exec(FROM_DEGREES, {})
+    for file, table in tables.values():
+        pd.testing.assert_frame_equal(pd.read_csv(file), table)
 
 
 @pytest.mark.parametrize(

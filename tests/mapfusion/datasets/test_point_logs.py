@@ -173,15 +173,20 @@ def test_noise_must_be_stated_and_bearings_are_radians(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "unit"),
-    [("points", "theta_rad", "degrees"), ("ranges", "turn_rate_rad_s", "degrees/s")],
+    ("kind", "name", "unit", "frame_s", "labels"),
+    [
+        ("points", "theta_rad", "degrees", 0.0, True),
+        ("points", "theta_rad", "degrees", 2.0, True),
+        ("points", "theta_rad", "degrees", 0.0, False),
+        ("ranges", "turn_rate_rad_s", "degrees/s", 0.0, True),
+        ("ranges", "turn_rate_rad_s", "degrees/s", 2.0, True),
+    ],
 )
-@pytest.mark.parametrize("frame_s", [0.0, 2.0])
 def test_odometry_in_degrees_is_refused(
-    kind: str, name: str, unit: str, frame_s: float, tmp_path: Path
+    kind: str, name: str, unit: str, frame_s: float, labels: bool, tmp_path: Path
 ) -> None:
     """In a frame of 2 s the heading changes by 29 degrees, 29 radians if it is taken so."""
-    write_recording(tmp_path / "R1", {}, kind)
+    write_recording(tmp_path / "R1", {}, kind, labels)
     path = tmp_path / "R1" / "odometry.csv"
     table = pd.read_csv(path)
     table.assign(**{name: np.degrees(table[name])}).to_csv(path, index=False)

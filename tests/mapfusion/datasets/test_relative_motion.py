@@ -1,5 +1,7 @@
 """Observed motions against the true ones, their covariance, and compositions over spans."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from mapfusion.datasets.relative_motion import (
     observed_motions,
     odometry_motions,
     poses_from_increments,
+    tracked_by_position,
 )
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.se2 import between, rotation, wrap
@@ -40,6 +43,25 @@ def test_planar_motions_and_their_covariance() -> None:
         own = found.covariance[0][np.ix_([0, 1, 5], [0, 1, 5])]
         off.append(error @ np.linalg.solve(own, error))
     assert np.mean(off) == pytest.approx(3, abs=0.7)  # chi-square of 3 degrees of freedom
+
+
+@pytest.mark.parametrize("step", [(0.1, 0, 0.05), (0.8, 0, 0.3)], ids=["slow", "fast"])
+def test_points_without_names_are_tracked_by_position(step: tuple[float, ...]) -> None:
+    """Tracks are nearly the labels, also if the robot moves as far as points are apart."""
+    log = circling_log(60, 0.01, poses=poses_from_increments(np.tile(step, (60, 1))))
+    seen, starts = log.observations, log.frame_starts()
+    tracked = tracked_by_position(replace(log, observations=replace(seen, label=None)))
+    counts = np.zeros(3)  # pairs of one label, of one track, and of both
+    for frame in range(1, len(log)):
+        a, b = (slice(starts[k], starts[k + 1]) for k in (frame - 1, frame))
+        of_label, of_track = (
+            names[a][:, None] == names[b]
+            for names in (seen.label, tracked.observations.track)
+            if names is not None
+        )
+        counts += of_label.sum(), of_track.sum(), (of_label & of_track).sum()
+    assert counts[2] > 0.85 * counts[0]
+    assert counts[2] > 0.98 * counts[1]
 
 
 def test_spans_compose_motions() -> None:
