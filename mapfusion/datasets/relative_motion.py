@@ -138,8 +138,8 @@ def _tracks(log: RobotLog, motion: Float) -> np.ndarray:
             continue
         before, after = position[a], position[b].copy()
         after[:, :2] = after[:, :2] @ rotation(motion[frame, 2]).T + motion[frame, :2]
-        distance, nearest = KDTree(before).query(after, k=2)
-        _, back = KDTree(after).query(before)
+        distance, nearest = (np.asarray(each) for each in KDTree(before).query(after, k=2))
+        back = np.asarray(KDTree(after).query(before)[1])
         clear = distance[:, 0] < _NEIGHBOUR_RATIO * distance[:, 1]
         clear[clear] &= back[nearest[clear, 0]] == np.flatnonzero(clear)
         track[b[clear]] = track[a[nearest[clear, 0]]]
