@@ -183,7 +183,7 @@ class _Record:
         return Drawn(shown, [skipped] if skipped else [], {name: elapsed_s})
 
     def write(self, outcomes: Mapping[str, Drawn]) -> None:
-        """Record the present state of the figures."""
+        """Record the present state of the figures, in the order of their names."""
         figures = {
             name: self._now[name]
             | {
@@ -191,7 +191,7 @@ class _Record:
                 "skipped": "".join(drawn.skipped),
                 "elapsed_s": drawn.elapsed_s[name],
             }
-            for name, drawn in outcomes.items()
+            for name, drawn in sorted(outcomes.items())
         }
         write_json(self._file, {"figures": figures})
 

@@ -1,6 +1,7 @@
 """Tests of each figure, on ordinary and on degenerate results."""
 
 import hashlib
+import json
 import re
 import shutil
 from pathlib import Path
@@ -53,6 +54,8 @@ def test_all_figures_are_drawn(trio_copy: Path) -> None:
     assert sorted(file.name for file in (trio_copy / "figures").iterdir()) == sorted(
         [*(file.name for file in files), *(f"{name}.txt" for name in FIGURES), "drawn.json"]
     )
+    recorded = json.loads((trio_copy / "figures" / "drawn.json").read_text())["figures"]
+    assert list(recorded) == sorted(FIGURES)  # whichever was drawn first
 
 
 @pytest.mark.parametrize("name", ["fig01_tracks", "fig06_aligner_time", "fig08_fused_landmark"])
