@@ -435,7 +435,7 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
         noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
         if not (noisier and _agrees_on_average(spans[0], noisier)):
             return LogConsistency((finding,), (), found)
-    jumps = tuple(find_jumps(log, spans[0], noise)) if named else ()
+    jumps = tuple(find_jumps(log, spans[0], noise))
     return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found)
 
 

@@ -57,6 +57,8 @@ _UNITS_M = {1000.0: "millimetres", 100.0: "centimetres", 1 / 0.3048: "feet"}
 _DEGREES = 180 / np.pi
 _LEAST_CHORD = 0.05  # chord over arc; shorter chords are dominated by noise
 _UNIT_TOLERANCE = 0.15  # relative deviation of a ratio from that of a unit
+# Largest factor between them if noise keeps the unit from explaining the motions.
+_UNIT_FACTOR = 2.0
 
 
 class Agreement(NamedTuple):
@@ -270,7 +272,11 @@ def likely_cause(
         return f"its times look {' or '.join(itertools.islice(each, _MAX_OFFSETS))}"
     plain = compare(observed, Stated(poses, noise))
     if plain.shift.ratio < _STANDS_STILL:
-        return "it says that the robot stands still"
+        still = "it says that the robot stands still"
+        for per_metre, unit in _UNITS_M.items():
+            if 1 / _UNIT_FACTOR < plain.shift.ratio * per_metre < _UNIT_FACTOR:
+                return f"{still}, or the observed distances are {unit}"
+        return still
     if plain.shift.median > 0 and plain.turn.median > 0:
         shift, turn = motions_of_poses(poses, observed.start, observed.end)
         scales = plain.shift.ratio, plain.turn.ratio

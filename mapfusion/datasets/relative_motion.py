@@ -117,17 +117,22 @@ def links(
 def tracked_by_position(log: RobotLog) -> RobotLog:
     """Return the log with tracks of points that are nearest neighbours in consecutive frames.
 
-    The neighbours are sought twice: at the positions that the odometry predicts, and at those of a
-    robot that does not move. A wrong odometry gives few neighbours, which seldom agree with one
-    motion. The tracks are those with more points that agree; the odometry is preferred.
+    The neighbours in a frame are sought at the positions that a motion since the frame before
+    predicts: the odometry, no motion, or the odometry of the frame before. A wrong prediction gives
+    few neighbours, which seldom agree with one motion. Each frame takes the prediction with the
+    most points that agree; the odometry is preferred.
     """
-    tracks = [_tracks(log, motion) for motion in (log.odometry, np.zeros_like(log.odometry))]
-    tracked = [replace(log, observations=replace(log.observations, track=t)) for t in tracks]
-    return max(tracked, key=lambda each: int(observed_spans(each)[0].n_agree.sum()))
+    previous = np.concatenate([np.zeros((1, 3)), log.odometry[:-1]])
+    motions = np.stack([log.odometry, np.zeros_like(previous), previous])
+    n_agree = np.zeros(motions.shape[:2], dtype=np.int64)
+    for n, motion in zip(n_agree, motions, strict=True):
+        observed, _ = _observed_steps(_tracked(log, motion))
+        n[observed.end] = observed.n_agree
+    return _tracked(log, motions[n_agree.argmax(axis=0), np.arange(len(log))])
 
 
-def _tracks(log: RobotLog, motion: Float) -> np.ndarray:
-    """Return the track of each observation, shape (N,), given the motions (T, 3) between frames."""
+def _tracked(log: RobotLog, motion: Float) -> RobotLog:
+    """Return the log with tracks, given the predicted motions (T, 3) since the frame before."""
     from scipy.spatial import KDTree
 
     starts, position = log.frame_starts(), log.observations.position_m
@@ -143,7 +148,7 @@ def _tracks(log: RobotLog, motion: Float) -> np.ndarray:
         clear = distance[:, 0] < _NEIGHBOUR_RATIO * distance[:, 1]
         clear[clear] &= back[nearest[clear, 0]] == np.flatnonzero(clear)
         track[b[clear]] = track[a[nearest[clear, 0]]]
-    return track
+    return replace(log, observations=replace(log.observations, track=track))
 
 
 def _planar_motion(
@@ -266,7 +271,13 @@ def odometry_motions(log: RobotLog, noise: MotionNoise) -> Motions:
 
 
 def observed_spans(log: RobotLog) -> list[Motions]:
-    """Return observed motions from frame to frame and over spans of 2, 4, 8, ... frames.
+    """Return observed motions from frame to frame and over spans of 2, 4, 8, ... frames."""
+    steps, factor = _observed_steps(log)
+    return [steps, *(observed_motions(log, lag, factor) for lag in _span_lengths(len(log)))]
+
+
+def _observed_steps(log: RobotLog) -> tuple[Motions, float | None]:
+    """Return observed motions from frame to frame, and the factor on the stated variances.
 
     Stated covariances that are far too small, such as covariances in a wrong unit, are enlarged
     until the motion is determined for most frames that share points. They are made equal in all
@@ -275,7 +286,7 @@ def observed_spans(log: RobotLog) -> list[Motions]:
     factor = None
     steps = observed_motions(log)
     min_links = _MIN_PLANAR_LINKS if log.planar else MIN_LINKS
-    if 2 * len(steps) < len(log) - 1:
+    if 2 * len(steps.end) < len(log) - 1:
         starts = log.frame_starts()
         tried = np.unique(np.linspace(1, len(log) - 1, _TRIAL_FRAMES).astype(int)).tolist()
         frames = [k for k in tried if len(links(log, starts, k - 1, k)[0]) >= min_links]
@@ -284,7 +295,7 @@ def observed_spans(log: RobotLog) -> list[Motions]:
             if 2 * sum(motion is not None for motion in found) >= len(frames):
                 break
         steps = steps if factor is None else observed_motions(log, 1, factor)
-    return [steps, *(observed_motions(log, lag, factor) for lag in _span_lengths(len(log)))]
+    return steps, factor
 
 
 def composed_spans(steps: Motions, n_frames: int) -> list[Motions]:

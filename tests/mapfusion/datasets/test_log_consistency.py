@@ -98,7 +98,7 @@ def test_mirrored_and_swapped_observations_without_labels_are_named(sound: Robot
     mistakes = {
         "heading has the other sign": [1, -1, 1] * seen.position_m,
         "y points ahead": seen.position_m[:, [1, 0, 2]],
-        "are the observed ones millimetres": 1000 * seen.position_m,
+        "are millimetres": 1000 * seen.position_m,
     }
     for words, position in mistakes.items():
         log = replace(bare, observations=replace(seen, position_m=position))
@@ -147,6 +147,8 @@ def test_single_jumps_count_for_nothing(name: str, sound: RobotLog) -> None:
         assert off @ np.linalg.solve(jump.covariance, off) < 25
         assert f"frame {jump.frame}: odometry" in finding.text
     assert error_m(*without_jumps(log, found.jumps)) < 0.03
+    bare = check_log(without_names(log), NOISE)
+    assert tuple(jump.frame for jump in bare.jumps) == frames
 
 
 def test_a_jump_is_told_in_metres(sound: RobotLog) -> None:
