@@ -419,6 +419,8 @@ class LogConsistency(NamedTuple):
 def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
     """Compare a log's odometry with the motion that its observations show.
 
+    Observations without labels, tracks and descriptors are tracked by their positions.
+
     Args:
         log: log with measured odometry. Odometry that was estimated from the observations agrees
             with them by construction.

@@ -57,7 +57,8 @@ _UNITS_M = {1000.0: "millimetres", 100.0: "centimetres", 1 / 0.3048: "feet"}
 _DEGREES = 180 / np.pi
 _LEAST_CHORD = 0.05  # chord over arc; shorter chords are dominated by noise
 _UNIT_TOLERANCE = 0.15  # relative deviation of a ratio from that of a unit
-# Largest factor between them if noise keeps the unit from explaining the motions.
+# Largest factor between a ratio and that of a unit which is suggested, where noise keeps the unit
+# from explaining the motions.
 _UNIT_FACTOR = 2.0
 
 

@@ -453,7 +453,7 @@ def _read_odometry(path: Path, measured_s: Float, radians: float = 1.0) -> Poses
         turn = step_s * float(np.median(np.abs(velocities[:, 1]))) if given[1] else 0.0
         if turn > np.pi:
             found = f"the robot turns by {turn:.3g} rad between two measurements (median); "
-            found += "if it holds degrees/s, multiply it by pi/180"
+            found += "are all times in seconds? if it holds degrees/s, multiply it by pi/180"
             raise InputError(f"{path}: column {_VELOCITY_FIELDS[1]}: {found}")
 
     def poses_at(wanted_s: Float) -> Float:

@@ -271,7 +271,10 @@ def odometry_motions(log: RobotLog, noise: MotionNoise) -> Motions:
 
 
 def observed_spans(log: RobotLog) -> list[Motions]:
-    """Return observed motions from frame to frame and over spans of 2, 4, 8, ... frames."""
+    """Return observed motions from frame to frame and over spans of 2, 4, 8, ... frames.
+
+    Stated covariances that are far too small are enlarged (`_observed_steps`).
+    """
     steps, factor = _observed_steps(log)
     return [steps, *(observed_motions(log, lag, factor) for lag in _span_lengths(len(log)))]
 

@@ -212,6 +212,16 @@ def test_turn_rates_in_degrees_are_refused_without_labels(tmp_path: Path) -> Non
         import_recording("ranges", tmp_path / "R1", tmp_path / "logs", NOISE["ranges"])
 
 
+def test_all_times_in_milliseconds_are_told(tmp_path: Path) -> None:
+    write_recording(tmp_path / "R1", {}, "ranges", labels=False)
+    for name in ("odometry", "ranges"):
+        path = tmp_path / "R1" / f"{name}.csv"
+        table = pd.read_csv(path)
+        table.assign(time_s=1000 * table["time_s"]).to_csv(path, index=False)
+    with pytest.raises(InputError, match="are all times in seconds"):
+        import_recording("ranges", tmp_path / "R1", tmp_path / "logs", NOISE["ranges"])
+
+
 @pytest.mark.parametrize("factor", [1e3, 1e6, 1e9])
 def test_odometry_with_times_in_another_unit_is_refused(factor: float, tmp_path: Path) -> None:
     write_recording(tmp_path / "R1", {}, "ranges")
