@@ -315,6 +315,9 @@ def why_angle_is_open(pairs: Pairs, drift_m2: float = 0.0, which: str = " that a
     ):
         if lacks_extent(p, covariance, drift_m2, 1):
             n = len(pairs)
+            if n > 1 and drift_m2 > 0 and not lacks_extent(p, covariance, 0.0, 1):
+                off = f"under the best one they are {math.sqrt(drift_m2):.2g} m off"
+                return f"no motion fits the {n} pairs: {off}, too much for the extent of map {name}"
             lie = f"pairs{which} lie" if n > 1 else f"pair{which.replace('agree', 'agrees')} lies"
             sigma_m = math.sqrt(np.median(covariance[:, [0, 1], [0, 1]]) + drift_m2)
             noise = f"noise of {sigma_m:.2g} m can tell"

@@ -47,13 +47,13 @@ from mapfusion.verification.registration import (
     PairRegistration,
     Registered,
     Registration,
-    common_unit,
 )
 from mapfusion.verification.rivals import (
     DISTINCT_M,
     SupportedMotion,
     distinct_motions,
     is_mirrored,
+    other_unit,
 )
 from mapfusion.verification.verdict import PairEvidence
 
@@ -163,16 +163,24 @@ class MapAlignment:
             image = "look like mirror images of each other: check the signs of y and "
             image += "theta, and the order of x and y"
             return f"{a} and {b} {image}"
-        if unit := common_unit(self.map_a, self.map_b, self.matching, refinement):
+        unit, in_unit = other_unit(self.ready.pairs, self._acceptance, refinement, self.matching)
+        if unit and all(in_unit):
             return f"{a} and {b} fit each other as maps in {unit}: write both in metres"
+        if unit:
+            name, other = (a, b) if in_unit[0] else (b, a)
+            return f"{name} fits {other} if it is in {unit}: write it in metres"
         return ""
+
+    @property
+    def _note(self) -> str:
+        return self.ready.pairs.note(int(np.count_nonzero(self.inlier)))
 
     @property
     def hint(self) -> str:
         """Property of the maps that may explain a refusal; empty if none is found."""
         if self.accepted or self.status in NOT_RUN:
             return ""
-        return self.ready.pairs.note(int(np.count_nonzero(self.inlier))) or self.cause
+        return self.ready.pairs.scale_note or self.cause or self._note
 
     @property
     def far_away(self) -> str:
@@ -212,7 +220,7 @@ class MapAlignment:
     @property
     def refusal(self) -> str:
         """Reason why the motion is not accepted, and a remedy."""
-        reason = self.reason.removesuffix(f"; {self.hint}")
+        reason = self.reason.removesuffix(f"; {self._note}")
         why = _sentence(f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}")
         heights = self.registered.refined.heights
         asks = reason.endswith("?") and not self.hint  # for a likely cause, such as another unit

@@ -15,8 +15,7 @@ from mapfusion.align.alignment import (
     Status,
     supported,
 )
-from mapfusion.align.clique import Clique
-from mapfusion.align.correspondences import Correspondences, HeightGate, MatchParameters, match
+from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.align.frames import (
     HeightDifference,
     Overlap,
@@ -26,7 +25,7 @@ from mapfusion.align.frames import (
     origin_of,
 )
 from mapfusion.align.refinement import Refinement
-from mapfusion.align.rigid_motion import residual_covariances, residuals
+from mapfusion.align.rigid_motion import fit_rigid, residual_covariances, residuals
 from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Verdict
@@ -296,6 +295,35 @@ def heights_of(pairs: Pairs, alignment: Alignment, gate_m: float) -> HeightDiffe
 
 # Probability that independent observations of a landmark agree as closely as copies do.
 _COPY_CHANCE = 1e-6
+_MOST_COPIES = 500  # pairs whose distances are compared
+
+
+def _coincident(pairs: Pairs, T_a_b: Float) -> np.ndarray:
+    """Mark the pairs, bool (N,), whose residuals are far below their standard deviation."""
+    e = residuals(T_a_b, pairs.p_a, pairs.p_b)
+    S = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
+    square = np.vecdot(e, np.linalg.solve(S + 1e-18 * np.eye(2), e[..., None])[..., 0])
+    return square <= chi_square_bound(_COPY_CHANCE, 2)
+
+
+def _motion_of_copies(pairs: Pairs, T_a_b: Float) -> Float:
+    """Return the motion (3,) of the pairs that may be copies; `T_a_b` if fewer than three may be.
+
+    A fused map keeps the landmarks of one map that no other map has. Their distances to each other
+    are equal in both maps. The other pairs displace the motion of all pairs by more than that.
+    """
+    some = pairs[:: -(-len(pairs) // _MOST_COPIES)]
+    own = residual_covariances(T_a_b, some.covariance_a, some.covariance_b)
+    variance = np.trace(own, axis1=1, axis2=2) / 2
+    apart_a, apart_b = (
+        np.linalg.norm(p[:, None, :2] - p[None, :, :2], axis=2) for p in (some.p_a, some.p_b)
+    )
+    square = (apart_a - apart_b) ** 2 / (variance[:, None] + variance + 1e-18)
+    equal = square <= chi_square_bound(_COPY_CHANCE, 1)
+    group = np.flatnonzero(equal[np.argmax(np.sum(equal, axis=1))])
+    if len(group) < MIN_PAIRS:
+        return T_a_b
+    return np.array(fit_rigid(some.p_a, some.p_b, group))
 
 
 def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
@@ -305,10 +333,10 @@ def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
     deviation.
     """
     used = pairs[alignment.inlier]
-    e = residuals(alignment.T_a_b, used.p_a, used.p_b)
-    S = residual_covariances(alignment.T_a_b, used.covariance_a, used.covariance_b)
-    square = np.vecdot(e, np.linalg.solve(S + 1e-18 * np.eye(2), e[..., None])[..., 0])
-    coincide = square <= chi_square_bound(_COPY_CHANCE, 2)
+    if not len(used):
+        return ""
+    coincide = _coincident(used, alignment.T_a_b)
+    coincide |= _coincident(used, _motion_of_copies(used, alignment.T_a_b))
     copied = coincide.copy()
     a, b, kind = pairs.map_a.descriptor, pairs.map_b.descriptor, pairs.map_a.descriptor_kind
     # bits that do not differ may be those of another observation
@@ -324,40 +352,6 @@ def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
         f"{n} of {of} pairs are the same observations in {names}: the maps are not independent, "
         "and fused covariances are too small"
     )
-
-
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}  # in metres
-
-
-def common_unit(
-    map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters, refinement: Refinement
-) -> str:
-    """Return the unit of length in which two maps fit each other; empty if there is none.
-
-    Two maps in millimetres differ by many times the gates of metres. In their unit most of the
-    correspondences agree.
-    """
-    for unit, size_m in _UNITS.items():
-        a, b = (
-            replace(
-                each,
-                position_m=each.position_m * size_m,
-                covariance_m2=each.covariance_m2 * size_m**2,
-                joint=None,
-                viewing=None,
-            )
-            for each in (map_a, map_b)
-        )
-        pairs = Pairs(a, b, match(a, b, parameters))
-        aligner = MethodAligner(Clique())
-        found = aligner.align_pairs(pairs, np.random.default_rng(0))
-        if not found.ok:
-            continue
-        refined = refinement.refine(pairs, found.T_a_b)
-        extent_m = float(np.ptp(pairs.p_b[:, :2], axis=0).max(initial=0.0))
-        if refined.ok and 2 * np.count_nonzero(refined.inlier) > len(pairs) and extent_m > 1:
-            return unit
-    return ""
 
 
 def supported_by(

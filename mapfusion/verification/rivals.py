@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -217,6 +218,15 @@ def mirror_image_motion(
     return motions[0], (of_image.p_b[motions[0].inlier] * flip)[:, :2]
 
 
+def fits_beyond_chance(
+    pairs: Pairs, acceptance: Acceptance, refinement: Refinement, n_trials: int = 1
+) -> bool:
+    """Return True if a motion has more support than chance gives in any of `n_trials`."""
+    bound = math.log10(acceptance.false_alarms / n_trials)
+    found = distinct_motions(pairs, 1, acceptance, refinement)
+    return any(each.log10_false_alarms <= bound for each in found)
+
+
 def is_mirrored(
     pairs: Pairs, acceptance: Acceptance, refinement: Refinement, matching: MatchParameters
 ) -> bool:
@@ -228,8 +238,51 @@ def is_mirrored(
     found = mirror_image_motion(pairs, acceptance, refinement, matching)
     if found is None or not found[0].log10_false_alarms <= bound:
         return False
-    own = distinct_motions(pairs, 1, acceptance, refinement)
-    return not any(each.log10_false_alarms <= bound for each in own)
+    return not fits_beyond_chance(pairs, acceptance, refinement)
+
+
+# Units of length other than the metre, in metres.
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
+# Ratio of the extents of two maps in one unit that partial overlap may explain.
+_SIMILAR_EXTENT = 10.0
+
+
+def other_unit(
+    pairs: Pairs, acceptance: Acceptance, refinement: Refinement, matching: MatchParameters
+) -> tuple[str, tuple[bool, bool]]:
+    """Return the unit in which two maps fit each other, and which of both maps are in it.
+
+    Two maps in millimetres differ by many times the gates of metres, and one map in millimetres has
+    no distances of the other. With the right units they fit beyond chance. The unit is empty if
+    there is none.
+    """
+    maps = pairs.map_a, pairs.map_b
+    extents_m = [float(np.ptp(each.position_m[:, :2], axis=0).max(initial=0.0)) for each in maps]
+    trials = []
+    for unit, size_m in _UNITS.items():
+        for in_unit in ((True, True), (True, False), (False, True)):
+            own_m = np.where(in_unit, size_m, 1.0) * extents_m
+            if own_m.min() > 1 and own_m.max() < _SIMILAR_EXTENT * own_m.min():
+                trials.append((unit, size_m, in_unit))
+    if fits_beyond_chance(pairs, acceptance, refinement):
+        return "", (False, False)
+    for unit, size_m, in_unit in trials:
+        a, b = (
+            replace(
+                each,
+                position_m=each.position_m * size_m,
+                covariance_m2=each.covariance_m2 * size_m**2,
+                joint=None,
+                viewing=None,
+            )
+            if scaled
+            else each
+            for each, scaled in zip(maps, in_unit, strict=True)
+        )
+        in_metres = Pairs(a, b, match(a, b, matching))
+        if fits_beyond_chance(in_metres, acceptance, refinement, len(trials)):
+            return unit, in_unit
+    return "", (False, False)
 
 
 def self_motions(

@@ -71,6 +71,11 @@ _BULK = 0.9
 # Size of the residuals in stated sigmas from which on a verdict says it. Chance does not reach it
 # with the fewest pairs that pass the test against chance.
 _OVERCONFIDENT = 3.0
+# The same for covariances that are too large. A fused map that holds one of two equally good maps
+# differs from it by 1/sqrt(3) of the stated sigmas, and maps whose landmarks share errors by 0.6 or
+# more. Standard deviations written as variances give far less.
+_UNDERCONFIDENT = 0.5
+_ENOUGH_PAIRS = 20  # pairs that chance makes agree so closely in fewer than one of 1000 maps
 _PATCH_REACH_M = 0.7  # largest distance between neighbouring corners of one texture
 _LEAST_OF_PATCH = 5  # landmarks
 # Beta priors of the shares of regions that a wrong motion confirms, as (confirmed, all) regions:
@@ -337,7 +342,7 @@ class PairVerifier:
                 reason = f"{untested}: {why} (see `mapfusion docs refusal`)"
         if status is Status.ACCEPTED and (unsure := self._why_unsure(alignment)):
             status, reason = Status.TOO_UNCERTAIN, unsure
-        if status is Status.ACCEPTED and (note := self._overconfidence_note(alignment)):
+        if status is Status.ACCEPTED and (note := self._residual_note(alignment)):
             reason = "; ".join(filter(None, (reason, note)))
         return Verdict(status, by_chance.log10_false_alarms, reason, **told)
 
@@ -561,20 +566,26 @@ class PairVerifier:
                 return True
         return False
 
-    def _overconfidence_note(self, alignment: Alignment) -> str:
+    def _residual_note(self, alignment: Alignment) -> str:
         """Say that the residuals contradict the covariances of the maps; empty if they do not.
 
         Maps with joint covariances are left out: errors that their landmarks share are stated.
-        The figure is a lower bound, since matching drops pairs whose heights differ too much.
+        Residuals that are too large are a lower bound, since matching drops pairs whose heights
+        differ too much.
         """
         maps = self._pairs.map_a, self._pairs.map_b
         if not alignment.inlier.any() or all(each.joint is not None for each in maps):
             return ""
         scale = residual_scale(alignment.T_a_b, self._pairs[alignment.inlier])
-        if scale < _OVERCONFIDENT:
+        if scale >= _OVERCONFIDENT:
+            times = f"the residuals are at least {scale:.2g} times as large as"
+            return f"{times} the maps' covariances state"
+        if scale > _UNDERCONFIDENT or np.count_nonzero(alignment.inlier) < _ENOUGH_PAIRS:
             return ""
-        times = f"the residuals are at least {scale:.2g} times as large as"
-        return f"{times} the maps' covariances state"
+        return (
+            f"the residuals are {scale:.2g} times as large as the maps' covariances state: they may "
+            "hold standard deviations in place of variances, or the maps share observations"
+        )
 
     def _why_unsure(self, alignment: Alignment) -> str:
         """Return why the covariance of an alignment is too large; empty if it is not."""

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion.align.aligners import ALIGNERS, make_aligner
-from mapfusion.align.alignment import Status
+from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.correspondences import MatchParameters, match
 from mapfusion.align.frames import (
     Overlap,
@@ -28,7 +28,9 @@ from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import chi_square_bound
 from mapfusion.landmark_map import LandmarkMap, read_map
-from mapfusion.verification.registration import Registered, Registration, common_unit
+from mapfusion.verification.false_alarms import Acceptance
+from mapfusion.verification.registration import Registered, Registration
+from mapfusion.verification.rivals import other_unit
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
 SIGMA_M = 0.02
@@ -258,8 +260,32 @@ def test_two_maps_in_millimetres_are_named() -> None:
         replace(m, position_m=1000 * m.position_m, covariance_m2=1e6 * m.covariance_m2)
         for m in (a, b)
     )
-    assert common_unit(large_a, large_b, MatchParameters(), Refinement()) == "millimetres"
-    assert common_unit(a, b, MatchParameters(), Refinement()) == ""
+    assert unit_of(large_a, large_b) == ("millimetres", (True, True))
+    assert unit_of(a, b) == ("", (False, False))
+
+
+@pytest.mark.parametrize(("unit", "size_m"), [("millimetres", 1e-3), ("feet", 0.3048)])
+def test_one_map_in_another_unit_is_named_without_descriptors(unit: str, size_m: float) -> None:
+    a, b = (replace(each, descriptor=None, label=None) for each in two_maps())
+    large_b = replace(b, position_m=b.position_m / size_m)
+    assert unit_of(a, large_b) == (unit, (False, True))
+    assert unit_of(large_b, a) == (unit, (True, False))
+    other = replace(b, position_m=np.random.default_rng(0).uniform(0, 40 / size_m, (len(b), 3)))
+    assert unit_of(a, other) == ("", (False, False))
+
+
+def unit_of(a: LandmarkMap, b: LandmarkMap) -> tuple[str, tuple[bool, bool]]:
+    pairs = Pairs(a, b, match(a, b))
+    return other_unit(pairs, Acceptance(), Refinement(), MatchParameters())
+
+
+def test_a_map_that_holds_the_other_is_named_without_descriptors() -> None:
+    a, b = (replace(each, descriptor=None, label=None) for each in two_maps())
+    assert "same observations" not in registered(a, b).verdict.reason
+    fused = b.position_m.copy()
+    fused[:10] = se2.transform_points(se2.inverse(T_A_B), a.position_m[:10])
+    told = registered(a, replace(b, position_m=fused)).verdict.reason
+    assert "10 of 31 pairs are the same observations in a and b" in told
 
 
 def test_a_map_without_covariances_needs_a_stated_sigma(tmp_path) -> None:

@@ -185,6 +185,51 @@ def test_the_advice_says_why_not_and_what_to_do(found: MapAlignment) -> None:
     assert told.count("mirror") == 1
 
 
+def labelled_maps(n: int = 40) -> tuple[LandmarkMap, LandmarkMap]:
+    rng = np.random.default_rng(0)
+    p, label = rng.uniform(-6, 6, (n, 3)) * [1, 1, 0], np.arange(n, dtype=np.int32)
+    in_b = se2.transform_points(se2.inverse(T_A_B), p)
+    made = []
+    for name, own in (("north", p), ("south", in_b)):
+        own = own + rng.normal(0, 0.02, (n, 3)) * [1, 1, 0]
+        made.append(replace(landmarks(own, 0.02, None, planar=True, name=name), label=label))
+    return made[0], made[1]
+
+
+@pytest.mark.parametrize("changed", [[1, -1, 1], "axes"])
+def test_a_labelled_mirror_image_is_named(changed) -> None:
+    north, south = labelled_maps()
+    p = south.position_m[:, [1, 0, 2]] if changed == "axes" else south.position_m * changed
+    told = mapfusion.align_maps(north, replace(south, position_m=p)).advice
+    assert "north and south look like mirror images of each other" in told
+    assert "one point" not in told
+    assert "labels" not in told
+
+
+def test_labels_of_other_landmarks_are_asked_for() -> None:
+    north, south = labelled_maps()
+    assert south.label is not None
+    told = mapfusion.align_maps(north, replace(south, label=np.roll(south.label, 7))).advice
+    assert told.endswith("40 labels are in both maps: do they name the same landmarks?")
+
+
+def test_one_map_in_millimetres_is_named_without_descriptors() -> None:
+    north, south = (replace(each, label=None) for each in labelled_maps())
+    large = replace(south, position_m=1000 * south.position_m)
+    for pair in ((north, large), (large, north)):
+        told = mapfusion.align_maps(*pair).advice
+        assert told.endswith("south fits north if it is in millimetres: write it in metres.")
+
+
+def test_standard_deviations_in_place_of_variances_are_noted() -> None:
+    maps = labelled_maps()
+    assert "residuals" not in mapfusion.align_maps(*maps).advice
+    wide = (replace(each, covariance_m2=each.covariance_m2 / 0.02) for each in maps)
+    told = mapfusion.align_maps(*wide).advice
+    assert "times as large as the maps' covariances state" in told
+    assert "standard deviations in place of variances" in told
+
+
 def test_a_merge_of_nothing_has_no_landmarks(tmp_path: Path) -> None:
     a, _ = two_maps()
     _, other = two_maps(seed=1)
