@@ -583,8 +583,8 @@ class PairVerifier:
         if scale > _UNDERCONFIDENT or np.count_nonzero(alignment.inlier) < _ENOUGH_PAIRS:
             return ""
         return (
-            f"the residuals are {scale:.2g} times as large as the maps' covariances state: they may "
-            "hold standard deviations in place of variances, or the maps share observations"
+            f"the residuals are {scale:.2g} times as large as the maps' covariances state: these "
+            "may be standard deviations in place of variances, or the maps share observations"
         )
 
     def _why_unsure(self, alignment: Alignment) -> str:
