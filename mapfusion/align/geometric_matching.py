@@ -212,13 +212,13 @@ class Bins(NamedTuple):
     n_theta: int
 
 
-# Factors of the hash of a bin (Teschner et al. 2003).
-_HASH = 73856093, 19349663, 83492791
+# Factors of the hash of a place (Teschner et al. 2003).
+_HASH = 73856093, 19349663
 
 
 @kernel
-def _slot(t: int, x: int, y: int, mask: int) -> int:
-    mixed = (t * _HASH[0]) ^ (x * _HASH[1]) ^ (y * _HASH[2])
+def _slot(x: int, y: int, mask: int) -> int:
+    mixed = (x * _HASH[0]) ^ (y * _HASH[1])
     return (mixed ^ (mixed >> 17)) & mask
 
 
@@ -254,7 +254,7 @@ _BESIDE = 4.5  # distance in bins of two bins that may hold votes for one motion
 
 
 @kernel
-def fullest_bins(
+def cast_votes(
     sites: tuple[Site, Site],
     of_a: Segments,
     of_b: Segments,
@@ -262,14 +262,10 @@ def fullest_bins(
     bins: Bins,
     tolerance_m: float,
     size_tolerance: float,
-    counts: np.ndarray,
-    most: int,
-) -> Float:
-    """Count the votes of segments of b, and return the fullest bins with their neighbours.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the votes of segments of b, by ascending bin of the angle.
 
-    A vote is the angle of a motion, and the place of `centre` (2,) of map b under it. Counts are
-    kept in a hash table without keys: bins that collide share a count, which at worst proposes one
-    more motion.
+    A vote is the angle of a motion, and the place of `centre` (2,) of map b under it.
 
     Args:
         sites: both maps.
@@ -280,16 +276,14 @@ def fullest_bins(
         tolerance_m: largest difference of two lengths.
         size_tolerance: largest relative difference of two sizes; negative if no landmark has
             attributes.
-        counts: zeros, their number a power of two.
-        most: largest number of bins.
 
     Returns:
-        Number of votes, theta, x and y of each bin, shape (n, 4).
+        Bin of the place of each vote along x and y, shape (V, 2), and the first vote of each bin of
+        the angle, shape (n_theta + 1,), the last one V.
     """
-    mask = len(counts) - 1
-    best, n_best = np.zeros((most, 4)), 0
     a, b = sites
-    for counted in range(2):  # counts all votes first, and then sums neighbouring bins
+    end, places = np.zeros(bins.n_theta + 1, np.int64), np.empty((0, 2), np.int32)
+    for filled in range(2):  # counts the votes of each angle first
         start = 0
         for f in range(len(of_b.length)):
             length, b_theta, b_rise = of_b.length[f], of_b.theta_rad[f], of_b.rise[f]
@@ -308,36 +302,81 @@ def fullest_bins(
                     and attributes_agree(a, b, of_a.ends[e, 1], of_b.ends[f, 1], size_tolerance)
                 ):
                     continue
-                ax, ay = of_a.along[e, 0], of_a.along[e, 1]
-                cos, sin = ax * bx + ay * by, ay * bx - ax * by
-                x = of_a.middle[e, 0] - (cos * mx - sin * my)
-                y = of_a.middle[e, 1] - (sin * mx + cos * my)
                 theta = of_a.theta_rad[e] - b_theta
                 theta += 2 * math.pi if theta < 0 else 0.0
                 t = min(int(theta / bins.theta_rad), bins.n_theta - 1)
-                u, v = math.floor(x / bins.shift_m), math.floor(y / bins.shift_m)
-                slot = _slot(t, u, v, mask)
-                if counted == 0:
-                    counts[slot] += 1
-                    continue
-                # a bin with few votes of its own is next to a full one, or there is none
-                own = counts[slot]
-                if own < 2 or _SHARE_OF_BIN * own < (best[most - 1, 0] if n_best == most else 0):
-                    continue
-                votes = 0
-                for dt in range(-1, 2):
-                    for du in range(-1, 2):
-                        for dv in range(-1, 2):
-                            row = (t + dt + bins.n_theta) % bins.n_theta
-                            votes += counts[_slot(row, u + du, v + dv, mask)]
-                if n_best == most and votes <= best[most - 1, 0]:
-                    continue
-                middle = ((t + 0.5) * bins.theta_rad, (u + 0.5) * bins.shift_m)
-                found = (float(votes), *middle, (v + 0.5) * bins.shift_m)
-                n_best = insert_bin(best, n_best, found, bins)
+                if filled:
+                    ax, ay = of_a.along[e, 0], of_a.along[e, 1]
+                    cos, sin = ax * bx + ay * by, ay * bx - ax * by
+                    x = of_a.middle[e, 0] - (cos * mx - sin * my)
+                    y = of_a.middle[e, 1] - (sin * mx + cos * my)
+                    places[end[t], 0] = math.floor(x / bins.shift_m)
+                    places[end[t], 1] = math.floor(y / bins.shift_m)
+                end[t] += 1
+        if not filled:
+            total = 0
+            for t in range(bins.n_theta):  # each bin begins where the bin before it ends
+                total, end[t] = total + end[t], total
+            places = np.empty((total, 2), np.int32)
+    first = np.zeros(bins.n_theta + 1, np.int64)
+    first[1:] = end[: bins.n_theta]
+    return places, first
+
+
+@kernel
+def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, most: int) -> Float:
+    """Return the bins with most votes, each counted with its neighbours.
+
+    The votes of three neighbouring angles at a time are counted in hash tables without keys. Places
+    that collide share a count, which at worst proposes one more motion.
+
+    Args:
+        places: votes of `cast_votes`, shape (V, 2).
+        first: first vote of each angle, shape (n_theta + 1,).
+        bins: widths of the bins.
+        most: largest number of bins.
+
+    Returns:
+        Number of votes, theta, x and y of each bin, shape (n, 4).
+    """
+    n = bins.n_theta
+    slots, largest = 1, 0
+    for t in range(n):
+        largest = max(largest, first[t + 1] - first[t])
+    while slots < _SLOTS_A_VOTE * largest:
+        slots *= 2
+    mask = slots - 1
+    counts = np.zeros((3, slots), np.int32)
+    best, n_best = np.zeros((most, 4)), 0
+    for step in range(-1, n + 1):
+        for k in range(first[step % n], first[step % n + 1]):
+            counts[step % 3, _slot(places[k, 0], places[k, 1], mask)] += 1
+        t = step - 1  # both neighbours of this angle are counted now
+        if t < 0:
+            continue
+        for k in range(first[t], first[t + 1]):
+            u, v = places[k, 0], places[k, 1]
+            # a bin with few votes of its own is next to a full one, or there is none
+            own = counts[t % 3, _slot(u, v, mask)]
+            if own < 2 or _SHARE_OF_BIN * own < (best[most - 1, 0] if n_best == most else 0):
+                continue
+            votes = 0
+            for du in range(-1, 2):
+                for dv in range(-1, 2):
+                    slot = _slot(u + du, v + dv, mask)
+                    votes += counts[0, slot] + counts[1, slot] + counts[2, slot]
+            if n_best == most and votes <= best[most - 1, 0]:
+                continue
+            middle = ((t + 0.5) * bins.theta_rad, (u + 0.5) * bins.shift_m)
+            found = (float(votes), *middle, (v + 0.5) * bins.shift_m)
+            n_best = insert_bin(best, n_best, found, bins)
+        before = (t - 1) % n
+        for k in range(first[before], first[before + 1]):
+            counts[(t - 1) % 3, _slot(places[k, 0], places[k, 1], mask)] = 0
     return best[:n_best].copy()
 
 
+_SLOTS_A_VOTE = 8  # so that few places share a slot
 _SHARE_OF_BIN = 27  # a bin and its neighbours; the fullest of them has this share of the votes
 
 
@@ -533,7 +572,6 @@ _CANDIDATES = 48  # bins that are refitted
 _OF_PART = 6  # bins of each of several parts of map b
 _BIN_SHIFT = 1.0  # width of a bin in tolerances; neighbouring bins are counted together
 _BIN_ANGLE = 2.0  # width in tolerances over the longest segment
-_MOST_SLOTS = 2**22  # largest length of the hash table
 _LEAST_LANDMARKS = 3  # of a map; fewer cannot contradict a motion
 _TRUE_WITHIN = 0.99  # probability that a common pair lies within the stated tolerance
 _WIDER = 1.5  # ratio of tolerances that differ
@@ -585,12 +623,9 @@ def find_placements(a: Site, b: Site, tolerance_m: float, size_tolerance: float)
     sizes = size_tolerance if have_attributes(a, b) else -1.0
     for rows, centre in parts:
         own = Segments(*(part[rows] for part in of_b))
-        high, low = (np.searchsorted(of_a.length, own.length + off) for off in (off_m, -off_m))
-        n_slots = 2 ** (2 * int(np.sum(high - low))).bit_length()
-        counts = np.zeros(min(n_slots, _MOST_SLOTS), np.int32)
         reach_m = float(np.hypot(*(own.middle - centre).T).max()) + longest / 2
-        given = (a, b), of_a, own, centre, bins, off_m, sizes, counts, most
-        for votes, theta, x, y in fullest_bins(*given):
+        places, first = cast_votes((a, b), of_a, own, centre, bins, off_m, sizes)
+        for votes, theta, x, y in fullest_bins(places, first, bins, most):
             T_a_b = np.array([x, y, theta])
             T_a_b[:2] -= rotation(theta) @ centre
             proposed.append((votes, T_a_b, centre, reach_m))

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,13 @@ import pytest
 from mapfusion.align.correspondences import HeightGate, match
 from mapfusion.align.geometric_matching import (
     DISTINCT_M,
+    Bins,
     Site,
     attributes_of_pairs_agree,
+    both_directions,
+    cast_votes,
     find_placements,
+    fullest_bins,
     mutually_nearest,
     segment_lengths,
     segments_of,
@@ -100,6 +105,40 @@ def test_segments_are_all_pairs_of_a_small_map():
     np.testing.assert_allclose(found.length, expected)
     assert longest > max(expected) or longest > max(segments_of(b, 0.0, 100.0).length)
     assert shortest == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 2.0])
+def test_votes_are_those_of_a_slow_count(turn_rad):
+    field = made_field(np.random.default_rng(9), 30, 20, noise_m=0.01)
+    a, b = sites(field)
+    b = b._replace(p=transform_points(np.array([0, 0, field.T_a_b[2] + turn_rad]), b.p))
+    n_theta, off_m, size_m = 60, 0.15, 0.2
+    bins = Bins(2 * math.pi / n_theta, size_m, n_theta)
+    of_a, of_b = both_directions(segments_of(a, 1.0, 8.0)), segments_of(b, 1.0, 8.0)
+    centre = of_b.middle.mean(axis=0)
+    expected = Counter()
+    for e, f in itertools.product(range(len(of_a.length)), range(len(of_b.length))):
+        z_m = of_a.rise[e] - of_b.rise[f]
+        near = abs(of_a.length[e] - of_b.length[f]) <= off_m
+        if not near or z_m**2 > of_a.most_z_m2[e] + of_b.most_z_m2[f]:
+            continue
+        theta = (of_a.theta_rad[e] - of_b.theta_rad[f]) % (2 * math.pi)
+        at_m = of_a.middle[e] - transform_points(np.array([0, 0, theta]), of_b.middle[f] - centre)
+        u, v = np.floor(at_m / size_m).astype(int)
+        expected[int(theta / bins.theta_rad), u, v] += 1
+    places, first = cast_votes((a, b), of_a, of_b, centre, bins, off_m, -1.0)
+    theta = np.repeat(np.arange(n_theta), np.diff(first))
+    assert Counter(zip(theta.tolist(), *places.T.tolist(), strict=True)) == expected
+    around = list(itertools.product((-1, 0, 1), repeat=3))
+    sums = {
+        (t, u, v): sum(expected[(t + dt) % n_theta, u + du, v + dv] for dt, du, dv in around)
+        for t, u, v in expected
+    }
+    most, best = max(sums.values()), fullest_bins(places, first, bins, 1)[0]
+    # bins of one vote are not proposed, and places that share a slot add votes
+    assert 0.98 * most <= best[0] <= 1.1 * most
+    t, u, v = (best[1:] // (bins.theta_rad, size_m, size_m)).astype(int)
+    assert sums[t, u, v] >= 0.9 * most
 
 
 def test_sizes_raise_the_share_of_true_pairs():
