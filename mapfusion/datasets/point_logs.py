@@ -16,9 +16,9 @@ A folder without odometry holds one such folder for each robot. Their landmarks 
 above.
 """
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +26,7 @@ import numpy as np
 import pyarrow as pa
 
 from mapfusion.datasets.log_consistency import check_log
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, TellingWarning
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.files import (
     COVARIANCE_FIELDS,
@@ -68,6 +68,7 @@ _LONGEST_HOLD_S = 1.0  # before the first and after the last pose the robot is t
 # units give more, and then no two rows lie within the measurements.
 _LARGEST_STEP = 300.0
 _LARGEST_BEARING = 2 * np.pi  # conventions are -pi to pi and 0 to 2 pi; degrees lie beyond
+_MAX_LABELS = 3  # in one message
 _VELOCITY_FIELDS = ["speed_m_s", "turn_rate_rad_s"]
 _POLAR_FIELDS = ["range_m", "bearing_rad"]
 _TIME = described(pa.field("time_s", pa.float64()), "time in seconds")
@@ -205,7 +206,7 @@ def import_points(
         InputError: a table is missing, damaged or contradicts another one; nothing is written.
     """
     chosen = settings or PointsSettings()
-    return _import_robots(folder, destination, chosen, partial(_read_points, settings=chosen))
+    return _import_robots(folder, destination, chosen, "points", _read_points)
 
 
 def import_ranges(
@@ -213,13 +214,17 @@ def import_ranges(
 ) -> list[Path]:
     """Write a log for each robot of a recording of ranges and bearings; see `import_points`."""
     chosen = settings or RangesSettings()
-    return _import_robots(folder, destination, chosen, partial(_read_ranges, settings=chosen))
+    return _import_robots(folder, destination, chosen, "ranges", _read_ranges)
 
 
 def _import_robots(
-    folder: Path, destination: Path, settings: _Frames, read: Callable[[Path], Measurements]
+    folder: Path,
+    destination: Path,
+    settings: Any,
+    kind: str,
+    read: Callable[[Path, Any], Measurements],
 ) -> list[Path]:
-    """Write the logs of the robots in a folder; `read` returns the measurements of one."""
+    """Write the logs of the robots in a folder; `read` reads the table `kind` of one."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a recording with odometry.csv)")
     folders = (folder, *sorted(folder.iterdir()))
@@ -230,7 +235,8 @@ def _import_robots(
     made = []
     for robot in robots[:1] if robots[0] == folder else robots:
         try:
-            measured, odometry = read(robot), table_path(robot, "odometry")
+            table, odometry = table_path(robot, kind), table_path(robot, "odometry")
+            measured = read(table, settings)
             # Times of the frames: those of the measurements, or equally spaced ones.
             clock_s, frame_s = np.unique(measured.time_s), settings.frame_s
             if frame_s:
@@ -245,6 +251,7 @@ def _import_robots(
             poses_at = _read_odometry(odometry, measured.time_s)
             log = log_on_clock(robot.resolve().name, clock_s, poses_at, measured)
             _require_radians(odometry, log, clock_s, measured)
+            _tell_repeated_labels(table, clock_s, measured)
             poses, points = table_path(robot, "truth_poses"), None
             T_world_robot = _read_true_poses(poses, clock_s, settings) if poses.is_file() else None
             surveys = (table_path(each, "landmarks") for each in (robot, folder))
@@ -302,9 +309,8 @@ def _read_timed(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str
     return table, attributes
 
 
-def _read_points(robot: Path, settings: PointsSettings) -> Measurements:
+def _read_points(path: Path, settings: PointsSettings) -> Measurements:
     """Read the table `points` of a robot."""
-    path = table_path(robot, "points")
     table, attributes = _read_timed(path, POINTS)
     require_cells(path, table, POSITION_FIELDS, np.isfinite, "give a finite number, or remove it")
     planar = attributes.get("planar") == "true"
@@ -321,9 +327,8 @@ def _read_points(robot: Path, settings: PointsSettings) -> Measurements:
     return _measured(path, table, attributes, position, covariance, planar, settings)
 
 
-def _read_ranges(robot: Path, settings: RangesSettings) -> Measurements:
+def _read_ranges(path: Path, settings: RangesSettings) -> Measurements:
     """Read the table `ranges` of a robot."""
-    path = table_path(robot, "ranges")
     table, attributes = _read_timed(path, RANGES)
     positive = "ranges are positive, in metres; remove rows without a return"
     require_cells(path, table, ["range_m"], lambda r: np.isfinite(r) & (r > 0), positive)
@@ -394,12 +399,7 @@ def log_on_clock(
         extras: further arguments of `RobotLog`.
     """
     frame, seen = np.searchsorted(clock_s, measured.time_s), measured.observations
-    kept = frame < len(clock_s)
-    if seen.label is not None:
-        pairs = np.stack([frame, seen.label], -1)[::-1]
-        last = np.zeros(len(frame), dtype=bool)
-        last[len(frame) - 1 - np.unique(pairs, axis=0, return_index=True)[1]] = True
-        kept &= last | (seen.label == NO_LABEL)
+    kept = (frame < len(clock_s)) & ~_seen_again(frame, seen.label)
     frame, seen, time_s = frame[kept], seen[kept], measured.time_s[kept]
 
     T_start_frame = poses_at(clock_s)
@@ -416,6 +416,31 @@ def log_on_clock(
     observations = Observations(position, covariance, *looks, descriptor_kind=seen.descriptor_kind)
     times = clock_s - clock_s[0]
     return RobotLog(robot, measured.planar, times, increments, frame, observations, **extras)
+
+
+def _seen_again(frame: np.ndarray, label: np.ndarray | None) -> np.ndarray:
+    """Return True for rows (N,) whose label a later row of the same frame has, too."""
+    again = np.zeros(len(frame), dtype=bool)
+    if label is not None:
+        pairs = np.stack([frame, label], -1)[::-1]
+        again[:] = label != NO_LABEL
+        again[len(frame) - 1 - np.unique(pairs, axis=0, return_index=True)[1]] = False
+    return again
+
+
+def _tell_repeated_labels(path: Path, clock_s: Float, measured: Measurements) -> None:
+    """Warn of rows that `log_on_clock` leaves out because a later row repeats their label."""
+    label = measured.observations.label
+    rows = np.flatnonzero(_seen_again(np.searchsorted(clock_s, measured.time_s), label))
+    if label is None or not len(rows):
+        return
+    labels = np.unique(label[rows]).tolist()
+    more = ", ..." if len(labels) > _MAX_LABELS else ""
+    which = f"label{'s' if len(labels) > 1 else ''} {', '.join(map(str, labels[:_MAX_LABELS]))}"
+    found = f"{len(rows)} of {len(label)} rows are left out ({which}{more}; first: row {rows[0]})"
+    reason = "a frame keeps the last row of each label"
+    text = f"{path}: {found}: {reason}; if they show several landmarks, give each its own label"
+    warnings.warn(text, TellingWarning, stacklevel=4)
 
 
 def _read_odometry(path: Path, measured_s: Float, radians: float = 1.0) -> PosesAt:

@@ -8,7 +8,7 @@ import pytest
 
 from mapfusion.datasets.formats import import_recording
 from mapfusion.datasets.point_logs import PointsSettings, RangesSettings
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, TellingWarning
 from mapfusion.robot_log import read_log, read_true_poses
 
 RADIUS_M, TURN_RAD_S = 2.0, 0.25
@@ -240,3 +240,19 @@ def test_a_refused_table_names_the_page(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"see `mapfusion docs point_logs`$"):
             import_recording("ranges", folder, tmp_path / "logs")
         (tmp_path / "R" / "odometry.csv").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize(("repeats", "said"), [(1, "label 2"), (4, "labels 0, 1, 2, ...")])
+def test_rows_that_repeat_a_label_in_their_frame_are_told(
+    repeats: int, said: str, tmp_path: Path
+) -> None:
+    write_recording(tmp_path / "R1", {}, "points")
+    path = tmp_path / "R1" / "points.csv"
+    table = pd.read_csv(path)
+    chosen = table[4:8] if repeats == 4 else table[6:7]
+    pd.concat([table[:8], chosen, table[8:]]).to_csv(path, index=False)
+    first = 6 if repeats == 1 else 4
+    counted = f"{repeats} of {160 + repeats} rows are left out"
+    with pytest.warns(TellingWarning, match=rf"s.csv: {counted} \({said}; first: row {first}\)"):
+        (log,) = import_recording("points", tmp_path / "R1", tmp_path / "logs", NOISE["points"])
+    assert len(read_log(log).observations) == 160
