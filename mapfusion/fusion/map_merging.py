@@ -7,6 +7,7 @@ import html
 import itertools
 import math
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +25,7 @@ from mapfusion.align.correspondences import (
 )
 from mapfusion.align.rigid_motion import residuals
 from mapfusion.descriptors import DescriptorKind, require_one_kind
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, TellingWarning
 from mapfusion.files import Write, write_together
 from mapfusion.fusion.fusers import (
     USUAL,
@@ -42,6 +43,7 @@ from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import motion_sigma, rms_distance_m
 from mapfusion.landmark_map import LandmarkMap, map_writes, read_map
 from mapfusion.plotting import Plan, fused_plan, pair_plan, plot_plans
+from mapfusion.tables import NO_LABEL
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.registration import (
     PairRegistration,
@@ -66,6 +68,7 @@ if TYPE_CHECKING:  # results are printed and written without data frames and fig
 # Ratio of the sigmas at the origin and at the overlap from which on T_a_b alone misleads.
 _LEVER = 30
 _MOST_RIVALS = 3  # motions beside the estimate; pictures of more are not legible
+_MAX_LABELS = 3  # in one message
 _MOST_PAIRS = 6  # of maps in a picture, two rows of plans
 # What a user can do about an alignment that is not accepted.
 _REMEDIES = {
@@ -555,6 +558,7 @@ def load_maps(
         InputError: a file or a table is not as documented, or descriptors are of different kinds.
     """
     loaded, kinds = list[LandmarkMap](), list[tuple[str, DescriptorKind | None]]()
+    opened = list[tuple[str, LandmarkMap]]()
     for name, each in given.items():
         if isinstance(each, LandmarkMap):
             landmarks, place = each, each.called
@@ -565,8 +569,28 @@ def load_maps(
             landmarks, place = own, name
         loaded.append(landmarks)
         kinds.append((place, landmarks.descriptor_kind))
+        if not isinstance(each, LandmarkMap):  # loaded before
+            opened.append((place, landmarks))
     require_one_kind(kinds)
+    if sum(each.label is not None for each in loaded) > 1:
+        for place, landmarks in opened:
+            if told := _repeated_labels(landmarks):
+                warnings.warn(f"{place}: {told}", TellingWarning, stacklevel=3)
     return loaded
+
+
+def _repeated_labels(landmarks: LandmarkMap) -> str:
+    """Say which labels of a map are on several landmarks; empty if none is."""
+    if landmarks.label is None:
+        return ""
+    labels, n = np.unique(landmarks.label[landmarks.label != NO_LABEL], return_counts=True)
+    rows = np.flatnonzero(n > 1)
+    if not len(rows):
+        return ""
+    shown = [f"label {labels[k]} is on {n[k]} landmarks" for k in rows[:_MAX_LABELS]]
+    shown += [f"{len(rows) - len(shown)} more are on several"] if len(rows) > len(shown) else []
+    rule = "of each only the landmark with the largest count is matched (the first, if equal)"
+    return f"{', '.join(shown)}, of {len(labels)} labels: {rule}; give each landmark its own label"
 
 
 def _registration(aligner: "str | Method | Aligner | Registration") -> Registration:

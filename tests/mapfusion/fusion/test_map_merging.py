@@ -19,6 +19,7 @@ from PIL import Image
 
 import mapfusion
 from mapfusion.align.alignment import Status
+from mapfusion.errors import TellingWarning
 from mapfusion.fusion.map_merging import MapAlignment, advice, best_alignment
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap, write_map
@@ -89,6 +90,25 @@ def test_tables_become_maps_and_maps_tables() -> None:
     told = r"^descriptors of map 2 are \d+ times as far apart as those of map north: scale both"
     with pytest.raises(mapfusion.InputError, match=told):
         mapfusion.merge_maps([a, long])
+
+
+def test_labels_of_several_landmarks_are_told_once_for_each_map(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    a, b = two_maps()
+    label = np.arange(60, dtype=np.int32)
+    label[[50, 51, 52]] = 7, 7, 9
+    paths = [tmp_path / "north.csv", tmp_path / "south.csv", tmp_path / "east.csv"]
+    for path, own in zip(paths, (label, np.arange(60, dtype=np.int32), label), strict=True):
+        write_map(path, replace(a, descriptor=None, descriptor_kind=None, label=own))
+    mapfusion.merge_maps([*paths[:2], b])
+    said = [str(each.message) for each in recwarn if each.category is TellingWarning]
+    assert len(said) == 1
+    assert said[0].startswith(f"{paths[0]}: label 7 is on 3 landmarks, label 9 is on 2 landmarks,")
+    assert "of 57 labels: of each only the landmark with the largest count is matched" in said[0]
+    recwarn.clear()
+    mapfusion.align_maps(paths[0], b)  # b has no labels, so that none are used
+    assert not recwarn.list
 
 
 def test_results_are_described_in_a_line(found: MapAlignment) -> None:
