@@ -78,6 +78,15 @@ _CONVERSIONS = {
     ("us", "s"): "1e-6",
     ("ns", "s"): "1e-9",
 }
+# Other usual names of labels, and of the numbers of descriptors.
+_LABEL_LIKE = re.compile(
+    r"((landmark|lm|marker|tag|point|object|feature|beacon|label)_?)?(id|no|nr|number|name|key)"
+    r"|labels|landmark|marker|tag|beacon|barcode|identity"
+)
+_DESCRIPTOR_LIKE = re.compile(
+    r"(desc|descr|descriptors|des|feat|feature|features|vec|vector|emb|embedding)(_?\[?\d{1,9}\]?)?"
+    r"|f_?\d{1,9}"
+)
 _MAX_NAMED = 3  # columns with similar names in one message
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
 
@@ -138,14 +147,7 @@ def read_open_table(
             column with a similar name, or a cell without a number.
     """
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
-    if content is not None:
-        table = content
-    elif read := _OTHER_READERS.get(path.suffix.lower()):
-        table = read(path, kind)
-    elif is_csv(path):
-        table = _read_csv(path, table_schema)
-    else:
-        table = read_parquet(path, f"{kind} table")
+    table = _as_given(path, table_schema) if content is None else content
     attributes, given = text_attributes(path, table), table.column_names
     if twice := sorted({name for name in given if given.count(name) > 1}):
         raise InputError(f"{path}: has two columns {', '.join(twice)}")
@@ -167,19 +169,76 @@ def read_open_table(
     found = {field.name: _column(path, table, field, planar) for field in table_schema}
     if missing := [name for name, values in found.items() if values is None]:
         remedy = f"`mapfusion docs formats` describes the columns of a {kind} table"
+        unread = _names_like(_LABEL_LIKE, names, table_schema)
         if here := [name for name in missing if name in similar]:
             remedy = _renaming({name: similar[name] for name in here})
+        elif missing == ["label"] and unread:
+            remedy = f"if {unread[0]} is the identity of the landmark, rename it to label"
         elif kind == "landmark_map" and {"cov_xx_m2", "cov_yy_m2"} <= set(missing):
             remedy = "`--sigma 0.05` states one standard deviation for all landmarks, in metres"
         raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")
     if similar:
         reason = "columns with unknown names are ignored"
         raise InputError(f"{path}: {_renaming(similar)}, or remove it: {reason}")
+    _tell_ignored_appearance(path, table, table_schema)
     if planar:
         attributes = {"planar": "true"} | attributes
     plain = [pa.field(field.name, field.type) for field in table_schema]
     columns = pa.table(found, schema=pa.schema(plain))
     return columns, attributes
+
+
+def _as_given(path: Path, table_schema: pa.Schema) -> pa.Table:
+    """Read all columns of a file, with its own names; raises InputError."""
+    kind = table_schema.metadata[b"mapfusion.kind"].decode()
+    if read := _OTHER_READERS.get(path.suffix.lower()):
+        return read(path, kind)
+    if is_csv(path):
+        return _read_csv(path, table_schema)
+    return read_parquet(path, f"{kind} table")
+
+
+def columns_as_read(path: Path, table_schema: pa.Schema) -> dict[str, str]:
+    """Return the known column that each column of a file is read as; empty for ignored ones.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    table, descriptors = _as_given(path, table_schema), dict[str, str]()
+    if "descriptor" in table_schema.names:
+        descriptors, _ = _descriptor_names(path, table)
+    known = {name: name for name in table_schema.names} | dict.fromkeys(descriptors, "descriptor")
+    return {name: known.get(name, "") for name in table.column_names}
+
+
+def _names_like(
+    pattern: re.Pattern[str], names: Sequence[str], table_schema: pa.Schema
+) -> list[str]:
+    """Return the unknown columns whose plain names match a pattern."""
+    unknown = (name for name in names if name not in table_schema.names)
+    return [name for name in unknown if pattern.fullmatch(_plain_name(name))]
+
+
+def _tell_ignored_appearance(path: Path, table: pa.Table, table_schema: pa.Schema) -> None:
+    """Warn of unknown columns that look like labels or descriptors of a table without descriptors.
+
+    In a table with descriptors, such a column usually numbers the rows only.
+    """
+    names, told = table.column_names, list[str]()
+    if "descriptor" not in table_schema.names or "descriptor" in names:
+        return
+    looks = _names_like(_DESCRIPTOR_LIKE, names, table_schema)
+    if len(looks) > 1:
+        wanted = f"descriptor_0 to descriptor_{len(looks) - 1}"
+        found = f"columns {looks[0]} to {looks[-1]} are ignored"
+        told.append(f"{found}; if they are descriptors, name them {wanted}")
+    elif looks and pa.types.is_nested(table.schema.field(looks[0]).type):
+        told.append(f"column {looks[0]} is ignored; if it holds descriptors, name it descriptor")
+    if "label" not in names and (like := _names_like(_LABEL_LIKE, names, table_schema)):
+        meant = "if it is the same number wherever a landmark is seen"
+        told.append(f"column {like[0]} is ignored; {meant}, name it label")
+    if told:
+        warnings.warn(f"{path}: {'; '.join(told)}", TellingWarning, stacklevel=3)
 
 
 def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, str]:

@@ -1,5 +1,6 @@
 """Command `inspect`: kind, version and contents of a file or folder."""
 
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,9 +12,10 @@ from experiments.evaluation import tables
 from experiments.evaluation.tables import require_as_written
 from experiments.reports.layout import Column, print_lines, print_table
 from mapfusion import attitude, landmark_map, robot_log
+from mapfusion.datasets import point_logs
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, read_parquet, read_table, text_attributes
-from mapfusion.tables import is_alone, is_csv, read_open_table
+from mapfusion.tables import columns_as_read, is_alone, is_csv, read_open_table
 from sim import trajectory
 
 _PREFIX, _KIND, _VERSION = "mapfusion.", "kind", "schema_version"
@@ -28,6 +30,9 @@ _OPEN = {
     "observations": robot_log.OBSERVATIONS,
     "truth_poses": robot_log.TRUTH_POSES,
     "truth_points": robot_log.TRUTH_POINTS,
+    "odometry": point_logs.ODOMETRY,
+    "points": point_logs.POINTS,
+    "ranges": point_logs.RANGES,
 }
 _CHECKED = {each.metadata[f"{_PREFIX}{_KIND}".encode()].decode(): each for each in _SCHEMAS}
 _UNITS = {"m": "m", "m2": "m²", "rad": "rad", "s": "s", "ms": "ms", "px": "px"}
@@ -168,7 +173,8 @@ def _open_schema(path: Path) -> pa.Schema:
 
 def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
     """Describe a table of any program as `align`, `merge` and `slam` read it."""
-    table, facts = read_open_table(path, table_schema)
+    with warnings.catch_warnings(record=table_schema is landmark_map.LANDMARKS):  # see `read_map`
+        table, facts = read_open_table(path, table_schema)
     kind = table_schema.metadata[f"{_PREFIX}{_KIND}".encode()].decode()
     known: dict[str, Any] = {
         name: value
@@ -185,7 +191,15 @@ def _open_table(path: Path, table_schema: pa.Schema) -> Contents:
         )
         if landmarks.descriptor_kind is not None:
             known["descriptors"] = str(landmarks.descriptor_kind)
-    return _columns_of(path, kind, table, known)
+    given: dict[str, list[str]] = {}
+    for name, known_name in columns_as_read(path, table_schema).items():
+        given.setdefault(known_name, []).append(name)
+    known["ignored columns"] = _listed(given.get("", [])) or "none"
+    told = _columns_of(path, kind, table, known)
+    sources = {name: names[0] for name, names in given.items()}
+    sources |= {name: f"{own[0]} to {own[-1]}" for name, own in given.items() if len(own) > 1}
+    rows = [(*row, sources.get(row[0], "not given")) for row in told.rows]
+    return told._replace(columns=[*told.columns, ("read from", "")], rows=rows)
 
 
 def _json(path: Path) -> Contents:
@@ -203,9 +217,14 @@ def _brief(found: dict[str, Any]) -> dict[str, Any]:
     for name, value in found.items():
         shown = value
         if isinstance(value, list) and all(isinstance(each, str) for each in value):
-            shown = ", ".join(value)
-            if len(value) > _NAMES_SHOWN:
-                shown = f"{len(value)}, from {value[0]} to {value[-1]}"
+            shown = _listed(value)
         if name != _KIND and isinstance(shown, str | float | int) and shown != "":
             facts[name] = shown
     return facts
+
+
+def _listed(names: list[str]) -> str:
+    """Return names as text; of many only their number and the ends."""
+    if len(names) > _NAMES_SHOWN:
+        return f"{len(names)}, from {names[0]} to {names[-1]}"
+    return ", ".join(names)

@@ -10,8 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from mapfusion import robot_log
+from mapfusion.datasets.point_logs import LANDMARKS as SURVEY
 from mapfusion.datasets.point_logs import ODOMETRY, RANGES
-from mapfusion.errors import InputError
+from mapfusion.errors import InputError, TellingWarning
 from mapfusion.landmark_map import read_map
 from mapfusion.robot_log import read_log, read_truth
 from mapfusion.tables import read_open_table
@@ -341,3 +342,42 @@ def test_optional_columns_in_another_unit_are_not_ignored(tmp_path, name, given,
         InputError, match=f"{re.escape(given)} {said} and name it {name}, or remove"
     ):
         read_open_table(path, ODOMETRY)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"id": 1}, "column id is ignored; if it is the same number wherever .* name it label$"),
+        ({"Landmark ID": 1}, "column Landmark ID is ignored"),
+        (
+            {"desc0": 0.1, "desc1": 0.2, "tag": 1},
+            "columns desc0 to desc1 are ignored; if they are descriptors, name them descriptor_0 "
+            "to descriptor_1; column tag is ignored",
+        ),
+        ({"label": 1, "feat_1": 0.1, "feat_2": 0.2}, "columns feat_1 to feat_2 are ignored"),
+        ({"embedding": [[0.1, 0.2]] * N}, "column embedding is ignored; .* name it descriptor$"),
+    ],
+)
+def test_ignored_columns_that_look_like_labels_or_descriptors_are_told(tmp_path, rng, more, said):
+    with pytest.warns(TellingWarning, match=f"m.parquet: {said}"):
+        read_map(write(plain_map(rng, **more), tmp_path / "m.parquet"))
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"id": 1, "descriptor_0": 0.1, "descriptor_1": 0.2},
+        {"id": 1, "label": range(N)},
+        {"feature": 1.0, "colour": 3, "weight": 0.1},
+    ],
+)
+def test_other_columns_are_ignored_in_silence(tmp_path, rng, more, recwarn):
+    read_map(write(plain_map(rng, **more), tmp_path / "m.csv"))
+    assert not [each for each in recwarn if "is ignored" in str(each.message)]
+
+
+def test_a_survey_without_labels_names_the_column_that_may_hold_them(tmp_path):
+    survey = pd.DataFrame({"id": [1], "x_m": [0.0], "y_m": [0.0]})
+    said = "no column label; if id is the identity of the landmark, rename it to label$"
+    with pytest.raises(InputError, match=said):
+        read_open_table(write(survey, tmp_path / "landmarks.csv"), SURVEY)

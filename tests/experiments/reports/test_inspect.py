@@ -129,6 +129,23 @@ def test_logs_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "rows: 3" in reply.out
 
 
+def test_what_each_column_is_read_as(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frame = pd.DataFrame({"x_m": [0.0, 1.0], "y_m": [0.0, 2.0], "cov_xx_m2": 0.01})
+    frame = frame.assign(cov_xy_m2=0.0, cov_yy_m2=0.01, id=[1, 2], weight=0.5)
+    numbers = {f"d{k}": [0.1, 0.2] for k in range(4)}
+    frame.assign(**numbers).to_csv(tmp_path / "north.csv", index=False)
+    found = contents_of(tmp_path / "north.csv")
+    assert found.facts["ignored columns"] == "id, weight"
+    sources = {row[0]: row[-1] for row in found.rows}
+    assert sources["descriptor"] == "d0 to d3"
+    assert (sources["x_m"], sources["label"]) == ("x_m", "not given")
+    frame.to_csv(tmp_path / "north.csv", index=False)
+    assert command(capsys, "inspect", tmp_path / "north.csv").err.count("id is ignored") == 1
+    seen = pd.DataFrame({"time_s": [0.0], "range_m": [1.0], "bearing_rad": [0.1], "snr": [9.0]})
+    seen.to_csv(tmp_path / "ranges.csv", index=False)
+    assert contents_of(tmp_path / "ranges.csv").facts["ignored columns"] == "snr"
+
+
 def truncated(result: Path, folder: Path) -> Path:
     path = folder / "cut.parquet"
     path.write_bytes(tables.table_path(result, "errors").read_bytes()[:-100])
