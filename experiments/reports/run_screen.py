@@ -396,8 +396,8 @@ def print_alignments(alignments: Sequence[MapAlignment]) -> None:
     names = defaultdict[str, list[str]](list)  # of the methods, by the reason that they give
     for each in alignments:
         if not each.accepted and each.reason != said:
-            reason = each.reason.removesuffix(f"; {each.hint}")
-            names[f"{str(each.status).replace('_', ' ')}: {reason}"].append(each.aligner)
+            reason = f"{str(each.status).replace('_', ' ')}: {each.bare_reason}"
+            names[reason].append(each.aligner)
     print_lines(f"{listed(methods)}: {reason}" for reason, methods in names.items())
     print_lines([advice(alignments)])
 

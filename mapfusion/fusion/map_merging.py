@@ -68,6 +68,10 @@ if TYPE_CHECKING:  # results are printed and written without data frames and fig
 # Ratio of the sigmas at the origin and at the overlap from which on T_a_b alone misleads.
 _LEVER = 30
 _MOST_RIVALS = 3  # motions beside the estimate; pictures of more are not legible
+# Of maps that are not plausible: span in degrees, distance from the origin over the span, median
+# sigma over the span.
+_LARGEST_DEGREES, _FAR, _LARGEST_SIGMA = 0.1, 50.0, 0.25
+_FEWEST = 3  # landmarks that show the span of a map
 _MAX_LABELS = 3  # in one message
 _MOST_PAIRS = 6  # of maps in a picture, two rows of plans
 # What a user can do about an alignment that is not accepted.
@@ -153,14 +157,18 @@ class MapAlignment:
         if found.status in NOT_RUN:  # the reason does not name the aligner
             return replace(found, reason=f"{self.aligner}: {found.status}: {found.reason}")
         if not found.ok and self.cause:
-            return replace(found, reason=f"{found.reason}; {self.cause}")
+            replaced = f"; {self._note}" if self.hint == self.cause else ""
+            reason = found.reason.removesuffix(replaced)
+            return replace(found, reason=f"{reason}; {self.cause}")
         return found
 
     @cached_property
     def cause(self) -> str:
-        """Say that the maps are mirror images, or in another unit; empty if they are not."""
+        """Say which property of the maps is the likely cause of a refusal; empty if none is."""
         if self.accepted:
             return ""
+        if odd := self._degrees or too_large_sigma(self.map_a) or too_large_sigma(self.map_b):
+            return odd
         a, b, refinement = self.map_a.name, self.map_b.name, self._refinement
         if is_mirrored(self.ready.pairs, self._acceptance, refinement, self.matching):
             image = "look like mirror images of each other: check the signs of y and "
@@ -183,7 +191,16 @@ class MapAlignment:
         """Property of the maps that may explain a refusal; empty if none is found."""
         if self.accepted or self.status in NOT_RUN:
             return ""
-        return self.ready.pairs.scale_note or self.cause or self._note
+        return self._degrees or self.ready.pairs.scale_note or self.cause or self._note
+
+    @property
+    def bare_reason(self) -> str:
+        """`reason` without its note on the maps, which `hint` tells or replaces."""
+        return self.reason.removesuffix(f"; {self._note}")
+
+    @property
+    def _degrees(self) -> str:
+        return in_degrees(self.map_a) or in_degrees(self.map_b)
 
     @property
     def far_away(self) -> str:
@@ -223,7 +240,7 @@ class MapAlignment:
     @property
     def refusal(self) -> str:
         """Reason why the motion is not accepted, and a remedy."""
-        reason = self.reason.removesuffix(f"; {self._note}")
+        reason = self.bare_reason
         why = _sentence(f"{self.aligner}: {str(self.status).replace('_', ' ')}: {reason}")
         heights = self.registered.refined.heights
         asks = reason.endswith("?") and not self.hint  # for a likely cause, such as another unit
@@ -295,6 +312,36 @@ class MapAlignment:
 
     def _repr_html_(self) -> str:
         return _html(self.advice, self.to_pandas())
+
+
+def in_degrees(landmarks: LandmarkMap) -> str:
+    """Say that a map looks like longitudes and latitudes; empty if it does not.
+
+    Their span is a small part of a metre, and they are far from the origin.
+    """
+    plan = landmarks.position_m[:, :2]
+    if len(plan) < _FEWEST or np.abs(plan).max() > 180:
+        return ""
+    span, middle = float(np.ptp(plan, axis=0).max()), np.median(plan, axis=0)
+    if span >= min(_LARGEST_DEGREES, float(np.abs(middle).max()) / _FAR):
+        return ""
+    found = f"all within {span:.2g} of ({middle[0]:.4f}, {middle[1]:.4f})"
+    looks = "look like longitude and latitude in degrees"
+    return f"x_m and y_m of {landmarks.name} {looks} ({found}): project them to metres, such as UTM"
+
+
+def too_large_sigma(landmarks: LandmarkMap) -> str:
+    """Say that the covariances of a map are too large for its span; empty if they are not."""
+    plan = landmarks.position_m[:, :2]
+    if len(plan) < _FEWEST:
+        return ""
+    variance = np.trace(landmarks.covariance_m2[:, :2, :2], axis1=1, axis2=2) / 2
+    sigma_m, span_m = float(np.sqrt(np.median(variance))), float(np.ptp(plan, axis=0).max())
+    if sigma_m <= _LARGEST_SIGMA * span_m:
+        return ""
+    found = f"a median sigma of {sigma_m:.3g} m in a map that spans {span_m:.3g} m"
+    asked = "is --sigma, or are the covariances, too large or in another unit?"
+    return f"landmarks of {landmarks.name} have {found}: {asked}"
 
 
 def motion_text(T: Float) -> str:

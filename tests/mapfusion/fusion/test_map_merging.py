@@ -111,6 +111,38 @@ def test_labels_of_several_landmarks_are_told_once_for_each_map(
     assert not recwarn.list
 
 
+@pytest.mark.parametrize("labels", [False, True])
+@pytest.mark.parametrize("sigma_m", [1e-6, 0.05])
+def test_maps_in_degrees_are_told(labels: bool, sigma_m: float) -> None:
+    tables = []
+    for own, rows in zip(two_maps(), (np.arange(60), np.r_[:40, 60:80]), strict=True):
+        degrees = own.position_m[:, :2] / [75.5e3, 111.3e3] + [8.5, 47.3]
+        table = pd.DataFrame(degrees, columns=["x_m", "y_m"])
+        tables.append(table.assign(label=rows) if labels else table)
+    found = mapfusion.align_maps(*tables, sigma_m=sigma_m)
+    assert not found.accepted
+    assert (
+        "x_m and y_m of a look like longitude and latitude in degrees (all within" in found.advice
+    )
+    assert "map more" not in found.advice
+    assert "do they name the same" not in found.advice
+    merged = mapfusion.merge_maps(tables, sigma_m=sigma_m)
+    assert "project them to metres, such as UTM" in merged.advice
+
+
+@pytest.mark.parametrize("labels", [False, True])
+@pytest.mark.parametrize("sigma_m", [10.0, 500.0])
+def test_a_sigma_as_large_as_the_map_is_told(labels: bool, sigma_m: float) -> None:
+    tables = []
+    for own, rows in zip(two_maps(), (np.arange(60), np.r_[:40, 60:80]), strict=True):
+        table = pd.DataFrame(own.position_m[:, :2], columns=["x_m", "y_m"])
+        tables.append(table.assign(label=rows) if labels else table)
+    found = mapfusion.align_maps(*tables, sigma_m=sigma_m)
+    assert not found.accepted
+    assert f"landmarks of a have a median sigma of {sigma_m:.3g} m in a map" in found.advice
+    assert found.advice.endswith("too large or in another unit?")
+
+
 def test_results_are_described_in_a_line(found: MapAlignment) -> None:
     merged = mapfusion.merge_maps(two_maps())
     for result in (found, merged, found.map_a):
