@@ -87,6 +87,7 @@ _DESCRIPTOR_LIKE = re.compile(
     r"(desc|descr|descriptors|des|feat|feature|features|vec|vector|emb|embedding)(_?\[?\d{1,9}\]?)?"
     r"|f_?\d{1,9}"
 )
+_NUMBER_LABELS = "number the landmarks 0, 1, 2, ..., with the same number in all maps and logs"
 _MAX_NAMED = 3  # columns with similar names in one message
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
 
@@ -304,6 +305,7 @@ def _is_number(text: str) -> bool:
 def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Array | None:
     """Return a column in the type of the schema, or its default; None if it is required."""
     default = 0.0 if planar and field.name in HEIGHT else default_of(field)
+    remedy = f"; {_NUMBER_LABELS}" if field.name == "label" else ""
     try:
         if pa.types.is_fixed_size_list(field.type):
             return _rows_of_numbers(path, table, field)
@@ -313,12 +315,18 @@ def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Ar
         values = table.column(field.name).combine_chunks()
         is_number = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
         if not is_number and values.null_count < len(values):
-            raise InputError(f"{path}: column {field.name} {_no_number(values)}")
+            raise InputError(f"{path}: column {field.name} {_no_number(values)}{remedy}")
         is_float = pa.types.is_floating(field.type)
-        if (
-            pa.types.is_floating(values.type) and not is_float
-        ):  # pandas stores integers with gaps as floats
-            values = pa.array(values.to_numpy(zero_copy_only=False), from_pandas=True)
+        if is_number and not is_float:
+            given, limits = values.to_numpy(zero_copy_only=False), np.iinfo(str(field.type))
+            inside = (given >= limits.min) & (given <= limits.max) & (given % 1 == 0)
+            wrong = np.flatnonzero(~inside & ~np.isnan(given))
+            if len(wrong):
+                found = f"is {given[wrong[0]]:.15g} in row {wrong[0]}"
+                wanted = f"expected a whole number up to {limits.max}"
+                raise InputError(f"{path}: column {field.name}: {found}, {wanted}{remedy}")
+            # pandas stores integers with gaps as floats
+            values = pa.array(given, from_pandas=True)
         empty = np.nan if is_float else default  # pandas stores NaN as an empty cell
         if values.null_count and empty is None:
             row = values.is_null().to_pylist().index(True)

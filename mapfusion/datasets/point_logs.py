@@ -68,6 +68,7 @@ _LONGEST_HOLD_S = 1.0  # before the first and after the last pose the robot is t
 # units give more, and then no two rows lie within the measurements.
 _LARGEST_STEP = 300.0
 _LARGEST_BEARING = 2 * np.pi  # conventions are -pi to pi and 0 to 2 pi; degrees lie beyond
+_SHARE_OF_DEGREES = 0.1  # of bearings beyond; fewer are single mistakes
 _MAX_LABELS = 3  # in one message
 _VELOCITY_FIELDS = ["speed_m_s", "turn_rate_rad_s"]
 _POLAR_FIELDS = ["range_m", "bearing_rad"]
@@ -332,7 +333,12 @@ def _read_ranges(path: Path, settings: RangesSettings) -> Measurements:
     table, attributes = _read_timed(path, RANGES)
     positive = "ranges are positive, in metres; remove rows without a return"
     require_cells(path, table, ["range_m"], lambda r: np.isfinite(r) & (r > 0), positive)
-    limit = "bearings are in radians, -pi to pi or 0 to 2 pi; are they degrees?"
+    finite = "give a finite number, or remove the row"
+    require_cells(path, table, ["bearing_rad"], np.isfinite, finite)
+    size = np.abs(column(table, "bearing_rad"))
+    limit = "bearings are in radians, -pi to pi or 0 to 2 pi"
+    if size.max() <= 360 and np.mean(size > _LARGEST_BEARING) > _SHARE_OF_DEGREES:
+        limit += "; are they degrees?"
     require_cells(path, table, ["bearing_rad"], lambda b: np.abs(b) <= _LARGEST_BEARING, limit)
     lacking = [] if settings.range_sigma_m or settings.range_sigma_ratio else ["range_sigma_m"]
     lacking += [] if settings.bearing_sigma_rad else ["bearing_sigma_rad"]

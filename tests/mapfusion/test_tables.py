@@ -200,12 +200,17 @@ def spoilt(frame, column, value, row=7):
         ("cov_xx_m2", -1.0, "covariance_m2: not positive definite in row 7"),
         ("cov_xy_m2", 0.011, "covariance_m2: not positive definite in row 7"),
         ("cov_zz_m2", 0.0, "covariance_m2: not positive definite in row 7"),
-        ("count", 2.5, "column count: .*truncated"),
-        ("count", 2**40, "column count: .*not in range"),
+        ("count", 2.5, "column count: is 2.5 in row 7, expected a whole number up to 2147483647$"),
+        ("count", 2**40, "column count: is 1099511627776 in row 7, expected a whole number up to"),
+        (
+            "label",
+            3.5,
+            "column label: is 3.5 in row 7, expected a whole number .*; number the land",
+        ),
     ],
 )
 def test_values_nothing_can_be_computed_with(tmp_path, rng, column, value, message):
-    frame = spoilt(plain_map(rng, count=3), column, value)
+    frame = spoilt(plain_map(rng, count=3, label=range(N)), column, value)
     with pytest.raises(InputError, match=message) as caught:
         read_map(write(frame, tmp_path / "m.parquet"))
     assert str(tmp_path / "m.parquet") in str(caught.value)
@@ -217,6 +222,9 @@ def test_tables_that_are_wrong_as_a_whole(tmp_path, rng):
         "row 30 repeats row 3": pd.concat([frame, frame[3:4]]),
         "no column x_m, y_m;": frame.drop(columns=["x_m", "y_m"]),
         "column x_m holds 'near' in row 0, expected a number": frame.assign(x_m="near"),
+        "column label holds 'tree2' in row 0, expected a number; number the landmarks 0, 1, 2, ...,": frame.assign(
+            label=["tree2", "tree3"] * (N // 2)
+        ),
         "column x_m holds bool, not numbers": frame.assign(x_m=True),
         "descriptor: lists of 2 and 3 numbers": frame.assign(
             descriptor=[[1.0, 2.0]] + [[1.0, 2.0, 3.0]] * (N - 1)

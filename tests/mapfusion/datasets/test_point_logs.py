@@ -170,6 +170,15 @@ def test_noise_must_be_stated_and_bearings_are_radians(tmp_path: Path) -> None:
     table.assign(bearing_rad=np.degrees(table["bearing_rad"])).to_csv(path, index=False)
     with pytest.raises(InputError, match="are they degrees"):
         import_recording("ranges", tmp_path / "R", tmp_path / "logs", NOISE["ranges"])
+    for cell, said in (
+        (np.nan, "column bearing_rad: is nan in row 3; give a finite number, or remove the row"),
+        (np.inf, "column bearing_rad: is inf in row 3; give a finite number, or remove the row"),
+        (9.0, "column bearing_rad: is 9 in row 3; bearings are in radians, -pi to pi or 0 to 2 pi"),
+    ):
+        table.loc[3, "bearing_rad"] = cell
+        table.to_csv(path, index=False, na_rep="nan")
+        with pytest.raises(InputError, match=f"{said}; see"):
+            import_recording("ranges", tmp_path / "R", tmp_path / "logs", NOISE["ranges"])
 
 
 @pytest.mark.parametrize(
