@@ -62,6 +62,7 @@ from mapfusion.tables import (
 )
 
 NO_TRACK = -1
+_MAX_NAMED = 5  # logs in one message
 # Limit of the heading increment between two frames, as a number. Larger turns are not observable
 # modulo 360 degrees. The limit admits a log in degrees, so that a later check can name the wrong
 # unit.
@@ -321,6 +322,17 @@ def read_log(folder: str | Path) -> RobotLog:
     path = table_path(folder, "frames")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder (expected a robot log with frames.parquet)")
+    if not path.is_file():
+        logs = [each for each in sorted(folder.iterdir()) if table_path(each, "frames").is_file()]
+        if logs:
+            names = ", ".join(each.name for each in logs[:_MAX_NAMED])
+            names += ", ..." if len(logs) > _MAX_NAMED else ""
+            found = f"is a folder of {len(logs)} robot logs ({names})" if logs[1:] else "is no log"
+            raise InputError(f"{folder}: {found}; name one log, such as {logs[0]}")
+        for kind in ("ranges", "points"):
+            if table_path(folder, kind).is_file():
+                made = f"`mapfusion import {kind} {folder} -o logs` makes a log of it"
+                raise InputError(f"{folder}: is a recording, not a robot log; {made}")
     frames, attributes = read_open_table(path, FRAMES)
     _require_numbered(path, frames)
     finite = "give a finite number"

@@ -285,7 +285,8 @@ def _log_command(format_name: str) -> Callable[..., None]:
         findings: list[tuple[str, Finding]] = []
         for path in paths:
             log, truth, stated = read_log(path), read_true_poses(path), FastSlamParameters()
-            found = list(check_log(log, stated.motion).findings)
+            checked = check_log(log, stated.motion)
+            found = list(checked.findings)
             sound = not any(finding.kind == "odometry" for finding in found)
             if truth is not None and (wrong := finding_of_truth(log, truth, stated.motion, sound)):
                 found.append(wrong)
@@ -293,6 +294,8 @@ def _log_command(format_name: str) -> Callable[..., None]:
             chosen = f"associated by {association_for(log, stated.association)}"
             counts = f"{len(log)} frames, {len(log.observations)} observations"
             print_lines([f"{log.robot}: {counts}, {chosen} (slam.filter.association)"])
+            if checked.unchecked:
+                options.print_to_stderr(f"warning: {log.robot}: {checked.unchecked}")
         print_paths(output, paths)
         _print_findings(findings, "observations", "maps of these logs would be wrong")
 

@@ -6,7 +6,7 @@ import json
 import re
 import reprlib
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -171,11 +171,14 @@ def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> An
     if recorded:
         own = _SIMULATION_S_OWN.items()
         data = {k: v for k, v in data.items() if (k, v) not in own}
-    if drawn and data.keys() & {"world", "robots", "logs"}:
+    if drawn and (others := data.keys() & {"world", "robots", "logs"}):
+        _require_not_added(where, place, {"generate"}, others)
         raise InputError(f"{where}: give either generate, or world and robots, or logs")
     needed = {"drive"} if drawn else _WORLD
     unclear = bool(data.keys() & _WORLD) if recorded else not data.keys() >= needed
     if unclear and data.keys() <= _FIELDS.keys():  # otherwise report the unknown name
+        if recorded:
+            _require_not_added(where, place, {"logs"}, data.keys() & _WORLD)
         raise InputError(f"{where}: {_EITHER}")
     if drawn:
         asked = _validated(where, GeneratedScenario, data, place)
@@ -186,6 +189,21 @@ def scenario_of(data: dict[str, Any], where: str, place: Place = _nowhere) -> An
         made["render"] = asked.render.model_dump()
         data = {key: value for key, value in data.items() if key != "generate"} | made
     return _validated(where, Recording if recorded else Simulation, data, place)
+
+
+def _require_not_added(where: str, place: Place, *kinds: Set[str]) -> None:
+    """Raise InputError for an override that adds a section to a scenario of another kind.
+
+    Args:
+        where: the file, with which the message begins.
+        place: returns the override that gives the value at a location.
+        kinds: the sections that exclude each other, in two sets.
+    """
+    for own, others in (kinds, kinds[::-1]):
+        for name in sorted(own):
+            if (by := place((name,))).startswith(", --set"):
+                has = f"this scenario has {' and '.join(sorted(others))}, and no {name}"
+                raise InputError(f"{where}{by}: {has}; leave it out ({_EITHER})")
 
 
 def made_settings(

@@ -31,8 +31,10 @@ from mapfusion.datasets.motion_agreement import (
     pose_mistakes,
 )
 from mapfusion.datasets.relative_motion import (
+    MIN_MOTIONS,
     PLANAR,
     Motions,
+    links_needed,
     motions_of_poses,
     observed_spans,
     tracked_by_position,
@@ -409,11 +411,13 @@ class LogConsistency(NamedTuple):
         findings: contradictions; empty for a sound log.
         jumps: single increments that are not used.
         noise: noise of the odometry; meaningless if the odometry as a whole is wrong.
+        unchecked: reason why the odometry could not be compared; empty if it was.
     """
 
     findings: tuple[Finding, ...]
     jumps: tuple[Jump, ...]
     noise: OdometryNoise
+    unchecked: str = ""
 
 
 def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
@@ -437,8 +441,15 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
         noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
         if not (noisier and _agrees_on_average(spans[0], noisier)):
             return LogConsistency((finding,), (), found)
-    jumps = tuple(find_jumps(log, spans[0], noise))
-    return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found)
+    jumps, unchecked, needed = tuple(find_jumps(log, spans[0], noise)), "", links_needed(log)
+    if found.n_observed < MIN_MOTIONS:
+        counts = np.bincount(log.iteration, minlength=len(log))
+        n_full = int(np.count_nonzero(counts >= needed))
+        unchecked = (
+            f"the odometry is not checked: {n_full} of {len(log)} frames show {needed} points or "
+            f"more, and {found.n_observed} share as many with the frame before"
+        )
+    return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found, unchecked)
 
 
 def outside_gate(log: RobotLog, landmark: np.ndarray) -> tuple[int, int]:

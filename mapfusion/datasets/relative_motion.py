@@ -114,6 +114,11 @@ def links(
     return a[mutual], b[other[mutual]]
 
 
+def links_needed(log: RobotLog) -> int:
+    """Return the number of points that two frames must share to determine a motion."""
+    return _MIN_PLANAR_LINKS if log.planar else MIN_LINKS
+
+
 def tracked_by_position(log: RobotLog) -> RobotLog:
     """Return the log with tracks of points that are nearest neighbours in consecutive frames.
 
@@ -288,7 +293,7 @@ def _observed_steps(log: RobotLog) -> tuple[Motions, float | None]:
     """
     factor = None
     steps = observed_motions(log)
-    min_links = _MIN_PLANAR_LINKS if log.planar else MIN_LINKS
+    min_links = links_needed(log)
     if 2 * len(steps.end) < len(log) - 1:
         starts = log.frame_starts()
         tried = np.unique(np.linspace(1, len(log) - 1, _TRIAL_FRAMES).astype(int)).tolist()

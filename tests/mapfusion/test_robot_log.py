@@ -284,3 +284,22 @@ def test_wrong_arguments_are_named():
         replace(log, odometry=log.odometry[:2])
     with pytest.raises(ValueError, match="iteration"):
         replace(log, iteration=log.iteration[:2])
+
+
+def test_folders_above_logs_and_recordings_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"frames\.parquet: no such file"):
+        read_log(tmp_path)
+    for k in range(7):
+        (tmp_path / f"R{k}").mkdir()
+        (tmp_path / f"R{k}" / "frames.csv").write_text("iteration\n")
+        said = "is no log; name one log, such as .*R0$"
+        if k:
+            more = ", ..." if k > 4 else ""
+            names = ", ".join(f"R{each}" for each in range(min(k + 1, 5)))
+            said = rf"is a folder of {k + 1} robot logs \({names}{more}\); name one log, such as"
+        with pytest.raises(InputError, match=said):
+            read_log(tmp_path)
+    (tmp_path / "empty" / "ranges.csv").write_text("time_s\n")
+    with pytest.raises(InputError, match=r"`mapfusion import ranges .*empty -o logs` makes a log"):
+        read_log(tmp_path / "empty")

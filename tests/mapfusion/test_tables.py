@@ -222,7 +222,7 @@ def test_tables_that_are_wrong_as_a_whole(tmp_path, rng):
         "row 30 repeats row 3": pd.concat([frame, frame[3:4]]),
         "no column x_m, y_m;": frame.drop(columns=["x_m", "y_m"]),
         "column x_m holds 'near' in row 0, expected a number": frame.assign(x_m="near"),
-        "column label holds 'tree2' in row 0, expected a number; number the landmarks 0, 1, 2, ...,": frame.assign(
+        "label holds 'tree2' in row 0, expected a number; number the landmarks": frame.assign(
             label=["tree2", "tree3"] * (N // 2)
         ),
         "column x_m holds bool, not numbers": frame.assign(x_m=True),

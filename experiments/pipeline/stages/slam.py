@@ -195,10 +195,9 @@ def checked_log(
             factor = noise.factor
             used = "the filter uses the larger noise (slam.noise: stated keeps slam.filter.motion)"
         findings = (*findings, Finding("noise", -1, f"{noise.text}; {used}"))
-    elif noise.n_observed < MIN_MOTIONS < len(log) and source is NoiseSource.FROM_LOG:
-        unknown = "frames share no points, which would show how noisy the odometry is"
+    elif found.unchecked and len(log) > MIN_MOTIONS:
         used = "the filter uses the noise of slam.filter.motion"
-        findings = (*findings, Finding("noise", -1, f"{unknown}; {used}"))
+        findings = (*findings, Finding("noise", -1, f"{found.unchecked}; {used}"))
     used_log, covariance = without_jumps(log, found.jumps, odometry_covariance)
     used = association_for(log, stated.association)
     if used is not stated.association:

@@ -53,7 +53,11 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
         ("name=../x", ["name", "pattern"]),
         ("name=/x", ["name", "pattern"]),
         ("robots=[]", ["world, robots and drive, or logs"]),
-        ("logs=[nowhere]", ["world, robots and drive, or logs"]),
+        ("logs=[nowhere]", ["--set logs=[nowhere]: this scenario has drive and robots and world"]),
+        (
+            "generate.robts=3",
+            ["--set generate.robts=3: this scenario has robots and world, and no generate"],
+        ),
         ("world.walls.0.points=[[0, 0]]", ["world.walls.0.points", "2"]),
         ("world.walls.0.mirrored=true", ["world.walls.0", "mirrored", "needs a look"]),
         ("world.walls.0.look=a b", ["world.walls.0.look", "pattern"]),

@@ -113,3 +113,19 @@ def test_import_compares_odometry_truth_and_observations(
     assert f"warning: R1: {said}" in wrong.err
     assert "millimetres" in wrong.err
     assert ("odometry and observations contradict each other" in wrong.err) == bool(code)
+
+
+def test_a_log_with_one_observation_a_frame_is_said_to_be_unchecked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_recording(tmp_path / "R1", {}, "points")
+    path = tmp_path / "R1" / "points.csv"
+    call = ("import", "points", tmp_path / "R1", "-o", tmp_path / "logs", "--param", "sigma_m=0.05")
+    assert "not checked" not in command(capsys, *call).err
+    pd.read_csv(path).drop_duplicates("time_s").to_csv(path, index=False)
+    said = "the odometry is not checked: 0 of 40 frames show 2 points or more, and 0 share"
+    told = command(capsys, *call)
+    assert told.code == 0
+    assert f"warning: R1: {said}" in told.err
+    mapped = command(capsys, "slam", tmp_path / "logs" / "R1", "-o", tmp_path / "m.parquet")
+    assert f"{said} as many with the frame before; the filter uses the noise of" in mapped.err

@@ -186,3 +186,16 @@ def test_a_pipe_is_read_once(tmp_path: Path) -> None:
     with pytest.raises(InputErrors, match=r"pipe: camera\.focal_px: is true, expected"):
         load_scenario(path)
     writer.join()
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "said"),
+    [
+        ("apart", "robots.0.name=A", "this scenario has generate, and no robots; leave it out"),
+        ("mrclam7", "drive.frames=9", "this scenario has logs, and no drive; leave it out"),
+    ],
+)
+def test_a_section_of_another_kind_of_scenario(name: str, override: str, said: str) -> None:
+    path = Path(__file__).parents[3] / "scenarios" / f"{name}.yaml"
+    with pytest.raises(InputError, match=rf"yaml, --set {override}: {said} \(give either world"):
+        load_scenario(path, [override])
