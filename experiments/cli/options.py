@@ -204,7 +204,9 @@ def announce_compilation(as_json: bool = False) -> None:
     """
     from mapfusion.geometry.numerics import before_compilation
 
-    told = "compiling numerical kernels that no earlier command needed; at most half a minute"
+    told = (
+        "compiling numerical kernels that no earlier command needed; later commands start at once"
+    )
     before_compilation(None if as_json else lambda: typer.echo(told, file=sys.stderr))
 
 

@@ -56,6 +56,7 @@ from mapfusion.fusion.map_merging import (
     advice,
     best_alignment,
     motion_text,
+    sigma_number,
     sigma_text,
 )
 from mapfusion.fusion.team_graph import EdgeStatus
@@ -375,14 +376,14 @@ def print_alignments(alignments: Sequence[MapAlignment]) -> None:
     ]
     bounds = ["≥ " if each else "" for each in found["lower_bound"]]
 
-    def texts(sigma: Iterable[float], form: str) -> list[str]:
+    def texts(sigma: Iterable[float], digits: int) -> list[str]:
         both = zip(bounds, sigma, strict=True)
-        return ["–" if math.isnan(x) else f"{bound}{x:{form}}" for bound, x in both]
+        return ["–" if math.isnan(x) else f"{bound}{sigma_number(x, digits)}" for bound, x in both]
 
     shown = found.assign(
         verdict=[str(each.status).replace("_", " ") for each in alignments],
-        sigma_m=texts(at_overlap, ".3f"),
-        sigma_rad=texts(sigma_rad, ".4f"),
+        sigma_m=texts(at_overlap, 3),
+        sigma_rad=texts(sigma_rad, 4),
         inliers=found["n_inliers"].map(str) + "/" + found["n_correspondences"].map(str),
         time=(1e3 * found["elapsed_s"]).map(two_digits),
     )

@@ -38,9 +38,10 @@ class _Counting(Composer):
         return super().compose_node(parent, index)
 
 
-def read_mapping(
-    path: Path, what: str = "a scenario, for example quick.yaml", keys: str = "scenario keys"
-) -> dict[str, Any]:
+_SCENARIO = "a scenario; `mapfusion scenarios` lists the shipped ones, which have no ending"
+
+
+def read_mapping(path: Path, what: str = _SCENARIO, keys: str = "scenario keys") -> dict[str, Any]:
     """Read one mapping from a YAML or JSON file.
 
     Args:

@@ -354,7 +354,12 @@ def sigma_text(covariance: Float, lower_bound: bool) -> str:
     """Write the standard deviations of the distance and the angle of a motion."""
     m, rad = motion_sigma(covariance)
     bound = "≥ " if lower_bound else ""
-    return f"sigma {bound}{m:.3f} m, {bound}{rad:.4f} rad"
+    return f"sigma {bound}{sigma_number(m, 3)} m, {bound}{sigma_number(rad, 4)} rad"
+
+
+def sigma_number(sigma: float, digits: int) -> str:
+    """Write a standard deviation with some decimals; a small one with two significant digits."""
+    return f"{sigma:.{digits}f}" if sigma >= 10 ** (1 - digits) else f"{sigma:.2g}"
 
 
 def _html(text: str, table: "pd.DataFrame") -> str:

@@ -188,7 +188,7 @@ def test_error_in_a_worker_process_is_one_line(
     [
         (["frobnicate"], ["frobnicate"]),
         (["run"], ["SCENARIO"]),
-        (["run", "nowhere.yaml"], ["nowhere.yaml", "no such file"]),
+        (["run", "nowhere.yaml"], ["nowhere.yaml", "no such file", "`mapfusion scenarios` lists"]),
         (["run", "x.yaml", "--bogus"], ["--bogus"]),
         (["run", "x.yaml", "--seed", "x"], ["--seed", "integer"]),
         (["run", "x.yaml", "--jobs", "0"], ["--jobs", "1"]),

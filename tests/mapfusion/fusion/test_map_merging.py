@@ -20,7 +20,7 @@ from PIL import Image
 import mapfusion
 from mapfusion.align.alignment import Status
 from mapfusion.errors import TellingWarning
-from mapfusion.fusion.map_merging import MapAlignment, advice, best_alignment
+from mapfusion.fusion.map_merging import MapAlignment, advice, best_alignment, sigma_text
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap, write_map
 from mapfusion.plotting import ELLIPSE_BOUND, GREEN, bounds, largest_magnification, plot_plans
@@ -160,6 +160,15 @@ def test_results_are_described_in_a_line(found: MapAlignment) -> None:
     assert "&lt;i&gt;" in hostile._repr_html_()
 
 
+@pytest.mark.parametrize(
+    ("sigma", "said"),
+    [(0.25, "sigma 0.250 m, 0.2500 rad"), (3.2e-5, "sigma ≥ 3.2e-05 m, ≥ 3.2e-05 rad")],
+)
+def test_small_sigmas_are_not_rounded_to_zero(sigma: float, said: str) -> None:
+    covariance = np.diag([0.5, 0.5, 1.0]) * sigma**2
+    assert sigma_text(covariance, lower_bound=sigma < 0.1) == said
+
+
 def test_the_advice_says_what_to_use_and_how_sure_it_is(found: MapAlignment) -> None:
     x, y, theta = found.T_a_b
     overlap = found.registered.refined.overlap
@@ -167,7 +176,7 @@ def test_the_advice_says_what_to_use_and_how_sure_it_is(found: MapAlignment) -> 
     sigma_m, sigma_rad = se2.motion_sigma(overlap.covariance)
     said = found.advice
     assert f"Use T_a_b = ({x:.3f} m, {y:.3f} m, {theta:.4f} rad) of ransac" in said
-    assert f"sigma ≥ {sigma_m:.3f} m, ≥ {sigma_rad:.4f} rad" in said
+    assert f"sigma ≥ {sigma_m:.2g} m, ≥ {sigma_rad:.2g} rad" in said
     assert f"{found.inlier.sum()} of {len(found.inlier)} correspondences" in said
     again = replace(found, aligner="other")
     assert "all 2 methods agree" in advice([found, again])
