@@ -57,11 +57,17 @@ class InvalidAnswerError(Exception):
 
 def checked_aligner(method: Any) -> Aligner:
     """Return the aligner of a plug-in's method; raise InvalidAnswerError if it is not a method."""
-    _require_type("randomised is", getattr(method, "randomised", None), bool)
-    if callable(getattr(method, "align", None)):
+    has_align, has_find = (callable(getattr(method, name, None)) for name in ("align", "find"))
+    lacking = "has no method `find(self, pairs, rng)`, which returns a Fit or an Undetermined "
+    lacking += (
+        "(nor `align(self, map_a, map_b, correspondences, rng)`); see `mapfusion docs plugins`"
+    )
+    _require(has_align or has_find, lacking)
+    told = hasattr(method, "randomised")
+    _require(told, "has no attribute `randomised`: set it to True if it uses `rng`, else to False")
+    _require_type("randomised is", method.randomised, bool)
+    if has_align:
         return method
-    has_find = callable(getattr(method, "find", None))
-    _require(has_find, "has neither a method find nor a method align")
     needs, height = getattr(method, "needs", None), getattr(method, "height", None)
     _require_type("needs is", needs, Needs, type(None))
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapfusion.fusion.map_merging import sigma_number
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import write_map
 from tests.helpers.made_up_maps import landmark_map
@@ -104,8 +105,9 @@ def test_merge(maps: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert shown.code == 0
     assert f"20 landmarks in {fused}" in shown.out
     sigma_m = (stated["cov_xx_m2"] + stated["cov_yy_m2"]) ** 0.5
+    sigma_rad = stated["cov_tt_rad2"] ** 0.5
     assert found["lower_bound"] is True  # these maps have no joint covariance
-    assert f"sigma ≥ {sigma_m:.3f} m, ≥ {stated['cov_tt_rad2'] ** 0.5:.4f} rad" in shown.out
+    assert f"sigma ≥ {sigma_number(sigma_m, 3)} m, ≥ {sigma_number(sigma_rad, 4)} rad" in shown.out
 
 
 def test_slam(tiny_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -436,7 +436,7 @@ def test_undetermined_and_what_it_needs_are_answers_too() -> None:
     ("name", "parameters", "reason"),
     [
         ("finder", {"what": "needs a number"}, "plug-in finder: needs is int, expected Needs"),
-        ("neither", {}, "plug-in neither: has neither a method find nor a method align"),
+        ("neither", {}, r"plug-in neither: has no method `find\(self, pairs, rng\)`, which"),
     ],
 )
 def test_what_is_no_method_is_told_before_a_run(name: str, parameters: dict, reason: str) -> None:
