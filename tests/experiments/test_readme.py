@@ -3,6 +3,7 @@
 import re
 import shlex
 import tomllib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from typer.main import get_command
 
 from experiments.cli.main import app
 from experiments.reports.run_screen import closing_lines
+from mapfusion.errors import TellingWarning
 from mapfusion.landmark_map import read_map
 from tests.helpers.tiny_scenario import command
 
@@ -69,9 +71,12 @@ def test_own_maps_are_aligned_and_merged_also_by_an_own_aligner(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     maps, aligner = (block for kind, block in BLOCKS if kind == "python")
-    exec(compile(maps, "README", "exec"), {})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TellingWarning)
+        exec(compile(maps, "README", "exec"), {})
     (tmp_path / "mine.py").write_text(aligner)
-    assert len(read_map(tmp_path / "fused.csv")) == 60
+    assert len(read_map(tmp_path / "fused.parquet")) == 60
+    (tmp_path / "fused.parquet").unlink()
     used = re.match(r"Use T_a_b = \((.*) m, (.*) m, (.*) rad\)", capsys.readouterr().out)
     assert used is not None
     # south is rounded to 0.1 m: 30 landmarks leave some millimetres
