@@ -34,7 +34,8 @@ _LEVEL, _PLANE_DIMENSIONS = 0.95, 2
 ELLIPSE_BOUND = chi_square_bound(_LEVEL, _PLANE_DIMENSIONS)  # squared Mahalanobis distance
 _OUTLIER_SHARE = 0.005  # on each side: a distant outlier must not shrink the map
 _MARGIN, _MIN_MARGIN_M = 0.05, 0.3  # of the view's extent
-_ELLIPSE_SHARE = 1 / 60  # of the view, for the semi-axis of a typical ellipse
+_ELLIPSE_SHARE = 1 / 60  # of the view, for the semi-axis of the typical ellipse of a part
+_LARGEST_ELLIPSE = 2.0  # times this share, for the part with the largest ellipses
 _GAP = 0.15  # between maps that are not aligned, as a share of the width of the first
 _MARKERS = ("o", "^", "v", "x", "d", "*")
 _PAGE_WIDTH_IN, _EDGE_IN = 8.0, 0.1
@@ -45,14 +46,16 @@ _TITLE_LINE_IN, _HEADING_LINE_IN, _LEGEND_ROW_IN = (
     0.19,
 )  # of type of at most 8.5 points
 _LARGEST_RATIO, _LEAST_RATIO = 1.3, 0.35  # of height to width of the large plan
-_SMALL_PER_ROW = 3
+_MOST_PER_ROW = 3  # small plans
+_LARGEST_SINGLE_RATIO = 0.6  # of height to width of a small plan that is alone in its row
 # Characters a line, of which the widest usual text fits the page: the heading, the titles of the
-# large and of a small plan, and the legend in one column, in two and in three.
-_WRAP, _TITLE_WRAP, _SMALL_TITLE_WRAP = 118, 105, 34
+# large plan and of one, two and three small plans in a row, the legend in one to three columns.
+_WRAP, _TITLE_WRAP, _SMALL_TITLE_WRAPS = 118, 105, (105, 52, 34)
 _LEGEND_WRAPS = (100, 50, 34)
 # Field of a plan, colour, width and style of its lines; those drawn last lie above the others.
 _LINKS = (("rejected", REJECTED_COLOUR, 0.5, "dotted"), ("accepted", ACCEPTED_COLOUR, 1.2, "solid"))
 _LINK_NAMES = {"rejected": "rejected", "accepted": "supporting"}
+_SMALL_SCALES = (0.9, 0.8, 0.6)  # of markers and lines of one, two and three small plans in a row
 _TITLE_POINTS, _SMALL_TITLE_POINTS = 8.5, 7.5
 _RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # part of Matplotlib: the same on every machine
@@ -189,9 +192,10 @@ def largest_magnification(size_m: float, limit_m: float) -> int:
 def magnification(plan: Plan) -> int:
     """Return the factor at which most ellipses of a plan are legible and do not cover others."""
     (low, high), parts = bounds(plan), [part.covariance_m2 for part in plan.parts]
-    sizes_m = np.concatenate([semi_axes(covariance)[0] for covariance in parts])
-    typical_m = float(np.median(sizes_m)) if len(sizes_m) else 0.0
-    return largest_magnification(typical_m, _ELLIPSE_SHARE * float((high - low).max()))
+    typical_m = [float(np.median(semi_axes(each)[0])) for each in parts if len(each)] or [0.0]
+    # Ellipses of fused landmarks are the smallest; they must be larger than their markers.
+    size_m = max(min(typical_m), max(typical_m) / _LARGEST_ELLIPSE)
+    return largest_magnification(size_m, _ELLIPSE_SHARE * float((high - low).max()))
 
 
 def plot_plans(plans: Sequence[Plan], heading: str) -> Figure:
@@ -215,11 +219,14 @@ def plot_plans(plans: Sequence[Plan], heading: str) -> Figure:
         low, high = bounds(first)
         wide_in = _PAGE_WIDTH_IN - _LEFT_IN - 2 * _EDGE_IN
         ratio = np.clip((high - low)[1] / (high - low)[0], _LEAST_RATIO, _LARGEST_RATIO)
-        small_in = _PAGE_WIDTH_IN / _SMALL_PER_ROW - _LEFT_IN - _EDGE_IN
         rows = [[(first, _TITLE_WRAP, wide_in, ratio * wide_in)]]
-        for k in range(0, len(others), _SMALL_PER_ROW):
-            row = others[k : k + _SMALL_PER_ROW]
-            rows.append([(plan, _SMALL_TITLE_WRAP, small_in, small_in) for plan in row])
+        per_row = min(max(len(others), 1), _MOST_PER_ROW)
+        small_in = _PAGE_WIDTH_IN / per_row - _LEFT_IN - 2 * _EDGE_IN / per_row
+        high_in = small_in * (min(ratio, _LARGEST_SINGLE_RATIO) if per_row == 1 else 1.0)
+        for k in range(0, len(others), per_row):
+            row = others[k : k + per_row]
+            wrap = _SMALL_TITLE_WRAPS[per_row - 1]
+            rows.append([(plan, wrap, small_in, high_in) for plan in row])
 
         boxes, top_in = [], _EDGE_IN + len(lines) * _HEADING_LINE_IN  # from the upper edge
         for row in rows:
@@ -228,7 +235,7 @@ def plot_plans(plans: Sequence[Plan], heading: str) -> Figure:
             for k, ((plan, _, width_in, height_in), title) in enumerate(
                 zip(row, titles, strict=True)
             ):
-                left_in = _LEFT_IN + k * (width_in + _LEFT_IN + _EDGE_IN)
+                left_in = _LEFT_IN + k * (width_in + _LEFT_IN)
                 boxes.append((plan, title, left_in, top_in, width_in, height_in))
             top_in += row[0][-1] + _BELOW_IN
         page = np.array([_PAGE_WIDTH_IN, top_in + legend_in])
@@ -243,7 +250,8 @@ def plot_plans(plans: Sequence[Plan], heading: str) -> Figure:
         for plan, title, left_in, top_in, width_in, height_in in boxes:
             corner, size = np.array([left_in, page[1] - top_in - height_in]), [width_in, height_in]
             axes = figure.add_axes((*(corner / page), *(size / page)))  # type: ignore[arg-type]
-            _draw(axes, plan, title, (width_in, height_in), 1.0 if plan is first else 0.6, factor)
+            scale = 1.0 if plan is first else _SMALL_SCALES[per_row - 1]
+            _draw(axes, plan, title, (width_in, height_in), scale, factor)
     return figure
 
 
@@ -288,7 +296,8 @@ def _ring(scale: float) -> dict[str, Any]:
 def _marker(part: Part, scale: float) -> dict[str, Any]:
     """Return the look of the landmarks of a part."""
     face = part.colour if part.marker == "x" else "none"
-    look = {"marker": part.marker, "markersize": 4.0 * scale, "linestyle": "none"}
+    size = 2.5 if part.colour == FUSED_COLOUR else 4.0  # fused landmarks have small ellipses
+    look = {"marker": part.marker, "markersize": size * scale, "linestyle": "none"}
     return look | {"color": part.colour, "markeredgewidth": 0.8 * scale, "markerfacecolor": face}
 
 

@@ -23,7 +23,14 @@ from mapfusion.errors import TellingWarning
 from mapfusion.fusion.map_merging import MapAlignment, advice, best_alignment, sigma_text
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap, write_map
-from mapfusion.plotting import ELLIPSE_BOUND, GREEN, bounds, largest_magnification, plot_plans
+from mapfusion.plotting import (
+    ELLIPSE_BOUND,
+    FUSED_COLOUR,
+    GREEN,
+    bounds,
+    largest_magnification,
+    plot_plans,
+)
 from tests.mapfusion.align.map_pairs import landmarks, unit_vectors
 
 T_A_B = np.array([3.0, -1.0, 0.5])
@@ -409,6 +416,19 @@ def test_the_legend_tells_the_enlargement_of_the_ellipses(found: MapAlignment) -
     np.testing.assert_allclose(np.asarray(collection.get_widths(), float), factor * own, rtol=1e-9)
     assert largest_magnification(1.0, 12.0) == 10
     assert largest_magnification(5.0, 1.0) == 1
+
+
+def test_a_merge_shows_ellipses_of_fused_landmarks_and_a_wide_plan_of_two_maps() -> None:
+    figure = mapfusion.merge_maps(two_maps()).plot()
+    fused, pair = figure.axes
+    assert pair.bbox.width == pytest.approx(fused.bbox.width, rel=0.01)
+    *_, (markers, ellipses) = zip(
+        fused.lines, [c for c in fused.collections if isinstance(c, EllipseCollection)], strict=True
+    )
+    assert markers.get_color() == FUSED_COLOUR
+    pixels_a_metre = fused.bbox.width / np.ptp(fused.get_xlim())
+    across = pixels_a_metre * np.asarray(ellipses.get_widths(), float)  # type: ignore[attr-defined]
+    assert np.median(across) > 3 * markers.get_markersize() * figure.dpi / 72
 
 
 def legend_of(figure: Figure) -> dict[str, Any]:
