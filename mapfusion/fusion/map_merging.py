@@ -352,7 +352,7 @@ def motion_text(T: Float) -> str:
 
 def sigma_text(covariance: Float, lower_bound: bool) -> str:
     """Write the standard deviations of the distance and the angle of a motion."""
-    m, rad = motion_sigma(covariance)
+    m, rad = map(float, motion_sigma(covariance))
     bound = "≥ " if lower_bound else ""
     return f"sigma {bound}{sigma_number(m, 3)} m, {bound}{sigma_number(rad, 4)} rad"
 
