@@ -312,7 +312,7 @@ def _motion_of_copies(pairs: Pairs, T_a_b: Float) -> Float:
     A fused map keeps the landmarks of one map that no other map has. Their distances to each other
     are equal in both maps. The other pairs displace the motion of all pairs by more than that.
     """
-    some = pairs[:: -(-len(pairs) // _MOST_COPIES)]
+    some = pairs[np.arange(0, len(pairs), -(-len(pairs) // _MOST_COPIES))]
     own = residual_covariances(T_a_b, some.covariance_a, some.covariance_b)
     variance = np.trace(own, axis1=1, axis2=2) / 2
     apart_a, apart_b = (
