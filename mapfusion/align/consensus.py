@@ -236,7 +236,7 @@ class Consensus:
         `level` is the index of s_drift in `variances_m2`, -1 without support.
         """
         if not np.all(np.isfinite(T_a_b)):
-            return Undetermined(f"no two of {len(pairs)} correspondences agree on a motion")
+            return Undetermined(f"no motion has the support of two of {len(pairs)} correspondences")
         if level < 0:
             return Undetermined("fewer than 2 correspondences support the motion found")
         variance_m2, support = self.variances_m2[level], pairs[inlier]
