@@ -258,6 +258,7 @@ _FEWEST_RATIOS = 20
 _SHIFTS = 8  # number of other pairs that each pair is compared with
 _SAME_SCALE = 1.2  # smaller factors may be calibration or drift
 _OTHER_WORLD = 100.0  # ratio of extents that differs in units rather than in the world
+_OTHER_SIZES = 10.0  # the same of median sizes of landmarks
 _UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
 
 
@@ -419,6 +420,7 @@ def match(
         shortage = ""
         if len(index_a) < FEW:
             shortage = "no motion lays landmarks of the maps on each other; matched by geometry"
+            shortage += _size_note(map_a, map_b)
         none = np.zeros(len(index_a))
         laid = Correspondences(index_a, index_b, none, shortage, parameters.size_tolerance)
         if one_floor:
@@ -491,6 +493,20 @@ def _placed(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Correspondences) -> C
         distance=pairs.distance[kept],
         set_aside="; ".join(told),
     )
+
+
+def _size_note(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
+    """Say that the sizes of two maps are in different units; empty if they may be in one."""
+    sizes_m = [
+        math.nan
+        if each.size_m is None or np.isnan(each.size_m).all()
+        else np.nanmedian(each.size_m)
+        for each in (map_a, map_b)
+    ]
+    if not max(sizes_m) >= _OTHER_SIZES * min(sizes_m):  # NaN fails
+        return ""
+    told = (f"{each.called} {_short(m)} m" for each, m in zip((map_a, map_b), sizes_m, strict=True))
+    return f"; median sizes: {', '.join(told)}: are both in metres?"
 
 
 def matched_by_geometry(map_a: LandmarkMap, map_b: LandmarkMap) -> bool:

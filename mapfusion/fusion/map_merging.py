@@ -8,7 +8,7 @@ import itertools
 import math
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -608,6 +608,7 @@ def load_maps(
 
     Raises:
         InputError: a file or a table is not as documented, or descriptors are of different kinds.
+        TypeError: a map is none of these.
     """
     loaded, kinds = list[LandmarkMap](), list[tuple[str, DescriptorKind | None]]()
     opened = list[tuple[str, LandmarkMap]]()
@@ -616,9 +617,12 @@ def load_maps(
             landmarks, place = each, each.called
         elif isinstance(each, str | os.PathLike):
             landmarks, place = read_map(Path(each), False, sigma_m, descriptor_metric), str(each)
-        else:
+        elif hasattr(each, "columns"):
             own = LandmarkMap.from_pandas(each, name, sigma_m, descriptor_metric)
             landmarks, place = own, name
+        else:
+            kinds_of_map = "a LandmarkMap, the path of a file or a pandas DataFrame"
+            raise TypeError(f"{name}: is {type(each).__name__}, expected {kinds_of_map}")
         loaded.append(landmarks)
         kinds.append((place, landmarks.descriptor_kind))
         if not isinstance(each, LandmarkMap):  # loaded before
@@ -686,6 +690,7 @@ def align_maps(
 
     Raises:
         InputError: a map cannot be read, or the descriptors are of different kinds.
+        TypeError: a map is no `LandmarkMap`, path or data frame.
         ValueError: the aligner is unknown.
     """
     a, b = load_maps({"a": map_a, "b": map_b}, sigma_m, descriptor_metric)
@@ -698,7 +703,7 @@ def align_maps(
 
 
 def merge_maps(
-    maps: "Sequence[MapLike]",
+    maps: "Iterable[MapLike]",
     *,
     aligner: "str | Method | Aligner | Registration" = "ransac",
     name: str = "",
@@ -729,6 +734,7 @@ def merge_maps(
             different kinds.
         ValueError: the aligner or the fuser is unknown.
     """
+    maps = list(maps)
     if len(maps) < 2:
         raise InputError("merge: give two maps or more")
     named = {f"map {k}": each for k, each in enumerate(maps, start=1)}

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from mapfusion.align.aligners import Aligner, MethodAligner, alignment_of_fit, as_aligner
 from mapfusion.align.alignment import (
@@ -27,6 +28,7 @@ from mapfusion.align.frames import (
 from mapfusion.align.refinement import Refinement
 from mapfusion.align.rigid_motion import fit_rigid, residual_covariances, residuals
 from mapfusion.geometry.numerics import Float, chi_square_bound
+from mapfusion.geometry.se2 import transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.verification.false_alarms import Verdict
 from mapfusion.verification.verdict import PairEvidence, PairVerifier, Verifier
@@ -278,11 +280,21 @@ class PairRegistration:
 def heights_of(pairs: Pairs, alignment: Alignment, gate_m: float) -> HeightDifference | None:
     """Compare the heights of two maps at the pairs within `gate_m` of an alignment in plan.
 
-    The pairs include those that fail the test of heights. Returns None for planar maps.
+    The pairs include those that fail the test of heights: of maps matched by geometry, the
+    landmarks that are nearest to each other in plan. Returns None for planar maps.
     """
     if pairs.planar:
         return None
     offered = pairs.correspondences.at_any_height
+    if pairs.by_geometry:
+        a, b = pairs.map_a.position_m[:, :2], pairs.map_b.position_m[:, :2]
+        moved = transform_points(alignment.T_a_b, b)
+        to_a, to_b = (
+            scipy.spatial.KDTree(a).query(moved)[1],
+            scipy.spatial.KDTree(moved).query(a)[1],
+        )
+        rows = np.flatnonzero(to_b[to_a] == np.arange(len(b)))
+        offered = Correspondences(to_a[rows], rows, np.zeros(len(rows)))
     free = pairs if offered is None else Pairs(pairs.map_a, pairs.map_b, offered)
     near = np.linalg.norm(residuals(alignment.T_a_b, free.p_a, free.p_b), axis=1) <= gate_m
     supports = np.isin(free.index_a, pairs.index_a[alignment.inlier])

@@ -257,7 +257,9 @@ def other_unit(
     there is none.
     """
     maps = pairs.map_a, pairs.map_b
-    extents_m = [float(np.ptp(each.position_m[:, :2], axis=0).max(initial=0.0)) for each in maps]
+    if not all(map(len, maps)):
+        return "", (False, False)
+    extents_m = [float(np.ptp(each.position_m[:, :2], axis=0).max()) for each in maps]
     trials = []
     for unit, size_m in _UNITS.items():
         for in_unit in ((True, True), (True, False), (False, True)):

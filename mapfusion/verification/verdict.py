@@ -75,6 +75,7 @@ _OVERCONFIDENT = 3.0
 # differs from it by 1/sqrt(3) of the stated sigmas, and maps whose landmarks share errors by 0.6 or
 # more. Standard deviations written as variances give far less.
 _UNDERCONFIDENT = 0.5
+_EQUAL = 1e-3
 _ENOUGH_PAIRS = 20  # pairs that chance makes agree so closely in fewer than one of 1000 maps
 _PATCH_REACH_M = 0.7  # largest distance between neighbouring corners of one texture
 _LEAST_OF_PATCH = 5  # landmarks
@@ -580,7 +581,11 @@ class PairVerifier:
         if scale >= _OVERCONFIDENT:
             times = f"the residuals are at least {scale:.2g} times as large as"
             return f"{times} the maps' covariances state"
-        if scale > _UNDERCONFIDENT or np.count_nonzero(alignment.inlier) < _ENOUGH_PAIRS:
+        # `shared_observations` tells maps whose landmarks are equal
+        if (
+            not _EQUAL < scale <= _UNDERCONFIDENT
+            or np.count_nonzero(alignment.inlier) < _ENOUGH_PAIRS
+        ):
             return ""
         return (
             f"the residuals are {scale:.2g} times as large as the maps' covariances state: these "

@@ -279,6 +279,28 @@ def unit_of(a: LandmarkMap, b: LandmarkMap) -> tuple[str, tuple[bool, bool]]:
     return other_unit(pairs, Acceptance(), Refinement(), MatchParameters())
 
 
+def test_maps_without_landmarks_are_in_no_unit() -> None:
+    a, _ = two_maps()
+    none = a[np.zeros(0, np.int64)]
+    assert unit_of(none, a) == unit_of(a, none) == unit_of(none, none) == ("", (False, False))
+
+
+def test_a_tilt_is_named_without_descriptors() -> None:
+    a, b = (replace(each, descriptor=None, label=None) for each in two_maps(80))
+    level = registered(a, b)
+    assert level.verdict.accepted
+    assert level.refined.heights is not None
+    assert not level.refined.heights.is_tilted
+    tilt_rad = math.radians(3)
+    p = b.position_m.copy()
+    p[:, 2] += math.tan(tilt_rad) * p[:, 0]
+    found = registered(a, replace(b, position_m=p))
+    assert not found.verdict.accepted
+    assert found.refined.heights is not None
+    assert found.refined.heights.tilt_rad == pytest.approx(tilt_rad, abs=math.radians(0.3))
+    assert "b is tilted by" in found.verdict.reason
+
+
 def test_a_map_that_holds_the_other_is_named_without_descriptors() -> None:
     a, b = (replace(each, descriptor=None, label=None) for each in two_maps())
     assert "same observations" not in registered(a, b).verdict.reason

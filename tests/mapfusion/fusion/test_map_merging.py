@@ -281,6 +281,24 @@ def test_labels_of_other_landmarks_are_asked_for() -> None:
     assert told.endswith("40 labels are in both maps: do they name the same landmarks?")
 
 
+def test_sizes_in_another_unit_are_named() -> None:
+    north, south = (replace(each, label=None) for each in labelled_maps())
+    size_m = np.random.default_rng(0).uniform(0.1, 0.5, len(north))
+    north, cm = replace(north, size_m=size_m), replace(south, size_m=100 * size_m)
+    told = mapfusion.align_maps(north, cm).advice
+    assert "median sizes: map north 0." in told
+    assert "are both in metres?" in told
+    assert "sizes" not in mapfusion.align_maps(north, replace(south, size_m=size_m)).advice
+
+
+@pytest.mark.parametrize("given", [np.zeros((3, 2)), [1, 2], None])
+def test_maps_of_an_unknown_type_are_refused(given) -> None:
+    north, south = labelled_maps()
+    with pytest.raises(TypeError, match=r"a: is .*expected a LandmarkMap, the path of a file or"):
+        mapfusion.align_maps(given, south)
+    assert mapfusion.merge_maps(each for each in (north, south)).any_merged
+
+
 def test_one_map_in_millimetres_is_named_without_descriptors() -> None:
     north, south = (replace(each, label=None) for each in labelled_maps())
     large = replace(south, position_m=1000 * south.position_m)
