@@ -610,6 +610,8 @@ def load_maps(
         InputError: a file or a table is not as documented, or descriptors are of different kinds.
         TypeError: a map is none of these.
     """
+    if sigma_m is not None and not 0 < sigma_m < math.inf:
+        raise InputError(f"sigma_m: is {sigma_m:g}, expected a positive number of metres")
     loaded, kinds = list[LandmarkMap](), list[tuple[str, DescriptorKind | None]]()
     opened = list[tuple[str, LandmarkMap]]()
     for name, each in given.items():
@@ -734,6 +736,8 @@ def merge_maps(
             different kinds.
         ValueError: the aligner or the fuser is unknown.
     """
+    if isinstance(maps, str | os.PathLike | LandmarkMap | Mapping) or hasattr(maps, "columns"):
+        raise TypeError(f"maps: is {type(maps).__name__}, expected a list of maps")
     maps = list(maps)
     if len(maps) < 2:
         raise InputError("merge: give two maps or more")

@@ -297,6 +297,11 @@ def test_maps_of_an_unknown_type_are_refused(given) -> None:
     with pytest.raises(TypeError, match=r"a: is .*expected a LandmarkMap, the path of a file or"):
         mapfusion.align_maps(given, south)
     assert mapfusion.merge_maps(each for each in (north, south)).any_merged
+    for single in ("north.csv", north, {"north": north}):
+        with pytest.raises(TypeError, match="expected a list of maps"):
+            mapfusion.merge_maps(single)
+    with pytest.raises(mapfusion.InputError, match="sigma_m: is -1, expected a positive number"):
+        mapfusion.align_maps(north, south, sigma_m=-1.0)
 
 
 def test_one_map_in_millimetres_is_named_without_descriptors() -> None:
