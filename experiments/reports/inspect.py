@@ -12,7 +12,6 @@ from experiments.evaluation import tables
 from experiments.evaluation.tables import require_as_written
 from experiments.reports.layout import Column, print_lines, print_table
 from mapfusion import attitude, landmark_map, robot_log
-from mapfusion.datasets import point_logs
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, read_parquet, read_table, text_attributes
 from mapfusion.tables import columns_as_read, is_alone, is_csv, read_open_table
@@ -24,16 +23,6 @@ _SCHEMAS = [*tables.ALL.values(), landmark_map.LANDMARKS, trajectory.TRAJECTORY]
 _SCHEMAS += [robot_log.FRAMES, robot_log.OBSERVATIONS, robot_log.ODOMETRY_COVARIANCE]
 _SCHEMAS += [attitude.ATTITUDE]
 _SCHEMAS += [robot_log.TRUTH_POSES, robot_log.TRUTH_POINTS]
-# Tables that other programs may write; without metadata the name of the file gives the kind.
-_OPEN = {
-    "frames": robot_log.FRAMES,
-    "observations": robot_log.OBSERVATIONS,
-    "truth_poses": robot_log.TRUTH_POSES,
-    "truth_points": robot_log.TRUTH_POINTS,
-    "odometry": point_logs.ODOMETRY,
-    "points": point_logs.POINTS,
-    "ranges": point_logs.RANGES,
-}
 _CHECKED = {each.metadata[f"{_PREFIX}{_KIND}".encode()].decode(): each for each in _SCHEMAS}
 _UNITS = {"m": "m", "m2": "m²", "rad": "rad", "s": "s", "ms": "ms", "px": "px"}
 # Columns of the upper triangle of an alignment's covariance end in the names of both axes.
@@ -61,6 +50,21 @@ _FOLDER_MARKS = {
     "*/frames.csv": "folder of robot logs",
     "*.parquet": "folder of tables",
 }
+
+
+def _open_tables() -> dict[str, pa.Schema]:
+    """Return tables that other programs may write, by the name of a file without metadata."""
+    from mapfusion.datasets import point_logs  # imports the front end
+
+    return {
+        "frames": robot_log.FRAMES,
+        "observations": robot_log.OBSERVATIONS,
+        "truth_poses": robot_log.TRUTH_POSES,
+        "truth_points": robot_log.TRUTH_POINTS,
+        "odometry": point_logs.ODOMETRY,
+        "points": point_logs.POINTS,
+        "ranges": point_logs.RANGES,
+    }
 
 
 class Contents(NamedTuple):
@@ -99,7 +103,7 @@ def contents_of(path: Path) -> Contents:
             table_schema = _open_schema(path)
             if not set(table_schema.names) & set(table.column_names):
                 raise InputError(f"{path}: none of mapfusion's (no mapfusion.kind in its metadata)")
-        if table_schema in (landmark_map.LANDMARKS, *_OPEN.values()):
+        if table_schema in (landmark_map.LANDMARKS, *_open_tables().values()):
             return _open_table(path, table_schema)
         if table_schema is not None:
             read_table(path, table_schema)  # raises if version or columns differ
@@ -145,7 +149,7 @@ def _folder_contents(path: Path) -> Contents:
     # Files and rows by table, or by folder and table in a result
     n_levels = 2 if kind == _RESULT else 1
     files = sorted(path.rglob("[!.]*.parquet"))
-    csv = [file for name in _OPEN for file in path.rglob(f"{name}.csv")]
+    csv = [file for name in _open_tables() for file in path.rglob(f"{name}.csv")]
     files += sorted(file for file in csv if file.with_suffix(".parquet") not in files)
     inside = [file.relative_to(path).with_suffix("").parts[:n_levels] for file in files]
     n_files, n_rows = Counter[str](), Counter[str]()
@@ -168,7 +172,7 @@ def _columns_of(path: Path, kind: str, table: pa.Table, facts: dict[str, Any]) -
 
 def _open_schema(path: Path) -> pa.Schema:
     """Return the schema for a file without metadata, by its name."""
-    return _OPEN.get(path.stem, landmark_map.LANDMARKS)
+    return _open_tables().get(path.stem, landmark_map.LANDMARKS)
 
 
 def _open_table(path: Path, table_schema: pa.Schema) -> Contents:

@@ -110,7 +110,7 @@ def test_an_override_changes_what_is_drawn(path: Path) -> None:
         ("generate.world.walls=[]", ["world.walls", "are drawn"]),
         ("generate.world.bogus=1", ["world.bogus", "unknown key"]),
         ("generate.world.texture.posters=-1", ["texture", "posters: is -1", "[0, 100] posters"]),
-        ("robots=[{name: a, start: [1, 1, 0], route: [[2, 2]]}]", ["either generate, or world"]),
+        ("robots=[{name: a, start: [1, 1, 0], route: [[2, 2]]}]", ["no robots; leave it out"]),
         ("seed=x", ["seed", "'x'"]),
         ("drive=null", ["generate stands for"]),
     ],
