@@ -319,7 +319,7 @@ def _column(path: Path, table: pa.Table, field: pa.Field, planar: bool) -> pa.Ar
         is_float = pa.types.is_floating(field.type)
         if is_number and not is_float:
             given, limits = values.to_numpy(zero_copy_only=False), np.iinfo(str(field.type))
-            inside = (given >= limits.min) & (given <= limits.max) & (given % 1 == 0)
+            inside = (given >= limits.min) & (given <= limits.max) & (np.trunc(given) == given)
             wrong = np.flatnonzero(~inside & ~np.isnan(given))
             if len(wrong):
                 found = f"is {given[wrong[0]]:.15g} in row {wrong[0]}"

@@ -204,9 +204,7 @@ def announce_compilation(as_json: bool = False) -> None:
     """
     from mapfusion.geometry.numerics import before_compilation
 
-    told = (
-        "compiling numerical kernels that no earlier command needed; later commands start at once"
-    )
+    told = "compiling numerical kernels that no earlier command needed; later ones reuse them"
     before_compilation(None if as_json else lambda: typer.echo(told, file=sys.stderr))
 
 

@@ -53,7 +53,7 @@ _FOLDER_MARKS = {
 
 
 def _open_tables() -> dict[str, pa.Schema]:
-    """Return tables that other programs may write, by the name of a file without metadata."""
+    """Return the schemas of tables of other programs by the names of files without metadata."""
     from mapfusion.datasets import point_logs  # imports the front end
 
     return {

@@ -305,6 +305,7 @@ _WORTH_A_LOOK = 0.3
 # Largest number of pairs of one graph, which fits the processor's cache; the time grows with the
 # square. In smaller parts chance agreement would exceed the true pairs.
 _PART = 2500
+_MOST_TWOS = 200  # motions of two pairs that are tried if the largest clique has none
 
 
 @dataclass(frozen=True)
@@ -349,6 +350,8 @@ class Clique(Consensus):
             done = search.none_in_parts([rows[k::parts] for k in range(parts)])
         if not done:
             search.exhaust(rows)
+        if search.level < 0:
+            search.offer_twos()
         return self.fit_of(search.T_a_b, search.inside, search.level, pairs, planar)
 
 
@@ -360,6 +363,7 @@ class CliqueSearch:
         inside: support of the motion, bool, shape (N,).
         near: support at the largest s_drift, bool, shape (N,).
         level: index of the most likely s_drift, -1 initially.
+        largest: largest clique that was offered, shape (K,).
     """
 
     def __init__(self, clique: Clique, pairs: PlanarPairs) -> None:
@@ -371,7 +375,7 @@ class CliqueSearch:
         self._log = -np.inf
         self.T_a_b = np.full(3, np.nan)
         self.inside = self.near = np.zeros(len(pairs.p_a), np.bool_)
-        self.level = -1
+        self.level, self.largest = -1, np.zeros(0, np.int64)
 
     def graphs(self, rows: np.ndarray) -> np.ndarray:
         """Return the consistency graphs (2, n, W) of some pairs (n,), without and with s_drift."""
@@ -394,6 +398,8 @@ class CliqueSearch:
 
         A clique of one pair, or of supporters of the current motion, is ignored.
         """
+        if len(clique) > len(self.largest):
+            self.largest = clique
         if len(clique) < 2 or self.near[clique].all():
             return
         pairs, scales, bound = self._pairs, self._variances_m2, self._bound
@@ -410,6 +416,18 @@ class CliqueSearch:
             given = self._pairs, self._spread.own_m2, self._scales_m2[scale], self._bound
             refit_to_support(self.T_a_b.copy(), *given, inside)
         return inside
+
+    def offer_twos(self) -> None:
+        """Offer motions of two pairs of the largest clique, pairs far apart first.
+
+        A mirror image keeps all distances and may be the largest clique, but no motion fits it.
+        Landmarks near its axis have a motion nevertheless.
+        """
+        i, j = np.triu_indices(len(self.largest), 1)
+        p = self._pairs.p_b[self.largest]
+        far = np.argsort(-np.linalg.norm(p[i] - p[j], axis=1), kind="stable")[:_MOST_TWOS]
+        for two in np.column_stack([i, j])[far]:
+            self.offer(self.largest[two])
 
     def is_complete(self) -> bool:
         """Return True if the other pairs contain no clique of half the number of supporters."""

@@ -259,7 +259,7 @@ _SHIFTS = 8  # number of other pairs that each pair is compared with
 _SAME_SCALE = 1.2  # smaller factors may be calibration or drift
 _OTHER_WORLD = 100.0  # ratio of extents that differs in units rather than in the world
 _OTHER_SIZES = 10.0  # the same of median sizes of landmarks
-_UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
+UNITS_PER_M = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
 
 
 @dataclass(frozen=True)
@@ -609,7 +609,7 @@ def scale_note(
         return ""
     large, small = (map_b, map_a) if scale > 1 else (map_a, map_b)
     factor = max(scale, 1 / scale)
-    units = (name for name, size in _UNITS.items() if abs(factor / size - 1) < _RATIO_WIDTH)
+    units = (name for name, size in UNITS_PER_M.items() if abs(factor / size - 1) < _RATIO_WIDTH)
     asked = f"is it in {unit}?" if (unit := next(units, "")) else "are both in metres?"
     return (
         f"distances between landmarks of {large.called} are {_short(factor)} times those of "

@@ -544,8 +544,7 @@ def interpolate_poses(wanted_s: Float, timed: Float, longest_gap_s: float) -> Fl
     gap_s = after[:, 0] - before[:, 0]
     share = (wanted_s - before[:, 0]) / np.where(gap_s > 0, gap_s, 1.0)
     pose = before[:, 1:] + share[:, None] * (after[:, 1:] - before[:, 1:])
-    with np.errstate(invalid="ignore"):  # the log refuses poses that are not finite
-        pose[:, 2] = wrap(before[:, 3] + share * wrap(after[:, 3] - before[:, 3]))
+    pose[:, 2] = wrap(before[:, 3] + share * wrap(after[:, 3] - before[:, 3]))
     known = (share >= 0) & (share <= 1) & (gap_s <= longest_gap_s)
     return np.where(known[:, None], pose, np.nan)
 

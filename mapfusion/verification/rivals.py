@@ -1,4 +1,4 @@
-"""Rival motions, and repeated structure: landmarks and regions that occur more than once."""
+"""Rival motions, mirror images and other units, and structure that occurs more than once."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -11,6 +11,7 @@ import scipy
 from mapfusion.align.alignment import MIN_PAIRS, Pairs, Undetermined
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import (
+    UNITS_PER_M,
     Correspondences,
     HeightGate,
     MatchParameters,
@@ -241,8 +242,6 @@ def is_mirrored(
     return not fits_beyond_chance(pairs, acceptance, refinement)
 
 
-# Units of length other than the metre, in metres.
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
 # Ratio of the extents of two maps in one unit that partial overlap may explain.
 _SIMILAR_EXTENT = 10.0
 
@@ -261,7 +260,8 @@ def other_unit(
         return "", (False, False)
     extents_m = [float(np.ptp(each.position_m[:, :2], axis=0).max()) for each in maps]
     trials = []
-    for unit, size_m in _UNITS.items():
+    for unit, per_m in UNITS_PER_M.items():
+        size_m = 1 / per_m
         for in_unit in ((True, True), (True, False), (False, True)):
             own_m = np.where(in_unit, size_m, 1.0) * extents_m
             if own_m.min() > 1 and own_m.max() < _SIMILAR_EXTENT * own_m.min():

@@ -75,7 +75,7 @@ _OVERCONFIDENT = 3.0
 # differs from it by 1/sqrt(3) of the stated sigmas, and maps whose landmarks share errors by 0.6 or
 # more. Standard deviations written as variances give far less.
 _UNDERCONFIDENT = 0.5
-_EQUAL = 1e-3
+_EQUAL = 1e-3  # residuals, in stated sigmas, up to which landmarks are copies of each other
 _ENOUGH_PAIRS = 20  # pairs that chance makes agree so closely in fewer than one of 1000 maps
 _PATCH_REACH_M = 0.7  # largest distance between neighbouring corners of one texture
 _LEAST_OF_PATCH = 5  # landmarks

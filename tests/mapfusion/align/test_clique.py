@@ -3,13 +3,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapfusion.align.alignment import Fit, Pairs
 from mapfusion.align.clique import (
+    Clique,
     full_set,
     greedy_clique,
     larger_clique,
     may_contain_clique,
     reduce_to_core,
 )
+from mapfusion.align.correspondences import match
+from mapfusion.geometry.se2 import transform_points
+from tests.mapfusion.align.map_pairs import landmarks
 
 UNLIMITED = 1_000_000
 
@@ -147,3 +152,18 @@ def test_of_one_clique_beside_single_vertices_the_bound_is_its_size():
     assert may_be_larger(planted, 8)
     assert not may_be_larger(planted, 9)
     assert not may_be_larger(random_graph(0, 70, 0.0), 1)
+
+
+def test_a_mirror_image_has_the_motion_of_one_wall():
+    """All distances of two mirrored walls agree, but a motion lays only one on its image."""
+    rng, T_a_b = np.random.default_rng(3), np.array([2.0, -1.0, 0.4])
+    wall = np.arange(20) < 12
+    p_b = np.column_stack([rng.uniform(0, 40, 20), np.where(wall, 0.0, 2.5), np.zeros(20)])
+    p_a = p_b * [1, -1, 1]
+    p_a[:, :2] = transform_points(T_a_b, p_a[:, :2])
+    label = np.arange(20, dtype=np.int32)
+    maps = [landmarks(p, 0.02, label=label, planar=True) for p in (p_a, p_b)]
+    found = Clique().find(Pairs(*maps, match(*maps)), rng)
+    assert isinstance(found, Fit)
+    assert np.array_equal(found.inlier, wall)
+    assert np.allclose(found.T_a_b, T_a_b, atol=1e-9)

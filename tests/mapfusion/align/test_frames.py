@@ -264,7 +264,9 @@ def test_two_maps_in_millimetres_are_named() -> None:
     assert unit_of(a, b) == ("", (False, False))
 
 
-@pytest.mark.parametrize(("unit", "size_m"), [("millimetres", 1e-3), ("feet", 0.3048)])
+@pytest.mark.parametrize(
+    ("unit", "size_m"), [("millimetres", 1e-3), ("feet", 0.3048), ("inches", 0.0254)]
+)
 def test_one_map_in_another_unit_is_named_without_descriptors(unit: str, size_m: float) -> None:
     a, b = (replace(each, descriptor=None, label=None) for each in two_maps())
     large_b = replace(b, position_m=b.position_m / size_m)
