@@ -150,7 +150,7 @@ def weighted_information(transformed: TransformedLandmarks, weight: Float) -> Fl
 
 
 # Convergence tolerance: squared length of the next step in sigmas.
-_CONVERGED = 1e-3
+_CONVERGED = 1e-6
 _MOST_STEPS = 50
 
 
