@@ -4,6 +4,7 @@
   finding with the likely cause.
 - Such odometry may be sound, and noisier than stated (`estimate_odometry_noise`): it agrees with
   the observed motion on average.
+- Small systematic errors in the direction of the odometry (`find_direction_error`) are corrected.
 - Single increments of the odometry that contradict the observations are jumps (`find_jumps`). The
   rest of such a log is sound: `without_jumps` replaces these increments by the observed motion.
 - `outside_gate` counts the observations outside the gate of the landmark that they are known to
@@ -30,6 +31,7 @@ from mapfusion.datasets.motion_agreement import (
     odometry_mistakes,
     pose_mistakes,
 )
+from mapfusion.datasets.odometry_direction import DirectionError, find_direction_error
 from mapfusion.datasets.relative_motion import (
     MIN_MOTIONS,
     PLANAR,
@@ -37,11 +39,12 @@ from mapfusion.datasets.relative_motion import (
     links_needed,
     motions_of_poses,
     observed_spans,
+    odometry_over_spans,
     tracked_by_position,
 )
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry.numerics import Float, chi_square_bound
-from mapfusion.geometry.se2 import compose, rotation, wrap
+from mapfusion.geometry.se2 import wrap
 from mapfusion.robot_log import NO_TRACK, RobotLog
 
 # A jump is a difference that is larger than chance explains and larger than any ordinary step.
@@ -80,7 +83,7 @@ class Finding(NamedTuple):
     """Contradiction within a log.
 
     Attributes:
-        kind: "odometry", "truth", "jump", "noise", "association" or "gate".
+        kind: "odometry", "truth", "direction", "jump", "noise", "association" or "gate".
         frame: frame of a jump, else -1.
         text: one line without the robot's name.
     """
@@ -111,9 +114,15 @@ class Jump:
         """Finding that describes the jump."""
         moved = [float(np.hypot(*motion[:2])) for motion in (self.odometry, self.observed)]
         turned = [float(motion[2]) for motion in (self.odometry, self.observed)]
+        apart_m = float(np.hypot(*(self.odometry - self.observed)[:2]))
         text = f"odometry moved {moved[0]:.2f} m, the observations {moved[1]:.2f} m"
-        if abs(moved[0] - moved[1]) < abs(float(wrap(turned[0] - turned[1]))):
+        if apart_m < abs(float(wrap(turned[0] - turned[1]))):
             text = f"odometry turned {turned[0]:.2f} rad, the observations {turned[1]:.2f} rad"
+        elif abs(moved[0] - moved[1]) < apart_m / 2:  # other directions rather than distances
+            by_odometry, seen = (
+                f"({x:.2f}, {y:.2f})" for x, y, _ in (self.odometry, self.observed)
+            )
+            text = f"odometry moved by {by_odometry} m, the observations by {seen} m"
         return Finding(
             "jump", self.frame, f"frame {self.frame}: {text}; this increment is not used"
         )
@@ -357,26 +366,12 @@ def _standard_deviations(odometry: Float, noise: MotionNoise) -> Float:
 
 
 def _differences(odometry: Float, sigma: Float, observed: Motions) -> tuple[Float, Float, Float]:
-    """Return the differences (N, 2) from observed motions, and the covariances S and C (N, 2, 2).
-
-    The covariance of an odometry motion is propagated to first order from frame to frame.
-    """
-    n = len(observed.start)
-    T, C = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    for k in range(1, int(np.max(observed.end - observed.start, initial=0)) + 1):
-        frame = observed.start + k
-        R = np.tile(np.eye(3), (n, 1, 1))
-        R[:, :2, :2] = rotation(T[:, 2])
-        moved = compose(T, odometry[frame])
-        by_heading = np.tile(np.eye(3), (n, 1, 1))
-        by_heading[:, 0, 2], by_heading[:, 1, 2] = T[:, 1] - moved[:, 1], moved[:, 0] - T[:, 0]
-        C = by_heading @ C @ np.swapaxes(by_heading, 1, 2)
-        C += (R * sigma[frame, None] ** 2) @ np.swapaxes(R, 1, 2)
-        T = moved
+    """Return the differences (N, 2) from observed motions, and both covariances (N, 2, 2)."""
+    T, C, _ = odometry_over_spans(odometry, sigma, observed)
     off = observed.motion[:, PLANAR] - T
     off[:, 2] = wrap(off[:, 2])
     S = observed.covariance[:, PLANAR][:, :, PLANAR]
-    measured = np.ix_(range(n), _MEASURED, _MEASURED)
+    measured = np.ix_(range(len(S)), _MEASURED, _MEASURED)
     return off[:, _MEASURED], S[measured], C[measured]
 
 
@@ -411,12 +406,14 @@ class LogConsistency(NamedTuple):
         findings: contradictions; empty for a sound log.
         jumps: single increments that are not used.
         noise: noise of the odometry; meaningless if the odometry as a whole is wrong.
+        direction: systematic error of the odometry's direction.
         unchecked: reason why the odometry could not be compared; empty if it was.
     """
 
     findings: tuple[Finding, ...]
     jumps: tuple[Jump, ...]
     noise: OdometryNoise
+    direction: DirectionError = DirectionError()
     unchecked: str = ""
 
 
@@ -441,6 +438,13 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
         noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
         if not (noisier and _agrees_on_average(spans[0], noisier)):
             return LogConsistency((finding,), (), found)
+    used_noise = noise.scaled(found.factor) if found.is_larger else noise
+    direction, text = find_direction_error(log.odometry, spans, used_noise)
+    findings = list[Finding]()
+    if text:
+        findings.append(Finding("direction", -1, text))
+        log = replace(log, odometry=direction.corrected(log.odometry))
+        found = estimate_odometry_noise(log, spans, noise)
     jumps, unchecked, needed = tuple(find_jumps(log, spans[0], noise)), "", links_needed(log)
     if found.n_observed < MIN_MOTIONS:
         counts = np.bincount(log.iteration, minlength=len(log))
@@ -449,7 +453,8 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
             f"the odometry is not checked: {n_full} of {len(log)} frames show {needed} points or "
             f"more, and {found.n_observed} share as many with the frame before"
         )
-    return LogConsistency(tuple(jump.finding for jump in jumps), jumps, found, unchecked)
+    findings += [jump.finding for jump in jumps]
+    return LogConsistency(tuple(findings), jumps, found, direction, unchecked)
 
 
 def outside_gate(log: RobotLog, landmark: np.ndarray) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from mapfusion.descriptors import USURF, euclidean_distance_at
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float, chi_square_bound
-from mapfusion.geometry.se2 import between, rotation, wrap
+from mapfusion.geometry.se2 import between, compose, rotation, wrap
 from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.tables import NO_LABEL
 from mapfusion.vision.visual_odometry import MIN_LINKS, RigidMotion, estimate_rigid_motion
@@ -273,6 +273,39 @@ def odometry_motions(log: RobotLog, noise: MotionNoise) -> Motions:
     covariance[:, PLANAR, PLANAR] = sigma**2
     end, none = np.arange(1, n + 1), np.zeros(n, dtype=np.int64)
     return Motions(end - 1, end, motion, covariance, none, none)
+
+
+def odometry_over_spans(
+    odometry: Float, sigma: Float, observed: Motions, turned_rad: Float | None = None
+) -> tuple[Float, Float, Float]:
+    """Return the odometry over the spans of observed motions, to first order in its errors.
+
+    Args:
+        odometry: increments, shape (T, 3).
+        sigma: their standard deviations, shape (T, 3).
+        observed: N observed motions.
+        turned_rad: angle by which a parameter turns the shift of each increment, shape (T,).
+
+    Returns:
+        Motions (N, 3), their covariances (N, 3, 3), and the derivatives (N, 2) of the shifts with
+        respect to the parameter.
+    """
+    n = len(observed.start)
+    T, C, B = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 2))
+    for k in range(1, int(np.max(observed.end - observed.start, initial=0)) + 1):
+        frame = observed.start + k
+        R = np.tile(np.eye(3), (n, 1, 1))
+        R[:, :2, :2] = rotation(T[:, 2])
+        moved = compose(T, odometry[frame])
+        across = np.column_stack([T[:, 1] - moved[:, 1], moved[:, 0] - T[:, 0]])
+        by_heading = np.tile(np.eye(3), (n, 1, 1))
+        by_heading[:, :2, 2] = across
+        C = by_heading @ C @ np.swapaxes(by_heading, 1, 2)
+        C += (R * sigma[frame, None] ** 2) @ np.swapaxes(R, 1, 2)
+        if turned_rad is not None:
+            B += turned_rad[frame, None] * across
+        T = moved
+    return T, C, B
 
 
 def observed_spans(log: RobotLog) -> list[Motions]:

@@ -1,6 +1,6 @@
 """Stage: FastSLAM of one robot over its log, with its map at each evaluated iteration."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from mapfusion.datasets.log_consistency import (
     gate_finding,
     without_jumps,
 )
+from mapfusion.datasets.odometry_direction import DirectionError
 from mapfusion.datasets.relative_motion import MIN_MOTIONS
 from mapfusion.fastslam.filter import FastSlamParameters, StepResult
 from mapfusion.fastslam.mapping import association_for, run_log
@@ -141,8 +142,8 @@ def run(settings: SlamSettings, job: Job) -> None:
     for file, table_schema, rows in zip(WRITES[:-1], schemas, tables, strict=True):
         write_table(job.output / file, rows, table_schema, evaluated)
     gate = gate_finding(log, counted)
-    findings = [*checked.findings, *([] if gate is None else [gate])]
-    write_findings(job.output, findings, checked.jumps, checked.noise_factor)
+    findings = checked.findings if gate is None else (*checked.findings, gate)
+    write_findings(job.output, checked._replace(findings=findings))
 
 
 SLAM_STAGE = StageKind("slam", "FastSLAM", run, WRITES)
@@ -152,12 +153,13 @@ class CheckedLog(NamedTuple):
     """Input of the filter and of the smoother, after the checks of a log.
 
     Attributes:
-        log: log without jumps.
+        log: log without jumps and without the systematic error of the odometry's direction.
         odometry_covariance: covariance of its odometry, shape (T, 3, 3); None: the motion noise.
         noise_factor: factor of the motion noise over the stated one.
         motion: motion noise.
         findings: findings about the log.
         jumps: increments of the odometry that are not used.
+        direction: systematic error of the odometry's direction.
     """
 
     log: RobotLog
@@ -166,6 +168,7 @@ class CheckedLog(NamedTuple):
     motion: MotionNoise
     findings: tuple[Finding, ...]
     jumps: tuple[Jump, ...]
+    direction: DirectionError
 
 
 def checked_log(
@@ -174,7 +177,7 @@ def checked_log(
     stated: FastSlamParameters,
     source: NoiseSource,
 ) -> CheckedLog:
-    """Check a log, remove the jumps of its odometry, and choose the motion noise.
+    """Check a log, correct its odometry, and choose the motion noise.
 
     The findings also name an association that differs from the stated one.
 
@@ -198,26 +201,27 @@ def checked_log(
     elif found.unchecked and len(log) > MIN_MOTIONS:
         used = "the filter uses the noise of slam.filter.motion"
         findings = (*findings, Finding("noise", -1, f"{found.unchecked}; {used}"))
-    used_log, covariance = without_jumps(log, found.jumps, odometry_covariance)
+    corrected = replace(log, odometry=found.direction.corrected(log.odometry))
+    used_log, covariance = without_jumps(corrected, found.jumps, odometry_covariance)
     used = association_for(log, stated.association)
     if used is not stated.association:
         text = f"observations have no {stated.association}: they are associated by {used}"
         findings = (*findings, Finding("association", -1, f"{text} (slam.filter.association)"))
     motion = stated.motion.scaled(factor)
-    return CheckedLog(used_log, covariance, factor, motion, findings, found.jumps)
+    return CheckedLog(used_log, covariance, factor, motion, findings, found.jumps, found.direction)
 
 
-def write_findings(
-    slam: Path, findings: Sequence[Finding], jumps: Sequence[Jump], noise_factor: float
-) -> None:
+def write_findings(slam: Path, checked: CheckedLog) -> None:
     """Write the findings about a robot's log, with the observed motion of jumps.
 
-    The factor of the motion noise over the stated one is an attribute of the table.
+    The factor of the motion noise over the stated one and the systematic error of the odometry's
+    direction are attributes of the table.
     """
+    findings = checked.findings
     observed = np.full((len(findings), 3), np.nan)
     covariance = np.full((len(findings), 3, 3), np.nan)
     row = {finding.frame: n for n, finding in enumerate(findings) if finding.kind == "jump"}
-    for jump in jumps:
+    for jump in checked.jumps:
         observed[row[jump.frame]], covariance[row[jump.frame]] = jump.observed, jump.covariance
     rows = {
         "check": [finding.kind for finding in findings],
@@ -226,7 +230,9 @@ def write_findings(
         **named_columns(_OBSERVED, observed),
         **covariance_columns(_OBSERVED_COVARIANCE, covariance),
     }
-    write_table(slam / WRITES[-1], rows, FINDINGS, {"noise_factor": repr(noise_factor)})
+    numbers = {"noise_factor": checked.noise_factor, **checked.direction._asdict()}
+    attributes = {name: repr(float(value)) for name, value in numbers.items()}
+    write_table(slam / WRITES[-1], rows, FINDINGS, attributes)
 
 
 def read_findings(slam: Path) -> pd.DataFrame:
@@ -241,9 +247,13 @@ def noise_factor(slam: Path) -> float:
 
 
 def log_as_filtered(log: Path, slam: Path) -> tuple[RobotLog, Float | None]:
-    """Return the filter's input log, without jumps, and its odometry covariance if known."""
-    table, _ = read_table(slam / WRITES[-1], FINDINGS)
+    """Return the filter's input log, as corrected, and its odometry covariance if known."""
+    table, attributes = read_table(slam / WRITES[-1], FINDINGS)
     recorded = read_log(log)
+    direction = DirectionError(
+        *(float(attributes.get(name, "0")) for name in DirectionError._fields)
+    )
+    recorded = replace(recorded, odometry=direction.corrected(recorded.odometry))
     observed, covariance = columns(table, _OBSERVED), covariances_from(table, _OBSERVED_COVARIANCE)
     jumps = [
         Jump(int(k), observed[n], covariance[n], recorded.odometry[k])
