@@ -270,7 +270,10 @@ def _read_csv(path: Path, table_schema: pa.Schema) -> pa.Table:
         raise InputError(f"{path}: no such file (expected a {kind} table)")
     data = path.read_bytes()
     try:
-        table = pyarrow.csv.read_csv(pa.BufferReader(data))
+        # Threads of Arrow that still run when the process exits would abort it.
+        table = pyarrow.csv.read_csv(
+            pa.BufferReader(data), pyarrow.csv.ReadOptions(use_threads=False)
+        )
         names = [name.strip() for name in table.column_names]  # fails for names that are not UTF-8
     except UNREADABLE as error:
         _require_dialect(path, data, table_schema)
