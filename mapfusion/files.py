@@ -156,7 +156,8 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
 def require_file(path: Path, what: str) -> None:
     """Raise DamagedFileError unless there is a file at `path`, which should be a `what`."""
     if not path.is_file():
-        raise DamagedFileError(path, f"no such file (expected a {what})")
+        found = "is a folder" if path.is_dir() else "no such file"
+        raise DamagedFileError(path, f"{found} (expected a {what})")
 
 
 def require_version(path: Path, content: Mapping[str, Any], known: int) -> None:

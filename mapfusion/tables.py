@@ -37,6 +37,7 @@ from mapfusion.files import (
     described,
     read_parquet,
     require_cells,
+    require_file,
     require_kind,
     text_attributes,
 )
@@ -47,6 +48,7 @@ _HEIGHT_NAMES = ("z", "height", "elevation", "altitude", "alt", "pos_z", "positi
 # Norms of packed bits, taken as numbers, differ by 8 % for 32 bytes and by 4 % for 128 bytes.
 # SIFT's numbers have one norm, and rounding changes it by less than 1 %.
 _SAME_NORM, _LEAST_NORMS = 0.02, 10
+_PARQUET_MAGIC = b"PAR1"  # first bytes of a Parquet file, whatever its ending
 _OTHER_READERS = {".ply": read_ply, ".g2o": read_g2o}
 # Units at the end of the names of columns, other spellings, and their names in messages.
 _UNIT = re.compile(
@@ -196,6 +198,12 @@ def _as_given(path: Path, table_schema: pa.Schema) -> pa.Table:
         return read(path, kind)
     if is_csv(path):
         return _read_csv(path, table_schema)
+    if path.suffix.lower() != ".parquet" and path.is_file():
+        with path.open("rb") as file:
+            if file.read(len(_PARQUET_MAGIC)) != _PARQUET_MAGIC:
+                known = ", ".join([".csv", ".parquet", *_OTHER_READERS])
+                ending = f"has the ending {path.suffix}" if path.suffix else "has no ending"
+                raise InputError(f"{path}: {ending}, but tables have {known}; convert or rename it")
     return read_parquet(path, f"{kind} table")
 
 
@@ -266,8 +274,7 @@ def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, s
 def _read_csv(path: Path, table_schema: pa.Schema) -> pa.Table:
     """Read a CSV file and strip blanks from its column names; raises InputError."""
     kind = table_schema.metadata[b"mapfusion.kind"].decode()
-    if not path.is_file():
-        raise InputError(f"{path}: no such file (expected a {kind} table)")
+    require_file(path, f"{kind} table")
     data = path.read_bytes()
     try:
         # Threads of Arrow that still run when the process exits would abort it.

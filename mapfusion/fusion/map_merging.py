@@ -527,14 +527,14 @@ class MergedMaps:
     def write(self, path: str | os.PathLike[str]) -> list[Path]:
         """Write all fused maps or none, as `write_map` does, and return the paths.
 
-        The map of most robots is written to `path`, others beside it (see `numbered_path`). Nothing
-        is written if no maps were merged.
+        The map of most robots is written to `path`, others beside it (see `numbered_path`).
 
         Raises:
+            InputError: no two maps were merged.
             OSError: a file cannot be written; existing files are then unchanged.
         """
         if not self.any_merged:
-            return []
+            raise InputError(self.advice)
         fused = self.fusion.fused
         paths = [numbered_path(Path(path), k) for k in range(1, len(fused) + 1)]
         writes: dict[Path, Write] = {}

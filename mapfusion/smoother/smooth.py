@@ -28,7 +28,7 @@ from mapfusion.geometry.joint_covariance import (
     reduce_rank,
 )
 from mapfusion.geometry.numerics import Float, chi_square_bound, one_blas_thread, require_shape
-from mapfusion.geometry.se2 import between, rotation
+from mapfusion.geometry.se2 import IDENTITY, between, rotation
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import STRAY_M, RobotLog
@@ -50,7 +50,7 @@ from mapfusion.smoother.optimizer import (
     update_points_and_weights,
 )
 from mapfusion.smoother.problem import OrderedObservations, order_observations
-from mapfusion.smoother.robust_loss import MOST_DOF, Tails
+from mapfusion.smoother.robust_loss import Tails
 from mapfusion.smoother.second_order import SecondOrder, second_order_errors
 from mapfusion.viewing import viewing_of_log
 
@@ -174,8 +174,8 @@ def _inconsistent_pairs(
 # poor initial path most observations look like outliers and would lose their weights.
 _INFLATION = 4.0
 _FIRST_TOLERANCE = 3e-2  # tolerance of this round, in squared sigmas a coordinate
-# If the odometry's variances exceed the stated ones by this factor, good observations look like
-# outliers until the noise scale is known. The weights are then computed again with the scale.
+# If the odometry's variances exceed the stated ones by this factor, the variances stated for its
+# noisy increments are not those stated for the motion, and those of the smoothed motion are taken.
 _LARGE_SCALE = 4.0
 # Standard deviations of an unknown motion between two frames.
 _UNKNOWN_M, _UNKNOWN_RAD = 10.0, 1.0
@@ -216,10 +216,16 @@ class SmootherParameters:
         known = self.odometry_covariance
         return known is None or bool(np.isnan(known).any())
 
-    def odometry_information(self, log: RobotLog) -> Float:
-        """Return the inverse variances of the increments after the first, shape (T - 1, 3)."""
+    def odometry_information(self, log: RobotLog, path: Float | None = None) -> Float:
+        """Return the inverse variances of the increments after the first, shape (T - 1, 3).
+
+        The motion noise depends on the motion: that of the odometry, or of a path (T, 3).
+        """
+        motion = log.odometry
+        if path is not None:
+            motion = np.concatenate([IDENTITY[None], between(path[:-1], path[1:])])
         if self.odometry_covariance is None:
-            return odometry_information(log.odometry, self.motion)
+            return odometry_information(motion, self.motion)
         blind = np.diff(log.frame_starts()) < _LEAST_OBSERVATIONS
         needed = blind[:-1] | blind[1:]
         stated = self.odometry_covariance[1 : len(log)]
@@ -227,7 +233,7 @@ class SmootherParameters:
         sigma[~needed] = [_UNKNOWN_M, _UNKNOWN_M, _UNKNOWN_RAD]
         own = np.isnan(stated).any(axis=(1, 2))
         information = bounded_information(sigma)
-        information[own] = odometry_information(log.odometry, self.motion)[own]
+        information[own] = odometry_information(motion, self.motion)[own]
         return information
 
 
@@ -267,6 +273,8 @@ class Smoothed:
         observation_scale: estimated factor on the stated covariances of observations on tracks.
         odometry_scales: estimated factors on the odometry's stated variances along, across and in
             the heading, shape (3,).
+        odometry_information: inverse variances of the increments after the first, with the factors,
+            shape (T - 1, 3).
         n_steps: number of Gauss-Newton steps.
         own_m2: see `common`, shape (L, 3, 3).
         common: Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y.
@@ -280,6 +288,7 @@ class Smoothed:
     tails: Tails
     observation_scale: float
     odometry_scales: Float
+    odometry_information: Float
     n_steps: int
     own_m2: Float
     common: SharedErrors
@@ -309,7 +318,7 @@ class Smoothed:
         if further is not None:
             rows = further.point_m.reshape(len(further.point_m), -1)
             common = StackedErrors(common, KnownErrors(rows))
-        of_noise = scales.observation, scales.odometry
+        of_noise = scales.observation, scales.odometry, information
         found = (state.estimate, state.obs, state.weights, state.tails, *of_noise)
         n_steps, own_m2 = steps_before + state.n_steps, state.solution.own_m2
         return cls(landmark, *found, n_steps, own_m2, common, further)
@@ -359,13 +368,14 @@ def smooth(
         start = update_points_and_weights(known, _start(known, path))
     if parameters.has_own_odometry:
         state, scales = optimize_with_noise(known, *start)
-        if scales.odometry.max() > _LARGE_SCALE and state.tails.observation < MOST_DOF:
-            path, n_steps = state.estimate.path, n_steps + state.n_steps
+        if scales.odometry.max() > _LARGE_SCALE:
+            used = scaled_information(information, scales.odometry)
+            information = parameters.odometry_information(log, state.estimate.path)
+            known = known._replace(information=information)
+            first_scales = np.mean(1 / used, axis=0) / np.mean(1 / information, axis=0)
+            start, n_steps = (state.estimate, state.weights, state.tails), n_steps + state.n_steps
             del state  # frees the memory of its factors
-            under = scaled_information(information, scales.odometry)
-            start, n_again = _robust_start(known._replace(information=under), path)
-            n_steps += n_again
-            state, scales = optimize_with_noise(known, *start, scales.odometry)
+            state, scales = optimize_with_noise(known, *start, first_scales)
     else:  # the noise of visual odometry is not estimated
         at, weights, tails = start
         state, scales = optimize(known, at, weights=weights, tails=tails), UNIT_SCALES

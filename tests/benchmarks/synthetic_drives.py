@@ -17,7 +17,6 @@ import numpy as np
 from mapfusion.geometry.numerics import Float, one_blas_thread
 from mapfusion.geometry.se2 import compose, wrap
 from mapfusion.smoother.elimination import memory_bytes, pose_covariances
-from mapfusion.smoother.normal_equations import scaled_information
 from mapfusion.smoother.optimizer import Problem, linearize_and_solve
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from tests.helpers.synthetic_drives import SHAPES, Drive, drive
@@ -68,8 +67,7 @@ def nees(driven: Drive, found: Smoothed) -> Nees:
 def _pose_covariances(driven: Drive, found: Smoothed, frames: np.ndarray) -> Float:
     """Return (n, 3, 3) of the equations where the smoother ended."""
     parameters, log = SmootherParameters(stray_m=STRAY_M), driven.log
-    information = scaled_information(parameters.odometry_information(log), found.odometry_scales)
-    problem = Problem(found.obs, log.odometry, information, parameters.offset_prior)
+    problem = Problem(found.obs, log.odometry, found.odometry_information, parameters.offset_prior)
     end = linearize_and_solve(problem, found.estimate, found.weights, found.tails)
     covariance = pose_covariances(end.obs, end.equations, end.solution, frames)
     further = found.second_order

@@ -222,7 +222,7 @@ def damaged(path):
         "truncated": (truncated, "damaged"),
         "empty": (empty, "damaged"),
         "foreign": (foreign, "not a Parquet file"),
-        "folder": (folder, "no such file"),
+        "folder": (folder, "is a folder"),
         "no metadata": (no_metadata, "kind is none, expected test.things"),
         "other kind": (other_kind, "kind is test.others, expected test.things"),
         "other version": (other_version, "schema_version is 1"),

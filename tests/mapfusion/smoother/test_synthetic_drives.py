@@ -49,6 +49,19 @@ def test_odometry_much_worse_than_stated_does_not_make_observations_gross() -> N
     assert found.odometry_scales.min() > 5
 
 
+def test_much_noisier_odometry_has_the_variances_of_its_motion() -> None:
+    """The noise that is stated for noisy increments is another one.
+
+    The robot drives straight in most frames. Noisy increments seem to turn, and the variance stated
+    for turns is larger. The factors would then be 47 along and 6 in the heading.
+    """
+    scales = [smoothed(drive("lap", 600, 5.0, seed)).odometry_scales for seed in range(3)]
+    along, across, heading = np.mean(scales, axis=0)
+    assert along == pytest.approx(25, rel=0.15)
+    assert across == pytest.approx(25, rel=0.25)
+    assert 10 < heading < 30
+
+
 def many_sightings(seed: int) -> Drive:
     """Few frames with many landmarks in view: the matrices are small beside the observations."""
     return Drive(*white_noise_log(np.random.default_rng(seed), 40, 600))
