@@ -33,6 +33,7 @@ _GATE = 0.999  # probability of a motion whose squared distance is not an outlie
 _MAX_ROUNDS = 5  # of the fit, which leaves other outliers aside and turns the increments further
 _CONVERGED_RAD = 1e-4
 _LARGEST_SHARE = 0.5  # of the turn: the heading is that at the start or at the end of a step
+_LARGEST_RAD = np.pi / 4  # of a sensor's heading; larger angles contradict the observations
 
 
 class DirectionError(NamedTuple):
@@ -69,16 +70,19 @@ class _Fit(NamedTuple):
         value: estimate without regard to its range.
         information: inverse of its variance.
         error: the error, within its range.
+        decrease: decrease of the sum of squared distances from no error to `value`. Distances of
+            outliers count as much as the gate.
     """
 
     value: float
     information: float
     error: DirectionError
+    decrease: float
 
     @property
     def gain(self) -> float:
         """Decrease of the sum of squared distances from no error to `error`."""
-        return self.value**2 * self.information - self.excess
+        return self.decrease - self.excess
 
     @property
     def excess(self) -> float:
@@ -122,7 +126,7 @@ def find_direction_error(
             for observed in spans
             if len(observed.end) >= _LEAST_MOTIONS
         )
-        fit = max(fits, key=lambda each: each.information, default=_Fit(0.0, 0.0, unit))
+        fit = max(fits, key=lambda each: each.information, default=_Fit(0.0, 0.0, unit, 0.0))
         sideways_m = distance_m * np.sin(fit.error.angles(odometry)[1:])
         is_larger = np.sum(sideways_m**2) > np.sum(across_m2)
         if fit.gain > by_chance and fit.excess <= within and is_larger:
@@ -137,7 +141,7 @@ def find_direction_error(
 def _fit(odometry: Float, sigma: Float, observed: Motions, unit: DirectionError) -> _Fit:
     """Estimate the multiple of `unit` that explains the observed motions best."""
     value, information, usual = 0.0, 0.0, np.ones(len(observed.end), dtype=bool)
-    angles = unit.angles(odometry)
+    angles, without = unit.angles(odometry), np.empty(0)
     for _ in range(_MAX_ROUNDS):
         turned = _multiple(unit, value).corrected(odometry)
         T, C, B = odometry_over_spans(turned, sigma, observed, angles)
@@ -145,18 +149,23 @@ def _fit(odometry: Float, sigma: Float, observed: Motions, unit: DirectionError)
         W = np.linalg.inv(observed.covariance[:, :2, :2] + C[:, :2, :2])
         information = float(np.einsum("ni,nij,nj->", B[usual], W[usual], B[usual]))
         if not information > 0:
-            return _Fit(0.0, 0.0, unit)
+            return _Fit(0.0, 0.0, unit, 0.0)
+        if not len(without):
+            without = np.einsum("ni,nij,nj->n", r, W, r)
         step = float(np.einsum("ni,nij,nj->", B[usual], W[usual], r[usual])) / information
         value += step
         off = r - step * B
         squares = np.einsum("ni,nij,nj->n", off, W, off)
         scale = max(float(np.median(squares)) / chi_square_bound(0.5, 2), 1.0)
         information /= scale
-        before, usual = usual, squares <= scale * chi_square_bound(_GATE, 2)
+        gate = scale * chi_square_bound(_GATE, 2)
+        before, usual = usual, squares <= gate
         if abs(step) < _CONVERGED_RAD and np.array_equal(usual, before):
             break
-    in_range = np.clip(value, -_LARGEST_SHARE, _LARGEST_SHARE) if unit.turn_share else value
-    return _Fit(value, information, _multiple(unit, float(in_range)))
+    largest = _LARGEST_SHARE if unit.turn_share else _LARGEST_RAD
+    in_range = float(np.clip(value, -largest, largest))
+    decrease = float(np.sum(np.minimum(without, gate) - np.minimum(squares, gate))) / scale
+    return _Fit(value, information, _multiple(unit, in_range), decrease)
 
 
 def _multiple(unit: DirectionError, value: float) -> DirectionError:

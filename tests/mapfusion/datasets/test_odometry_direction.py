@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from mapfusion.datasets.log_consistency import check_log
-from mapfusion.datasets.odometry_direction import DirectionError
+from mapfusion.datasets.odometry_direction import DirectionError, find_direction_error
 from mapfusion.datasets.relative_motion import (
     Motions,
     motions_of_poses,
+    observed_spans,
     odometry_over_spans,
     poses_from_increments,
 )
@@ -60,6 +61,21 @@ def test_sound_logs_are_left_alone() -> None:
             found = check_log(drive(seed, shape, labels=bool(seed % 2)), NOISE)
             assert found.findings == ()
             assert found.direction == DirectionError()
+
+
+def test_points_that_hardly_show_the_motion_give_no_error() -> None:
+    """Single points err by metres: the fit may end anywhere."""
+    sigma_m = 3.0
+    for seed in range(12):
+        log, rng = drive(seed, "bends"), np.random.default_rng(seed)
+        kept = np.flatnonzero(rng.random(len(log.iteration)) < 0.5)
+        seen, plane = log.observations[kept], np.array([1.0, 1.0, 0.0])
+        moved = seen.position_m + sigma_m * plane * rng.standard_normal((len(kept), 3))
+        wide = seen.covariance_m2 + sigma_m**2 * np.diag(plane)
+        vague = replace(seen, position_m=moved, covariance_m2=wide)
+        log = replace(log, iteration=log.iteration[kept], observations=vague)
+        error, text = find_direction_error(log.odometry, observed_spans(log), NOISE)
+        assert (error, text) == (DirectionError(), "")
 
 
 def test_an_error_that_no_mistake_explains_is_not_corrected() -> None:
