@@ -174,7 +174,9 @@ def save_maps(path: Path, made: SlamResult) -> list[Path]:
 
 
 def save_fused(path: Path, merged: MergedMaps) -> list[Path]:
-    """Write the fused maps (`MergedMaps.write`); raise InputError if a file cannot be written."""
+    """Write the fused maps, if maps were merged; raise InputError if a file cannot be written."""
+    if not merged.any_merged:
+        return []
     try:
         return merged.write(path)
     except OSError as error:
