@@ -53,7 +53,7 @@ def test_much_noisier_odometry_has_the_variances_of_its_motion() -> None:
     """The noise that is stated for noisy increments is another one.
 
     The robot drives straight in most frames. Noisy increments seem to turn, and the variance stated
-    for turns is larger. The factors would then be 47 along and 6 in the heading.
+    for turns is larger.
     """
     scales = [smoothed(drive("lap", 600, 5.0, seed)).odometry_scales for seed in range(3)]
     along, across, heading = np.mean(scales, axis=0)
