@@ -189,7 +189,7 @@ def _description(error: DirectionError, likely: Sequence[DirectionError], odomet
                 f"the sensor seems to point {degrees:.2g} degrees further {side} than stated"
             )
     return (
-        f"the odometry's increments point {np.degrees(mean_rad):.2g} degrees beside the motion that "
-        f"the observations show ({float(np.mean(distance_m * np.sin(angles))):.2g} m a frame): "
+        f"the odometry's increments point {np.degrees(mean_rad):.2g} degrees beside the motion "
+        f"that the observations show ({float(np.mean(distance_m * np.sin(angles))):.2g} m a frame): "
         f"{', or '.join(causes)}; they are turned by this angle"
     )
