@@ -177,6 +177,7 @@ def _description(error: DirectionError, likely: Sequence[DirectionError], odomet
     distance_m = np.hypot(odometry[1:, 0], odometry[1:, 1])
     angles = np.abs(error.angles(odometry)[1:])
     mean_rad = float(distance_m @ angles / distance_m.sum())
+    sideways_m = float(np.mean(distance_m * np.sin(angles)))
     causes = []
     for each in likely:
         if each.turn_share:
@@ -190,6 +191,6 @@ def _description(error: DirectionError, likely: Sequence[DirectionError], odomet
             )
     return (
         f"the odometry's increments point {np.degrees(mean_rad):.2g} degrees beside the motion "
-        f"that the observations show ({float(np.mean(distance_m * np.sin(angles))):.2g} m a frame): "
+        f"that the observations show ({sideways_m:.2g} m a frame): "
         f"{', or '.join(causes)}; they are turned by this angle"
     )
