@@ -306,7 +306,7 @@ def tasks(
 
     chosen = tuple(scenarios or task_set.SCENARIOS)
     require_folder(output, chosen)
-    store = Store(results / "store")
+    store = Store.of(results)
     with layout.progress() as show:
         made = task_set.make_task_set(output, chosen, parse_seeds(seeds), store, jobs, show)
     kind = "the published set" if made.published else "not the published set"
@@ -347,7 +347,7 @@ def leaderboard(
     """Rank aligners and fusers on a task set: `mapfusion study leaderboard results/tasks`.
 
     Writes a page and tables. Methods run one after the other, so that times can be compared.
-    Finished results are reused: `--method mine.py:Mine` computes only its own after a first ranking.
+    Finished results are reused: `--method mine.py:Mine` then computes only its own.
     """
     from experiments.cli.options import require_folder
     from experiments.pipeline.store import Store
@@ -360,7 +360,7 @@ def leaderboard(
     require_folder(folder, [tasks, *(estimates or ())])
     aligners, fusers = chosen_methods(methods or (), only)
     found = TaskSet.read(tasks)
-    store = Store(results / "store")
+    store = Store.of(results)
     with layout.progress() as show:
         board = run_leaderboard(found, aligners, fusers, estimates or (), store, show)
     write_leaderboard(board, folder)

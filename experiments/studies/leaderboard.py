@@ -76,7 +76,7 @@ from experiments.studies.intervals import (
 )
 from experiments.studies.method_comparison import STAGES, compare_methods, oracle_ratios
 from experiments.studies.statistics import alignment_nees
-from experiments.studies.task_set import Task, TaskSet, tasks_of_scenario
+from experiments.studies.task_set import VERIFIER, Task, TaskSet, tasks_of_scenario
 from mapfusion.align.alignment import Alignment, Pairs, Status, undetermined
 from mapfusion.align.refinement import Oracle, Refinement
 from mapfusion.errors import InputError, one_line
@@ -96,12 +96,10 @@ from mapfusion.fusion.merge import connect
 from mapfusion.geometry.numerics import generator
 from mapfusion.verification.false_alarms import Verdict
 from mapfusion.verification.registration import PairRegistration, VerifiedRefinement
-from mapfusion.verification.verdict import Verifier
 
 # Settings of the leaderboard, the same for all methods and versions of a set.
 SEED = 0
 TRUE_PAIR_RADIUS_M = 0.1  # the default of `evaluate.true_pair_radius_m`
-_VERIFIER = Verifier()
 REFERENCE_ALIGNER, REFERENCE_FUSER = "ransac", "kalman-drift"
 _LABEL = "rank the methods"
 _ALIGNMENTS_FILE, _FUSIONS_FILE = "alignments.parquet", "fusions.parquet"
@@ -138,8 +136,8 @@ def run_aligner(settings: AlignerCell, job: Job) -> None:
     tasks, parts = tasks_of_scenario(Path(settings.folder), settings.scenario), []
     for number, task in enumerate(tasks):
         maps, offered = task.pair.maps, task.pair.offered
-        evidence = evidence_of(task.pair.rivals, maps, _VERIFIER.evidence)
-        refinement = VerifiedRefinement(Pairs(*maps, offered), Refinement(), _VERIFIER, evidence)
+        evidence = evidence_of(task.pair.rivals, maps, VERIFIER.evidence)
+        refinement = VerifiedRefinement(Pairs(*maps, offered), Refinement(), VERIFIER, evidence)
         on_pair = PairRegistration(aligner, refinement)
         for _ in range(1 if number else 2):  # the first call compiles and fills caches
             registered = on_pair.register(generator(SEED, "leaderboard", settings.name, task.name))
@@ -154,7 +152,7 @@ def run_aligner(settings: AlignerCell, job: Job) -> None:
 def _errors_of(task: Task, row: Mapping[str, Any]) -> pd.DataFrame:
     """Return the errors of an estimate and of the oracle on a task, without times."""
     pair = replace(task.pair, estimates=(row,))
-    return error_rows(pair, _VERIFIER, TRUE_PAIR_RADIUS_M).assign(**task.keys)
+    return error_rows(pair, VERIFIER, TRUE_PAIR_RADIUS_M).assign(**task.keys)
 
 
 @dataclass(frozen=True)

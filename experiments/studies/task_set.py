@@ -57,6 +57,7 @@ from mapfusion.files import (
     write_whole,
 )
 from mapfusion.landmark_map import map_writes, read_map
+from mapfusion.verification.verdict import Verifier
 
 VERSION = 1
 # Scenarios of the published set. The last three have no common ground: an alignment there is wrong.
@@ -89,6 +90,7 @@ _TABLES = {
     _POINTS: POINTS,
     _ORIGINS: ORIGINS,
 }
+VERIFIER = Verifier()  # of the rival motions, and of all alignments of the leaderboard
 _LABEL = "make the tasks"
 _LICENCE = "https://spdx.org/licenses/MIT.html"
 _CONTEXT = {
@@ -233,14 +235,15 @@ def make_task_set(
         InputError: a scenario cannot be used.
     """
     paths = [one_scenario(word) for word in scenarios]
+    for path in paths:
+        if not isinstance(load_scenario(path), Simulation):
+            raise InputError(f"{path}: is a recording; tasks need the exact truth of a simulation")
     runs = [(path, seed) for path in paths for seed in seeds]
     rows: dict[str, list[pd.DataFrame]] = {file: [] for file in _TABLES}
     maps = list[Path]()
     for n, (path, seed) in enumerate(runs):
         on_progress(_LABEL, n, len(runs))
         scenario = load_scenario(path, [f"render.renderer={_RENDERER}"], seed)
-        if not isinstance(scenario, Simulation):
-            raise InputError(f"{path}: is a recording; tasks need the exact truth of a simulation")
         run = EvaluatedRun.of(scenario, store)
         run.execute(jobs, lambda *_: None, [robot.smooth for robot in run.pipeline.robots])
         maps += _add_run(run, folder, rows)
@@ -266,7 +269,8 @@ def _add_run(
         rows[_ORIGINS].append(pd.DataFrame(pose).assign(**of_run, robot=robot.name))
     # all pairs of robots are aligned at the same iterations
     iterations = run.pipeline.pairs[0].smoothed.match.settings.iterations
-    for iteration in (iterations[len(iterations) // 2], iterations[-1]):
+    middle = iterations[(len(iterations) - 1) // 2]
+    for iteration in dict.fromkeys((middle, iterations[-1])):
         files = dict[str, str]()
         for name, robot in robots.items():
             files[name] = f"{scenario.name}-{scenario.seed}-{name}-{iteration}.parquet"
@@ -288,7 +292,7 @@ def _add_run(
             matched = {"index_a": pairs.index_a, "index_b": pairs.index_b}
             matched |= {"descriptor_distance": pairs.distance}
             rows[_CORRESPONDENCES].append(pd.DataFrame(of_task | matched).assign(task=task))
-            if evidence := scenario.align.verifier.on(Pairs(map_a, map_b, pairs)).evidence:
+            if evidence := VERIFIER.on(Pairs(map_a, map_b, pairs)).evidence:
                 rivals = pd.DataFrame(rival_rows(of_task, evidence))
                 rows[_RIVALS].append(rivals.assign(task=task))
             row = {"task": task, **of_run, **of_task, "map_a": files[a], "map_b": files[b]}
