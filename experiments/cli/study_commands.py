@@ -278,17 +278,16 @@ def benchmark(
 
 @studies.command()
 def tasks(
-    *,
-    output: options.Output,
     scenarios: Annotated[
         list[str] | None,
-        typer.Option(
-            "--scenario",
-            metavar="SCENARIO",
-            help="Scenario of the tasks, in place of the published ones; may be repeated.",
+        typer.Argument(
+            metavar="[SCENARIO...]",
+            help="Scenarios of the tasks, in place of those of the published set.",
             autocompletion=options.complete_scenario,
         ),
     ] = None,
+    *,
+    output: options.Output,
     seeds: options.Seeds = "0..4",
     jobs: options.Jobs = options.ALL_CORES,
     results: options.Results = options.RESULTS,
@@ -323,7 +322,6 @@ def leaderboard(
         list[str] | None,
         typer.Option(
             "--method",
-            "--aligner",
             metavar="NAME",
             help="A further aligner, as FILE.py:CLASS; may be repeated.",
             autocompletion=options.complete_aligner,

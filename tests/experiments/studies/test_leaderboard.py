@@ -313,7 +313,7 @@ def test_bad_input_is_told_in_one_line(
     arguments = ["study", "leaderboard", made / "tasks", "--results", tmp_path]
     assert_refused(command(capsys, *arguments, "--method", "batch"), "batch", "logs")
     assert_refused(command(capsys, *arguments, "--method", "ransack"), "ransack", "ransac")
-    told = command(capsys, "study", "tasks", "-o", tmp_path / "t", "--scenario", "mrclam7")
+    told = command(capsys, "study", "tasks", "mrclam7", "-o", tmp_path / "t")
     assert_refused(told, "mrclam7", "recording")
 
 
