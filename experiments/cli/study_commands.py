@@ -113,6 +113,13 @@ def sweep(
         str | None,
         typer.Option(help="A running Dask scheduler, tcp://HOST:PORT, in place of --jobs."),
     ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBER/COUNT",
+            help="Only this part of the runs, 1/4 to 4/4 for four jobs that share RESULTS.",
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder; RESULTS/sweeps/NAME by default.")
     ] = None,
@@ -134,7 +141,8 @@ def sweep(
 
     require_folder(output, scenarios)
     chosen = parse_seeds(seeds), settings or (), results, output, aligners
-    asked = sweep.prepare(scenarios, *chosen)
+    part = None if shard is None else sweep.Shard.parse(shard)
+    asked = sweep.prepare(scenarios, *chosen, shard=part)
     if dry_run:
         study_screen.print_survey(sweep.survey(asked))
         return
