@@ -15,7 +15,7 @@ DEVELOPING := $(VENV)/.developing
 # Where this is set, each of the many processes that tests and runs start would compile our source anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: wheel-test browser-test clean-kernels lock demo test campaign seeded-faults lint check check-fresh bench paper \
+.PHONY: docs wheel-test browser-test clean-kernels lock demo test campaign seeded-faults lint check check-fresh bench paper \
     install clean
 
 install: $(DEVELOPING)
@@ -45,6 +45,10 @@ demo: $(INSTALLED)
 # (`tests/conftest.py`), all others as they stand.
 test: $(DEVELOPING)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# The documentation site, in docs/_build/html; a warning is an error.
+docs: $(DEVELOPING)
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
 
 # Thousands of broken inputs, and kills; up to an hour. ONLY=PART for one part.
 SEED ?= 0

@@ -113,6 +113,13 @@ def sweep(
         str | None,
         typer.Option(help="A running Dask scheduler, tcp://HOST:PORT, in place of --jobs."),
     ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBER/COUNT",
+            help="Only this part of the runs, 1/4 to 4/4 for four jobs that share RESULTS.",
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder; RESULTS/sweeps/NAME by default.")
     ] = None,
@@ -134,7 +141,8 @@ def sweep(
 
     require_folder(output, scenarios)
     chosen = parse_seeds(seeds), settings or (), results, output, aligners
-    asked = sweep.prepare(scenarios, *chosen)
+    part = None if shard is None else sweep.Shard.parse(shard)
+    asked = sweep.prepare(scenarios, *chosen, shard=part)
     if dry_run:
         study_screen.print_survey(sweep.survey(asked))
         return
@@ -274,6 +282,95 @@ def benchmark(
     summary = benchmark.summarise(rows)
     write_benchmark(folder, design, rows, summary)
     study_screen.print_benchmark(folder, summary)
+
+
+@studies.command()
+def tasks(
+    scenarios: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[SCENARIO...]",
+            help="Scenarios of the tasks, in place of those of the published set.",
+            autocompletion=options.complete_scenario,
+        ),
+    ] = None,
+    *,
+    output: options.Output,
+    seeds: options.Seeds = "0..4",
+    jobs: options.Jobs = options.ALL_CORES,
+    results: options.Results = options.RESULTS,
+) -> None:
+    """Make the task set of the leaderboard: `mapfusion study tasks -o results/tasks`.
+
+    Simulates the runs and writes maps, correspondences and, apart, the truth. Finished stages are
+    reused. Other seeds give hidden tasks for a competition.
+    """
+    from experiments.cli.options import require_folder
+    from experiments.pipeline.store import Store
+    from experiments.reports import layout
+    from experiments.scenario.suite import parse_seeds
+    from experiments.studies import task_set
+
+    chosen = tuple(scenarios or task_set.SCENARIOS)
+    require_folder(output, chosen)
+    store = Store.of(results)
+    with layout.progress() as show:
+        made = task_set.make_task_set(output, chosen, parse_seeds(seeds), store, jobs, show)
+    kind = "the published set" if made.published else "not the published set"
+    layout.print_lines([f"{len(made.tasks)} tasks in {output}, {kind}", f"SHA-256 {made.digest}"])
+
+
+@studies.command()
+def leaderboard(
+    tasks: Annotated[
+        Path, typer.Argument(metavar="TASKS", help="Folder that `mapfusion study tasks` wrote.")
+    ],
+    *,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            metavar="NAME",
+            help="A further aligner, as FILE.py:CLASS; may be repeated.",
+            autocompletion=options.complete_aligner,
+        ),
+    ] = None,
+    only: Annotated[
+        bool,
+        typer.Option("--only", help="Rank the methods of --method alone, beside the reference."),
+    ] = False,
+    estimates: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="Motions computed elsewhere, with columns task, tx_m, ty_m, theta_rad; may be "
+            "repeated.",
+        ),
+    ] = None,
+    output: options.OutputFolder = None,
+    results: options.Results = options.RESULTS,
+) -> None:
+    """Rank aligners and fusers on a task set: `mapfusion study leaderboard results/tasks`.
+
+    Writes a page and tables. Methods run one after the other, so that times can be compared.
+    Finished results are reused: `--method mine.py:Mine` then computes only its own.
+    """
+    from experiments.cli.options import require_folder
+    from experiments.pipeline.store import Store
+    from experiments.reports import layout
+    from experiments.reports.report.leaderboard_page import print_leaderboard, write_leaderboard
+    from experiments.studies.leaderboard import chosen_methods, run_leaderboard
+    from experiments.studies.task_set import TaskSet
+
+    folder = output or results / "leaderboard"
+    require_folder(folder, [tasks, *(estimates or ())])
+    aligners, fusers = chosen_methods(methods or (), only)
+    found = TaskSet.read(tasks)
+    store = Store.of(results)
+    with layout.progress() as show:
+        board = run_leaderboard(found, aligners, fusers, estimates or (), store, show)
+    write_leaderboard(board, folder)
+    print_leaderboard(board, folder)
 
 
 @studies.command()

@@ -18,6 +18,7 @@ from typing import Any
 from experiments.plugins.isolated_process import IsolatedAligner, ProcessFailedError, process_for
 from mapfusion.align.aligners import ALIGNERS, PEERS, Aligner, as_aligner, construct
 from mapfusion.errors import did_you_mean, not_installed
+from mapfusion.fusion.fusers import FUSERS, target_of
 from mapfusion.plugin_classes import IN_FILE, load_class, target_in_file
 
 ENTRY_POINTS = "mapfusion.aligners"  # group of the entry points that declare aligners
@@ -190,6 +191,17 @@ def callable_aligner(method: str, parameters: dict[str, Any], time_limit_s: floa
     if found.kind is Kind.BUILT_IN:
         return as_aligner(make_method(method, **parameters))
     return IsolatedAligner(method, _as_json(method, parameters), time_limit_s, found.absence)
+
+
+def code_of_fuser(name: str) -> str:
+    """Return target and hash of the code of a plug-in fuser, for the keys of stages.
+
+    It is empty for ours, whose sources are in the keys.
+    """
+    if name in FUSERS:
+        return ""
+    target = target_of(name)
+    return f"{target} {fingerprint(target.partition(':')[0].partition('.')[0])}"
 
 
 def require_usable(method: str, parameters: dict[str, Any]) -> None:

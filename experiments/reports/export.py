@@ -323,9 +323,10 @@ def page(text: str) -> str:
     lines.append(
         "`experiments/evaluation/tables.py` describes the rows. All columns are present.\n"
     )
-    lines += ["| table | column | type | unit |", "|---" * 4 + "|"]
+    lines += ["| table | column | type | unit | meaning |", "|---" * 5 + "|"]
     for name, schema in tables.ALL.items():
-        lines += [f"| {name} {_column_row(field.name, field.type)}" for field in schema]
+        cells = ((field.name, field.type, tables.MEANING[field.name]) for field in schema)
+        lines += [f"| {name} {_column_row(*each)}" for each in cells]
     return "\n".join([*lines, ""])
 
 

@@ -131,11 +131,11 @@ def write_benchmark(
             for entry in design.aligners
         ],
     }
-    _write_provenance(folder, provenance)
+    write_provenance(folder, provenance)
     save_figure(folder, "benchmark", study_figures.draw_benchmark, summary)
 
 
-def _write_provenance(folder: Path, content: Mapping[str, Any]) -> None:
+def write_provenance(folder: Path, content: Mapping[str, Any]) -> None:
     """Write the content with the versions of Python and of libraries, the machine and the time."""
     environment = {
         "python": platform.python_version(),
@@ -208,7 +208,7 @@ def write_independence(
     write_rows(folder / "costs.parquet", COSTS, found.costs)
     write_text(folder / "summary.csv", summary.to_csv(index=False))
     write_text(folder / "summary.md", independence_markdown(scenarios, summary))
-    _write_provenance(folder, {"scenarios": [scenario.resolved() for scenario in scenarios]})
+    write_provenance(folder, {"scenarios": [scenario.resolved() for scenario in scenarios]})
     try:
         save_figure(folder, FIGURE, study_figures.draw_independence, found.teams, found.costs)
     except NothingToDraw as reason:

@@ -111,6 +111,30 @@ def runs_of(
     return runs
 
 
+class Shard(NamedTuple):
+    """Part of a sweep: one of `count` blocks of consecutive runs, numbered from 1."""
+
+    number: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> "Shard":
+        """Parse NUMBER/COUNT; raises InputError that shows the correct form."""
+        number, _, count = text.partition("/")
+        if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+            raise InputError(f"--shard {text}: expected NUMBER/COUNT, from 1/4 to 4/4 for four")
+        return cls(int(number), int(count))
+
+    def of(self, runs: Sequence[SweepRun]) -> list[SweepRun]:
+        """Return the runs of this block; consecutive runs share most stages."""
+        first, end = (len(runs) * k // self.count for k in (self.number - 1, self.number))
+        return list(runs[first:end])
+
+    def __str__(self) -> str:
+        # with leading zeros, so that the order of the names is that of the numbers
+        return f"{self.number:0{len(str(self.count))}d}-of-{self.count}"
+
+
 _LONGEST_NAME = 80
 _TABLES = (
     "errors",
@@ -139,17 +163,23 @@ def prepare(
     results: Path,
     output: Path | None = None,
     aligners: Sequence[str] = (),
+    shard: Shard | None = None,
 ) -> Sweep:
     """Check what the user asked for, `settings` as in `--set`; nothing is written.
 
-    Without `output`, the sweep's folder is named after the scenario files, names and tags.
+    Without `output`, the sweep's folder is named after the scenario files, names and tags, and
+    after the shard if only this part of the runs is wanted.
 
     Raises:
-        InputError: a scenario, key or value is wrong.
+        InputError: a scenario, key or value is wrong, or the shard has no runs.
     """
     axes = parse_axes(settings)
     runs = runs_of(scenarios_of(asked), seeds, axes, aligners)
     name = "-".join(Path(part).stem for part in asked)[:_LONGEST_NAME]
+    if shard is not None:
+        n_runs, runs, name = len(runs), shard.of(runs), f"{name}.{shard}"
+        if not runs:
+            raise InputError(f"--shard {shard.number}/{shard.count}: the sweep has {n_runs} runs")
     folder = output or results / "sweeps" / name
     # absolute: workers may have been started elsewhere
     return Sweep(runs, Store.of(results.resolve()), SweepDataset(folder.resolve(), tuple(axes)))

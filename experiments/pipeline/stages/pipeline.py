@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from experiments.pipeline.stage import RecordedLog, Stage, StageKind, in_dependency_order
 from experiments.pipeline.stages import align, drive, features, fuse, log, slam, smooth
 from experiments.pipeline.stages.drive import Walls
-from experiments.plugins.discovery import find_method, fingerprint
+from experiments.plugins.discovery import code_of_fuser, find_method, fingerprint
 from experiments.scenario.settings import (
     AnyScenario,
     Recording,
@@ -27,7 +27,7 @@ from experiments.scenario.settings import (
 )
 from experiments.scenario.world_settings import NAME_PATTERN, TAKEN_NAMES, Section
 from mapfusion.errors import InputError
-from mapfusion.fusion.fusers import FUSERS, make_fuser, name_order, target_of
+from mapfusion.fusion.fusers import make_fuser, name_order, target_of
 from mapfusion.robot_log import read_log
 from mapfusion.smoother.smooth import SmootherParameters
 from mapfusion.vision.descriptors import DESCRIBERS, descriptor_bytes
@@ -353,15 +353,13 @@ def _fusers(
     own |= {"noise_floor_m": scenario.slam.filter.noise_floor_m}
     stages = {}
     for name in scenario.fuse.fusers:
-        target = target_of(name)
-        module, ours = target.partition(":")[0], name in FUSERS
-        origin = "" if ours else f"{target} {fingerprint(module.partition('.')[0])}"
+        origin = code_of_fuser(name)
         stages[name] = _stage(
             fuse.FUSE_STAGE,
             scenario.merge,
             own=own | {"fuser": name, "origin": origin},
             before=before | aligned[make_fuser(name).smoothed],
-            loads=(module if ours else "mapfusion.fusion",),
+            loads=("mapfusion.fusion" if origin else target_of(name).partition(":")[0],),
         )
     return stages
 

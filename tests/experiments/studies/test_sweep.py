@@ -31,11 +31,13 @@ from experiments.evaluation import tables
 from experiments.pipeline.cluster import SweepTerms, code_version, dask_client
 from experiments.pipeline.store import Store
 from experiments.pipeline.tasks import Task, unfinished
+from experiments.reports.study_files import run_statistics
 from experiments.studies import sweep as driver_module
 from experiments.studies import sweep as plan_module
 from experiments.studies.sweep import (
     OnSweepProgress,
     PlannedRun,
+    Shard,
     Sweep,
     SweepDriver,
     SweepProgress,
@@ -156,6 +158,44 @@ def test_the_same_again_does_nothing_and_more_adds(
     assert dry.code == 0
     assert "4 runs, 2 of them finished" in dry.out
     assert len(pd.read_parquet(swept / "runs")) == 4
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+def test_shards_are_disjoint_and_complete(count: int, short_path: Path) -> None:
+    runs = prepare([short_path], [0, 1], [GRID[1]], Path("results")).runs
+    shards = [Shard(number, count).of(runs) for number in range(1, count + 1)]
+    assert [run for shard in shards for run in shard] == runs
+    assert max(map(len, shards)) - min(map(len, shards)) <= 1
+
+
+def test_shards_give_the_same_statistics_as_one_sweep(
+    swept: Path, short_path: Path, results: Path, tmp_path: Path
+) -> None:
+    folders = []
+    for text in ("1/2", "2/2"):
+        asked = prepare([short_path], [0, 1], [GRID[1], GRID[3]], results, shard=Shard.parse(text))
+        assert not execute(asked, 1, None, lambda _: None).failed
+        folders.append(asked.dataset.folder)
+    assert [folder.name for folder in folders] == ["short.1-of-2", "short.2-of-2"]
+    run_statistics([swept], tmp_path / "one", as_json=False)
+    run_statistics(folders, tmp_path / "two", as_json=False)
+    files = {path.name for path in (tmp_path / "one").iterdir() if path.is_file()}
+    assert len(files) > 5
+    assert {path.name for path in (tmp_path / "two").iterdir()} >= files
+    for name in files:
+        one, two = ((tmp_path / folder / name).read_bytes() for folder in ("one", "two"))
+        assert one == two, name
+
+
+@pytest.mark.parametrize("text", ["", "2", "0/2", "3/2", "1/0", "a/b", "-1/2"])
+def test_a_wrong_shard_is_told(text: str) -> None:
+    with pytest.raises(InputError, match=r"--shard .*expected NUMBER/COUNT"):
+        Shard.parse(text)
+
+
+def test_a_shard_without_runs_is_told(short_path: Path) -> None:
+    with pytest.raises(InputError, match="--shard 1/9: the sweep has 2 runs"):
+        prepare([short_path], [0, 1], [], Path("results"), shard=Shard(1, 9))
 
 
 def test_other_settings_do_not_go_into_the_same_folder(

@@ -1,0 +1,186 @@
+"""Configuration of the documentation site, which `make docs` builds with Sphinx.
+
+The pages of the reference are written from the code before each build.
+"""
+
+import inspect
+import itertools
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import typer
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx.application import Sphinx
+
+DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS.parent))
+
+import mapfusion  # noqa: E402
+from experiments.cli.main import app as command_line  # noqa: E402
+from experiments.scenario.loading import schema_text  # noqa: E402
+
+project = "mapfusion"
+author = "the mapfusion authors"
+release = mapfusion.__version__
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+]
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 3
+exclude_patterns = ["_build", "pictures"]
+html_theme = "furo"
+html_math_renderer = "mathml"  # needs no script and no network
+html_title = "mapfusion"
+html_show_copyright = False
+autodoc_typehints = "none"  # the docstrings name types and shapes
+autodoc_member_order = "bysource"
+napoleon_use_ivar = True
+REFERENCE = DOCS / "reference"
+
+
+class Key(NamedTuple):
+    """Key of a scenario."""
+
+    section: str
+    name: str
+    kind: str
+    default: str
+    meaning: str
+
+
+def scenario_keys() -> Iterator[Key]:
+    """Yield every key of a scenario, the keys of each section together."""
+    schema = json.loads(schema_text())
+    definitions = schema["$defs"]
+
+    def objects(node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        """Yield the objects that a node allows; for a list, those that it may hold."""
+        if "$ref" in node:
+            yield from objects(definitions[node["$ref"].rpartition("/")[2]])
+        elif "anyOf" in node:
+            for each in node["anyOf"]:
+                yield from objects(each)
+        elif node.get("type") == "array" and isinstance(node.get("items"), dict):
+            yield from objects(node["items"])
+        elif "properties" in node:
+            yield node
+
+    def kind_of(field: dict[str, Any]) -> str:
+        kinds = []
+        for each in field.get("anyOf", [field]):
+            if "$ref" in each:
+                own = definitions[each["$ref"].rpartition("/")[2]]
+                kinds.append(kind_of(own) if "enum" in own else "section")
+            else:
+                choices = " or ".join(map(str, each.get("enum", [])))
+                kinds.append(choices or str(each.get("const", each.get("type", "any"))))
+        return ", ".join(dict.fromkeys(kinds))
+
+    def keys_of(nodes: list[dict[str, Any]], section: str) -> Iterator[Key]:
+        fields: dict[str, tuple[dict[str, Any], bool]] = {}
+        for node in nodes:
+            for name, field in node["properties"].items():
+                fields.setdefault(name, (field, name in node.get("required", [])))
+        for name, (field, required) in fields.items():
+            default = json.dumps(field["default"]) if "default" in field else ""
+            known = "required" if required else default if len(default) < LONGEST_DEFAULT else ""
+            yield Key(section, name, kind_of(field), known, field["description"])
+        for name, (field, _) in fields.items():
+            if inner := [*objects(field)]:
+                yield from keys_of(inner, f"{section}.{name}".lstrip("."))
+
+    yield from keys_of([*objects(schema)], "")
+
+
+LONGEST_DEFAULT = 60  # characters; longer ones are those of sections
+
+
+def scenario_page() -> str:
+    """Return the page of all scenario keys."""
+    about = (
+        "Written from the code. [Scenarios](../scenarios.md) explains how the keys work together."
+    )
+    parts = [f"# Scenario keys\n\n{about} Units are in brackets.\n"]
+    for section, keys in itertools.groupby(scenario_keys(), key=lambda key: key.section):
+        parts.append(f"## {f'`{section}`' if section else 'Top level'}\n")
+        parts.append("| Key | Type | Default | Meaning |\n|---|---|---|---|")
+        for key in keys:
+            default = f"`{key.default}`" if key.default not in ("", "required") else key.default
+            cells = (f"`{key.name}`", key.kind, default, key.meaning)
+            parts.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+        parts.append("")
+    return "\n".join(parts)
+
+
+def command_page() -> str:
+    """Return the page of all commands and their options."""
+    root = typer.main.get_command(command_line)
+    parts = [
+        "# Command line\n",
+        "Written from the code: `mapfusion COMMAND --help` prints the same.\n",
+    ]
+
+    def add(name: str, command: Any) -> None:
+        for child, own in sorted(getattr(command, "commands", {}).items()):
+            add(f"{name} {child}", own)
+        if getattr(command, "commands", None):
+            return
+        parts.append(f"## {name}\n\n{inspect.cleandoc(command.help or '')}\n")
+        rows = []
+        for parameter in command.params:
+            shown = " ".join((*parameter.opts, *parameter.secondary_opts))
+            if parameter.param_type_name == "argument":
+                shown = parameter.metavar or parameter.name.upper()
+            about = " ".join((getattr(parameter, "help", "") or "").split()).replace("|", "\\|")
+            rows.append(f"| `{shown}` | {about} |")
+        if rows:
+            parts.append("| Argument or option | Meaning |\n|---|---|\n" + "\n".join(rows) + "\n")
+
+    add("mapfusion", root)
+    return "\n".join(parts)
+
+
+def api_page() -> str:
+    """Return the page of the public names of the library."""
+    about = "`import mapfusion` offers these names. [Library](../library.md) shows their use."
+    parts = [f"# Python API\n\n{about}\n"]
+    for name in sorted(mapfusion.__all__, key=str.lower):
+        value = getattr(mapfusion, name)
+        if inspect.isclass(value):
+            kind = "autoexception" if issubclass(value, BaseException) else "autoclass"
+            parts.append(f"```{{eval-rst}}\n.. {kind}:: mapfusion.{name}\n   :members:\n```\n")
+        elif callable(value):
+            parts.append(f"```{{eval-rst}}\n.. autofunction:: mapfusion.{name}\n```\n")
+    return "\n".join(parts)
+
+
+def write_reference(_: Sphinx) -> None:
+    """Write the pages of the reference that come from the code."""
+    REFERENCE.mkdir(exist_ok=True)
+    pages = {"scenario_keys": scenario_page, "command_line": command_page, "api": api_page}
+    for name, page in pages.items():
+        (REFERENCE / f"{name}.md").write_text(page(), encoding="utf-8")
+
+
+def write_math(translator: Any, node: nodes.math) -> None:
+    """Write an equation in a line as MathML."""
+    translator.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def write_math_block(translator: Any, node: nodes.math_block) -> None:
+    """Write an equation on lines of its own as MathML."""
+    translator.body.append(convert(node.astext(), display="block"))
+    raise nodes.SkipNode
+
+
+def setup(app: Sphinx) -> None:
+    """Draw equations as MathML, and write the reference before the pages are read."""
+    app.add_html_math_renderer("mathml", (write_math, None), (write_math_block, None))
+    app.connect("builder-inited", write_reference)
