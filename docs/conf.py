@@ -150,7 +150,7 @@ def api_page() -> str:
     """Return the page of the public names of the library."""
     about = "`import mapfusion` offers these names. [Library](../library.md) shows their use."
     parts = [f"# Python API\n\n{about}\n"]
-    for name in sorted(mapfusion.__all__, key=str.lower):
+    for name in sorted(vars(mapfusion)["__all__"], key=str.lower):
         value = getattr(mapfusion, name)
         if inspect.isclass(value):
             kind = "autoexception" if issubclass(value, BaseException) else "autoclass"

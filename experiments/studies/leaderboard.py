@@ -143,8 +143,9 @@ def run_aligner(settings: AlignerCell, job: Job) -> None:
             registered = on_pair.register(generator(SEED, "leaderboard", settings.name, task.name))
             beside = reference.align(*maps, offered, generator(SEED, "reference", task.name))
         row = task.pair.keys | {"aligner": settings.name, "repetition": 0}
-        row |= estimate_row(len(offered), *registered)
-        times = {"elapsed_s": registered.estimated.elapsed_s, "reference_s": beside.elapsed_s}
+        estimated, refined, verdict = registered
+        row |= estimate_row(len(offered), estimated, refined, verdict)
+        times = {"elapsed_s": estimated.elapsed_s, "reference_s": beside.elapsed_s}
         parts.append(_errors_of(task, row).assign(**times))
     write_rows(job.output / _ALIGNMENTS_FILE, ALIGNMENTS, pd.concat(parts, ignore_index=True))
 
@@ -318,9 +319,11 @@ def run_leaderboard(
         )
     )
     # each aligner has its own copy of the oracle's rows
-    rows = pd.concat([*aligned, *given], ignore_index=True)
+    rows, fusion_rows = (
+        pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=pd.Index(names))
+        for parts, names in (([*aligned, *given], ALIGNMENTS.names), (fused, FUSIONS.names))
+    )
     rows = rows.drop_duplicates(["task", "aligner"], ignore_index=True)
-    fusion_rows = pd.concat(fused, ignore_index=True) if fused else pd.DataFrame()
     return Leaderboard(tasks, rows, fusion_rows, origins)
 
 
@@ -354,32 +357,31 @@ def read_estimates(path: Path, tasks: TaskSet) -> pd.DataFrame:
     for name in names:
         if not pd.api.types.is_numeric_dtype(given[name]):
             raise InputError(f"{path}: {name}: is not a number in every row")
-    of_task = given.set_index("task")
+    given_for = {row["task"]: row for row in given.to_dict("records")}
     parts = []
     for scenario in tasks.scenarios:
         for task in tasks_of_scenario(tasks.folder, scenario):
-            stated = of_task.loc[task.name] if task.name in of_task.index else None
             row = task.pair.keys | {"aligner": path.stem, "repetition": 0}
-            row |= _stated_row(len(task.pair.offered), stated)
+            row |= _given_row(len(task.pair.offered), given_for.get(task.name))
             rows = _errors_of(task, row)
             times = dict.fromkeys(("elapsed_s", "reference_s"), np.nan)
             parts.append(rows[rows["aligner"] != ORACLE].assign(**times))
     return pd.concat(parts, ignore_index=True)[ALIGNMENTS.names]
 
 
-def _stated_row(n_pairs: int, stated: "pd.Series | None") -> dict[str, Any]:
+def _given_row(n_pairs: int, given: Mapping[Any, Any] | None) -> dict[str, Any]:
     """Return the row of `estimates` for a motion from a file; None for no motion."""
-    if stated is None or not np.isfinite(stated[list(MOTION)].to_numpy(float)).all():
+    T_a_b = np.array([given[name] for name in MOTION] if given else [np.nan] * 3, dtype=float)
+    if given is None or not np.isfinite(T_a_b).all():
         missing = undetermined("no motion is given", n_pairs, time.perf_counter())
         return estimate_row(n_pairs, missing, missing, Verdict(missing.status, np.nan, ""))
     covariance = np.full((3, 3), np.nan)
-    if set(COVARIANCE) <= set(stated.index):
-        covariance = covariances_of(stated[list(COVARIANCE)].to_frame().T)[0]
-    T_a_b, inlier = stated[list(MOTION)].to_numpy(float), np.zeros(n_pairs, dtype=bool)
-    made = Alignment(T_a_b, covariance, inlier, np.nan, Status.ACCEPTED, "", np.nan, False)
-    accepted = bool(stated.get("accepted", 1))
-    verdict = Verdict(Status.ACCEPTED if accepted else Status.REFUSED, np.nan, "as given")
-    return estimate_row(n_pairs, made, made, verdict)
+    if set(COVARIANCE) <= given.keys():
+        covariance = covariances_of(pd.DataFrame([given]))[0]
+    inlier = np.zeros(n_pairs, dtype=bool)
+    alignment = Alignment(T_a_b, covariance, inlier, np.nan, Status.ACCEPTED, "", np.nan, False)
+    status = Status.ACCEPTED if given.get("accepted", 1) else Status.REFUSED
+    return estimate_row(n_pairs, alignment, alignment, Verdict(status, np.nan, "as given"))
 
 
 _SHARE = ("decisions", "decisions_low", "decisions_high")
@@ -414,11 +416,13 @@ ALIGNER_RANKS = schema(
 
 def rank_aligners(alignments: pd.DataFrame) -> pd.DataFrame:
     """Return one row per aligner, the best first (ALIGNER_RANKS)."""
+    if alignments.empty:
+        return pd.DataFrame(columns=pd.Index(ALIGNER_RANKS.names))
     rows = alignments[alignments["status"] != Status.ABSENT]
     maps, rng = summarise_alignments(rows), generator(SEED, "leaderboard")
     right = _right_decisions(rows)
     by_decisions, by_error = _more_right(right, methods_in(maps)), _smaller_errors(maps, rng)
-    beats = by_decisions | {both for both in by_error if both[::-1] not in by_decisions}
+    beats = by_decisions | {(a, b) for a, b in by_error if (b, a) not in by_decisions}
     ratios = oracle_ratios(maps, rng).set_index("aligner")
     nees = alignment_nees(rows, rng)
     nees = nees.set_index("aligner") if len(nees) else nees
@@ -470,8 +474,8 @@ def _more_right(right: pd.DataFrame, aligners: Sequence[str]) -> set[tuple[str, 
         tests.append(mean_change(change_of_each_run(change, run_id, n_runs, mean=True)))
     significant = holm(np.array([test.p for test in tests])) < SIGNIFICANCE
     return {
-        both if test.change > 0 else both[::-1]
-        for both, test, known in zip(pairs, tests, significant, strict=True)
+        (a, b) if test.change > 0 else (b, a)
+        for (a, b), test, known in zip(pairs, tests, significant, strict=True)
         if known
     }
 
@@ -517,8 +521,8 @@ def rank_fusers(fusions: pd.DataFrame) -> pd.DataFrame:
     tests = [mean_change(log_ratio(by_run[a].to_numpy(), by_run[b].to_numpy())) for a, b in pairs]
     significant = holm(np.array([test.p for test in tests])) < SIGNIFICANCE
     beats = {
-        both if test.change < 0 else both[::-1]
-        for both, test, known in zip(pairs, tests, significant, strict=True)
+        (a, b) if test.change < 0 else (b, a)
+        for (a, b), test, known in zip(pairs, tests, significant, strict=True)
         if known
     }
     ranked = []

@@ -204,10 +204,19 @@ def tasks_of_scenario(folder: Path, scenario: str) -> tuple[Task, ...]:
             known = {iteration: points[file][list(POSITION_FIELDS)].to_numpy()}
             origin = T_world_map.loc[(row["seed"], name)].to_numpy()
             robots.append(EvaluatedRobot(name, maps, known, PathTruth(np.empty((0, 3)), origin)))
-        (map_a, points_a), (map_b, points_b) = (robot.at(iteration) for robot in robots)
-        pairs = correspondences_of(offered[row["task"]])
-        given = (map_a, map_b), (points_a, points_b), pairs, (), rivals.get(row["task"], no_rivals)
-        found.append(Task(row["task"], scenario, row["seed"], MapPair(*robots, iteration, *given)))
+        a, b = robots
+        (map_a, points_a), (map_b, points_b) = a.at(iteration), b.at(iteration)
+        pair = MapPair(
+            a,
+            b,
+            iteration,
+            (map_a, map_b),
+            (points_a, points_b),
+            correspondences_of(offered[row["task"]]),
+            estimates=(),
+            rivals=rivals.get(row["task"], no_rivals),
+        )
+        found.append(Task(row["task"], scenario, row["seed"], pair))
     return tuple(found)
 
 

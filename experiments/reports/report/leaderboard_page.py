@@ -53,18 +53,16 @@ _CHART_PX = 70, 34  # height of a chart: of its margins, and of each method
 
 def print_leaderboard(board: Leaderboard, folder: Path) -> None:
     """Print both rankings, ties and the folder of the files."""
-    n_mergeable = int(board.aligners["n_mergeable"].max()) if len(board.aligners) else 0
+    rows = board.aligners
+    n_mergeable = max(rows["n_mergeable"], default=0)
     note = f"equal ranks are ties; missed: of {n_mergeable} pairs of maps with {MERGEABLE_PAIRS} "
     note += f"or more true pairs; errors: medians on maps with {RICH_PAIRS} or more; time: over "
-    print_frame(
-        board.aligners, ALIGNER_COLUMNS, "Aligners", f"{note}{REFERENCE_ALIGNER}'s on the same maps"
-    )
+    note += f"{REFERENCE_ALIGNER}'s on the same maps"
+    print_frame(rows, ALIGNER_COLUMNS, "Aligners", note)
     note = f"medians over runs; time: over {REFERENCE_FUSER}'s on the same maps"
     print_frame(board.fusers, FUSER_COLUMNS, "Fusers", note)
-    failed = board.aligners[board.aligners["n_failed"] > 0] if len(board.aligners) else ()
-    if len(failed):
-        rows = zip(failed["aligner"], failed["n_failed"], strict=True)
-        print_lines(f"  {name}: failed on {n} tasks, see alignments.parquet" for name, n in rows)
+    failed = zip(rows["aligner"], rows["n_failed"], strict=True)
+    print_lines(f"  {name}: failed on {n} tasks, see alignments.parquet" for name, n in failed if n)
     print_lines([f"Page and tables: {folder}"])
 
 

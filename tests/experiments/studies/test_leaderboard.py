@@ -305,6 +305,16 @@ def test_the_command_ranks_a_class_in_a_file(
     assert origin["methods"]["Mine"]["files"]
 
 
+def test_a_fuser_alone_is_ranked(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["study", "leaderboard", made / "tasks", "--only", "--method", "kalman"]
+    reply = command(capsys, *arguments, "-o", tmp_path / "board", "--results", made)
+    assert reply.code == 0, reply.err
+    assert pd.read_csv(tmp_path / "board" / "aligners.csv").empty
+    assert "No aligner was ranked" in (tmp_path / "board" / "leaderboard.html").read_text()
+
+
 def test_bad_input_is_told_in_one_line(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
