@@ -233,25 +233,27 @@ def _tell_ignored_appearance(path: Path, table: pa.Table, table_schema: pa.Schem
 
     In a table with descriptors, such a column usually numbers the rows only.
     """
-    names, told = table.column_names, list[str]()
+    names, messages = table.column_names, list[str]()
     if "descriptor" not in table_schema.names or "descriptor" in names:
         return
-    looks = _names_like(_DESCRIPTOR_LIKE, names, table_schema)
-    if len(looks) > 1:
-        wanted = f"descriptor_0 to descriptor_{len(looks) - 1}"
-        found = f"columns {looks[0]} to {looks[-1]} are ignored"
-        told.append(f"{found}; if they are descriptors, name them {wanted}")
-    elif looks and pa.types.is_nested(table.schema.field(looks[0]).type):
-        told.append(f"column {looks[0]} is ignored; if it holds descriptors, name it descriptor")
-    if "label" not in names and (like := _names_like(_LABEL_LIKE, names, table_schema)):
-        meant = "if it is the same number wherever a landmark is seen"
-        told.append(f"column {like[0]} is ignored; {meant}, name it label")
-    if told:
-        warnings.warn(f"{path}: {'; '.join(told)}", TellingWarning, stacklevel=3)
+    columns = _names_like(_DESCRIPTOR_LIKE, names, table_schema)
+    if len(columns) > 1:
+        wanted = f"descriptor_0 to descriptor_{len(columns) - 1}"
+        ignored = f"columns {columns[0]} to {columns[-1]} are ignored"
+        messages.append(f"{ignored}; if they are descriptors, name them {wanted}")
+    elif columns and pa.types.is_nested(table.schema.field(columns[0]).type):
+        messages.append(
+            f"column {columns[0]} is ignored; if it holds descriptors, name it descriptor"
+        )
+    if "label" not in names and (label_columns := _names_like(_LABEL_LIKE, names, table_schema)):
+        condition = "if it is the same number wherever a landmark is seen"
+        messages.append(f"column {label_columns[0]} is ignored; {condition}, name it label")
+    if messages:
+        warnings.warn(f"{path}: {'; '.join(messages)}", TellingWarning, stacklevel=3)
 
 
 def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, str]:
-    """Return unknown columns with a name similar to a known one, by the known name.
+    """Return misspelled columns of a table, by the name that the schema gives them.
 
     Similar names differ only in letter case, blanks, hyphens or the unit. Every usual name of a
     height is similar to z_m, since data without z_m would be read as planar.
@@ -265,9 +267,9 @@ def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, s
         if name in table_schema.names:
             continue
         plain = _plain_name(name)
-        like = known.get(plain) or known.get(_UNIT.sub("", plain))
-        if like is not None and like not in names:
-            similar.setdefault(like, name)
+        known_name = known.get(plain) or known.get(_UNIT.sub("", plain))
+        if known_name is not None and known_name not in names:
+            similar.setdefault(known_name, name)
     return similar
 
 

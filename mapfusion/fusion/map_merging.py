@@ -564,15 +564,16 @@ class MergedMaps:
         fused = self.fused
         title = f"fused map, in the frame of {self.maps[fused.members[0]].name}"
         plans = [fused_plan(title, fused.landmarks, fused.parents, self.maps)]
-        for (a, b), found in itertools.islice(self.alignments.items(), _MOST_PAIRS):
-            both = f"{found.map_a.name} and {found.map_b.name}"
+        for (a, b), alignment in itertools.islice(self.alignments.items(), _MOST_PAIRS):
+            pair_name = f"{alignment.map_a.name} and {alignment.map_b.name}"
             T_a, T_b = fused.T_first_map[a], fused.T_first_map[b]
-            title = f"{both}:\n{str(found.status).replace('_', ' ')}"
+            title = f"{pair_name}:\n{str(alignment.status).replace('_', ' ')}"
             if np.isnan(T_a).any() or np.isnan(T_b).any():
-                T_a, T_b = np.zeros(3), found.T_a_b
+                T_a, T_b = np.zeros(3), alignment.T_a_b
                 title = f"{title}, not merged"
-            title += f",\n{np.count_nonzero(found.inlier)} of {len(found.inlier)} correspondences"
-            plans.append(found.plan(title, T_a, T_b, found.inlier, (a, b)))
+            inlier = alignment.inlier
+            title += f",\n{np.count_nonzero(inlier)} of {len(inlier)} correspondences"
+            plans.append(alignment.plan(title, T_a, T_b, inlier, (a, b)))
         return plans
 
     def plot(self) -> "Figure":
@@ -597,12 +598,12 @@ def numbered_path(path: Path, k: int) -> Path:
 
 
 def load_maps(
-    given: Mapping[str, "MapLike"], sigma_m: float | None = None, descriptor_metric: str = ""
+    maps_by_name: Mapping[str, "MapLike"], sigma_m: float | None = None, descriptor_metric: str = ""
 ) -> list[LandmarkMap]:
-    """Return maps given as such, by path or as tables.
+    """Load maps from map objects, file paths or tables.
 
     Args:
-        given: the maps by the names of those that are tables.
+        maps_by_name: maps, paths or tables, by the name that a table's map gets.
         sigma_m: standard deviation per axis of landmarks without covariances.
         descriptor_metric: metric of descriptors that state none.
 
@@ -614,7 +615,7 @@ def load_maps(
         raise InputError(f"sigma_m: is {sigma_m:g}, expected a positive number of metres")
     loaded, kinds = list[LandmarkMap](), list[tuple[str, DescriptorKind | None]]()
     opened = list[tuple[str, LandmarkMap]]()
-    for name, each in given.items():
+    for name, each in maps_by_name.items():
         if isinstance(each, LandmarkMap):
             landmarks, place = each, each.called
         elif isinstance(each, str | os.PathLike):
