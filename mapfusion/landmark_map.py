@@ -42,7 +42,7 @@ from mapfusion.files import (
     schema,
     table_write,
     text_attributes,
-    write_together,
+    write_all_atomically,
 )
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import (
@@ -304,7 +304,7 @@ def write_map(path: str | Path, landmarks: LandmarkMap) -> None:
         InputError: the path has another ending, or the map has no form of this kind.
         OSError: a file cannot be written; existing files are then unchanged.
     """
-    write_together(map_writes(Path(path), landmarks))
+    write_all_atomically(map_writes(Path(path), landmarks))
 
 
 def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:

@@ -26,7 +26,7 @@ from mapfusion.align.correspondences import (
 from mapfusion.align.rigid_motion import residuals
 from mapfusion.descriptors import DescriptorKind, require_one_kind
 from mapfusion.errors import InputError, TellingWarning
-from mapfusion.files import Write, write_together
+from mapfusion.files import Write, write_all_atomically
 from mapfusion.fusion.fusers import (
     USUAL,
     AlignedPair,
@@ -540,7 +540,7 @@ class MergedMaps:
         writes: dict[Path, Write] = {}
         for place, each in zip(paths, fused, strict=True):
             writes |= map_writes(place, each.landmarks)
-        write_together(writes)
+        write_all_atomically(writes)
         return paths
 
     def to_pandas(self) -> "pd.DataFrame":
