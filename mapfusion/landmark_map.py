@@ -324,9 +324,10 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
             parts |= {"sizes": landmarks.size_m is not None}
             parts |= {"categories": landmarks.category is not None}
         if lost := [name for name, there in parts.items() if there]:
-            which = kind if kind == "g2o" else kind.upper()
-            told = f"{path}: {which} cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
-            warnings.warn(told, TellingWarning, stacklevel=3)
+            format_name = kind if kind == "g2o" else kind.upper()
+            lost_text = " and ".join(lost)
+            warning = f"{path}: {format_name} cannot hold the map's {lost_text}; .parquet keeps all"
+            warnings.warn(warning, TellingWarning, stacklevel=3)
         try:
             if kind == "csv":
                 text = csv_bytes(_known_columns(landmarks))

@@ -319,29 +319,30 @@ def in_degrees(landmarks: LandmarkMap) -> str:
 
     Their span is a small part of a metre, and they are far from the origin.
     """
-    plan = landmarks.position_m[:, :2]
-    if len(plan) < _FEWEST or np.abs(plan).max() > 180:
+    p_planar = landmarks.position_m[:, :2]
+    if len(p_planar) < _FEWEST or np.abs(p_planar).max() > 180:
         return ""
-    span, middle = float(np.ptp(plan, axis=0).max()), np.median(plan, axis=0)
+    span, middle = float(np.ptp(p_planar, axis=0).max()), np.median(p_planar, axis=0)
     if span >= min(_LARGEST_DEGREES, float(np.abs(middle).max()) / _FAR):
         return ""
-    found = f"all within {span:.2g} of ({middle[0]:.4f}, {middle[1]:.4f})"
-    looks = "look like longitude and latitude in degrees"
-    return f"x_m and y_m of {landmarks.name} {looks} ({found}): project them to metres, such as UTM"
+    extent_text = f"all within {span:.2g} of ({middle[0]:.4f}, {middle[1]:.4f})"
+    degrees_text = "look like longitude and latitude in degrees"
+    text = f"x_m and y_m of {landmarks.name} {degrees_text} ({extent_text})"
+    return f"{text}: project them to metres, such as UTM"
 
 
 def too_large_sigma(landmarks: LandmarkMap) -> str:
     """Say that the covariances of a map are too large for its span; empty if they are not."""
-    plan = landmarks.position_m[:, :2]
-    if len(plan) < _FEWEST:
+    p_planar = landmarks.position_m[:, :2]
+    if len(p_planar) < _FEWEST:
         return ""
     variance = np.trace(landmarks.covariance_m2[:, :2, :2], axis1=1, axis2=2) / 2
-    sigma_m, span_m = float(np.sqrt(np.median(variance))), float(np.ptp(plan, axis=0).max())
+    sigma_m, span_m = float(np.sqrt(np.median(variance))), float(np.ptp(p_planar, axis=0).max())
     if sigma_m <= _LARGEST_SIGMA * span_m:
         return ""
-    found = f"a median sigma of {sigma_m:.3g} m in a map that spans {span_m:.3g} m"
-    asked = "is --sigma, or are the covariances, too large or in another unit?"
-    return f"landmarks of {landmarks.name} have {found}: {asked}"
+    sigma_text = f"a median sigma of {sigma_m:.3g} m in a map that spans {span_m:.3g} m"
+    question = "is --sigma, or are the covariances, too large or in another unit?"
+    return f"landmarks of {landmarks.name} have {sigma_text}: {question}"
 
 
 def motion_text(T: Float) -> str:
@@ -366,13 +367,13 @@ def _html(text: str, table: "pd.DataFrame") -> str:
     return f"<p>{html.escape(text)}</p>{table.to_html(max_rows=6, float_format='{:.3f}'.format)}"
 
 
-def best_alignment(found: Sequence[MapAlignment]) -> MapAlignment:
+def best_alignment(alignments: Sequence[MapAlignment]) -> MapAlignment:
     """Return the accepted alignment that chance explains least; else the nearest to acceptance."""
-    return min(found, key=lambda each: (_RANKS.index(each.status), _log10_chance(each)))
+    return min(alignments, key=lambda each: (_RANKS.index(each.status), _log10_chance(each)))
 
 
-def _log10_chance(found: MapAlignment) -> float:
-    log10 = found.registered.verdict.log10_false_alarms
+def _log10_chance(alignment: MapAlignment) -> float:
+    log10 = alignment.registered.verdict.log10_false_alarms
     return math.inf if math.isnan(log10) else log10
 
 
