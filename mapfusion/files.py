@@ -46,18 +46,18 @@ _WRITER = re.compile(rf"\.{re.escape(platform.node())}-(?P<pid>\d+)\.[^.]+\.part
 Write = Callable[[Path], object] | None
 
 
-def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Call `write` with a temporary file beside `path`, and then rename that file to `path`.
 
     No reader sees half a file. The temporary name ends in `.part`, so that patterns like
     `*.parquet` do not find a file that a killed process left behind (see `remove_abandoned`). An
     OSError names `path`.
     """
-    write_together({path: write})
+    write_all_atomically({path: write})
 
 
-def write_together(writes: Mapping[Path, Write]) -> None:
-    """Write files that belong together as `write_whole` does; remove those whose value is None.
+def write_all_atomically(writes: Mapping[Path, Write]) -> None:
+    """Write several files as one transaction; remove those whose value is None.
 
     All are filled before the first is renamed or removed. If one cannot be written, all files stay
     as they were.
@@ -120,7 +120,7 @@ def json_bytes(content: Mapping[str, Any]) -> bytes:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON object with the digest of its file."""
-    write_whole(path, lambda temporary: temporary.write_bytes(json_bytes(content)))
+    write_atomically(path, lambda temporary: temporary.write_bytes(json_bytes(content)))
 
 
 def read_json(path: Path, what: str) -> dict[str, Any]:
@@ -222,7 +222,7 @@ def write_table(
     attributes: Mapping[str, str] | None = None,
 ) -> None:
     """Write columns (arrays by name) as a table of a schema, with further text attributes."""
-    write_whole(path, table_write(columns, table_schema, attributes))
+    write_atomically(path, table_write(columns, table_schema, attributes))
 
 
 def table_write(

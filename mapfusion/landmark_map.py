@@ -42,7 +42,7 @@ from mapfusion.files import (
     schema,
     table_write,
     text_attributes,
-    write_together,
+    write_all_atomically,
 )
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import (
@@ -304,7 +304,7 @@ def write_map(path: str | Path, landmarks: LandmarkMap) -> None:
         InputError: the path has another ending, or the map has no form of this kind.
         OSError: a file cannot be written; existing files are then unchanged.
     """
-    write_together(map_writes(Path(path), landmarks))
+    write_all_atomically(map_writes(Path(path), landmarks))
 
 
 def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
@@ -324,9 +324,10 @@ def map_writes(path: Path, landmarks: LandmarkMap) -> dict[Path, Write]:
             parts |= {"sizes": landmarks.size_m is not None}
             parts |= {"categories": landmarks.category is not None}
         if lost := [name for name, there in parts.items() if there]:
-            which = kind if kind == "g2o" else kind.upper()
-            told = f"{path}: {which} cannot hold the map's {' and '.join(lost)}; .parquet keeps all"
-            warnings.warn(told, TellingWarning, stacklevel=3)
+            format_name = kind if kind == "g2o" else kind.upper()
+            lost_text = " and ".join(lost)
+            warning = f"{path}: {format_name} cannot hold the map's {lost_text}; .parquet keeps all"
+            warnings.warn(warning, TellingWarning, stacklevel=3)
         try:
             if kind == "csv":
                 text = csv_bytes(_known_columns(landmarks))

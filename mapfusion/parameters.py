@@ -83,13 +83,15 @@ def require_in_range(settings: object) -> None:
 def _ranged(settings: type) -> dict[str, Any]:
     """Return the annotations of all settings that have a range."""
     hints = get_type_hints(settings, include_extras=True)
-    return {name: hint for name, hint in hints.items() if _declares(hint)}
+    return {name: hint for name, hint in hints.items() if _has_range(hint)}
 
 
-def _declares(hint: Any) -> bool:
-    """Return True if an annotation or a part of it has a range."""
-    own = any(isinstance(each, Range) for each in getattr(hint, "__metadata__", ()))
-    return own or any(map(_declares, get_args(hint)))
+def _has_range(hint: Any) -> bool:
+    """Return True if a type annotation, or one of its type arguments, has a `Range`."""
+    has_own_range = any(
+        isinstance(annotation, Range) for annotation in getattr(hint, "__metadata__", ())
+    )
+    return has_own_range or any(map(_has_range, get_args(hint)))
 
 
 def _require_as_declared(name: str, value: Any, hint: Any) -> None:

@@ -436,8 +436,8 @@ def read_true_points(folder: Path) -> Float | None:
 
 def _require_true(path: Path, values: Float) -> Float:
     """Return rows of the truth (N, 3); raise InputError for a row that is known in part."""
-    known = ~np.isnan(values)
-    half = known.any(1) & ~known.all(1)
+    is_known = ~np.isnan(values)
+    half = is_known.any(1) & ~is_known.all(1)
     large = (np.abs(values) > LARGEST_POSITION_M).any(1)  # infinity is
     for wrong, what in ((half, "known in part"), (large, "infinite or above 1e7 m")):
         if wrong.any():

@@ -116,9 +116,9 @@ def csv_bytes(columns: Mapping[str, np.ndarray]) -> bytes:
     A column (N, k) becomes k columns NAME_0, NAME_1, ...; NaN is an empty cell.
     """
     apart = {
-        name if values.ndim == 1 else f"{name}_{place}": each
+        name if values.ndim == 1 else f"{name}_{number}": each
         for name, values in columns.items()
-        for place, each in enumerate([values] if values.ndim == 1 else values.T)
+        for number, each in enumerate([values] if values.ndim == 1 else values.T)
     }
     table = pa.table({name: pa.array(each, from_pandas=True) for name, each in apart.items()})
     text = pa.BufferOutputStream()
@@ -201,9 +201,11 @@ def _as_given(path: Path, table_schema: pa.Schema) -> pa.Table:
     if path.suffix.lower() != ".parquet" and path.is_file():
         with path.open("rb") as file:
             if file.read(len(_PARQUET_MAGIC)) != _PARQUET_MAGIC:
-                known = ", ".join([".csv", ".parquet", *_OTHER_READERS])
+                endings = ", ".join([".csv", ".parquet", *_OTHER_READERS])
                 ending = f"has the ending {path.suffix}" if path.suffix else "has no ending"
-                raise InputError(f"{path}: {ending}, but tables have {known}; convert or rename it")
+                raise InputError(
+                    f"{path}: {ending}, but tables have {endings}; convert or rename it"
+                )
     return read_parquet(path, f"{kind} table")
 
 
@@ -233,25 +235,27 @@ def _tell_ignored_appearance(path: Path, table: pa.Table, table_schema: pa.Schem
 
     In a table with descriptors, such a column usually numbers the rows only.
     """
-    names, told = table.column_names, list[str]()
+    names, messages = table.column_names, list[str]()
     if "descriptor" not in table_schema.names or "descriptor" in names:
         return
-    looks = _names_like(_DESCRIPTOR_LIKE, names, table_schema)
-    if len(looks) > 1:
-        wanted = f"descriptor_0 to descriptor_{len(looks) - 1}"
-        found = f"columns {looks[0]} to {looks[-1]} are ignored"
-        told.append(f"{found}; if they are descriptors, name them {wanted}")
-    elif looks and pa.types.is_nested(table.schema.field(looks[0]).type):
-        told.append(f"column {looks[0]} is ignored; if it holds descriptors, name it descriptor")
-    if "label" not in names and (like := _names_like(_LABEL_LIKE, names, table_schema)):
-        meant = "if it is the same number wherever a landmark is seen"
-        told.append(f"column {like[0]} is ignored; {meant}, name it label")
-    if told:
-        warnings.warn(f"{path}: {'; '.join(told)}", TellingWarning, stacklevel=3)
+    columns = _names_like(_DESCRIPTOR_LIKE, names, table_schema)
+    if len(columns) > 1:
+        wanted = f"descriptor_0 to descriptor_{len(columns) - 1}"
+        ignored = f"columns {columns[0]} to {columns[-1]} are ignored"
+        messages.append(f"{ignored}; if they are descriptors, name them {wanted}")
+    elif columns and pa.types.is_nested(table.schema.field(columns[0]).type):
+        messages.append(
+            f"column {columns[0]} is ignored; if it holds descriptors, name it descriptor"
+        )
+    if "label" not in names and (label_columns := _names_like(_LABEL_LIKE, names, table_schema)):
+        condition = "if it is the same number wherever a landmark is seen"
+        messages.append(f"column {label_columns[0]} is ignored; {condition}, name it label")
+    if messages:
+        warnings.warn(f"{path}: {'; '.join(messages)}", TellingWarning, stacklevel=3)
 
 
 def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, str]:
-    """Return unknown columns with a name similar to a known one, by the known name.
+    """Return misspelled columns of a table, by the name that the schema gives them.
 
     Similar names differ only in letter case, blanks, hyphens or the unit. Every usual name of a
     height is similar to z_m, since data without z_m would be read as planar.
@@ -265,9 +269,9 @@ def _similar_names(names: Sequence[str], table_schema: pa.Schema) -> dict[str, s
         if name in table_schema.names:
             continue
         plain = _plain_name(name)
-        like = known.get(plain) or known.get(_UNIT.sub("", plain))
-        if like is not None and like not in names:
-            similar.setdefault(like, name)
+        known_name = known.get(plain) or known.get(_UNIT.sub("", plain))
+        if known_name is not None and known_name not in names:
+            similar.setdefault(known_name, name)
     return similar
 
 
@@ -521,24 +525,24 @@ def _unpacked(path: Path, name: str, packed: pa.Array, width: int, own_file: boo
     metric (`own_file`).
     """
     matrix = packed.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)
-    known = np.logical_not(np.all(np.isnan(matrix), axis=1))
-    given = matrix[known]
-    wrong = np.argwhere(~((given >= 0) & (given <= 255) & (given == np.floor(given))))
+    has_descriptor = np.logical_not(np.all(np.isnan(matrix), axis=1))
+    numbers = matrix[has_descriptor]
+    wrong = np.argwhere(~((numbers >= 0) & (numbers <= 255) & (numbers == np.floor(numbers))))
     if len(wrong):
         row, number = wrong[0]
         cell = re.sub(r"_0$", f"_{number}", name)  # the first of numbered columns, or one of lists
-        found = f"is {given[row, number]:g} in row {np.flatnonzero(known)[row]}"
+        found = f"is {numbers[row, number]:g} in row {np.flatnonzero(has_descriptor)[row]}"
         needed = "packed bits are whole numbers from 0 to 255; a row without descriptor has all "
         needed += "its cells empty; numbers that are no bits have the metric euclidean or cosine"
         raise InputError(f"{path}: column {cell}: {found}; {needed}")
-    norms = np.linalg.norm(given, axis=1)
-    if not own_file and len(given) >= _LEAST_NORMS and norms.std() < _SAME_NORM * norms.mean():
+    norms = np.linalg.norm(numbers, axis=1)
+    if not own_file and len(numbers) >= _LEAST_NORMS and norms.std() < _SAME_NORM * norms.mean():
         found = f"column {name}: is read as packed bits, but all rows have the norm"
         remedy = "numbers of SIFT look so: store them as floats, without the metric hamming"
         text = f"{path}: {found} {norms.mean():.0f}; {remedy}"
         warnings.warn(text, TellingWarning, stacklevel=2)
     bits = np.full((len(matrix), 8 * width), np.nan, np.float32)
-    bits[known] = unpack_bits(given.astype(np.uint8))
+    bits[has_descriptor] = unpack_bits(numbers.astype(np.uint8))
     return pa.FixedSizeListArray.from_arrays(pa.array(bits.ravel()), 8 * width)
 
 
@@ -560,10 +564,10 @@ def appearance_columns(
     if kind is not None and kind.metric == "hamming":
         absent = np.any(np.isnan(descriptor), axis=1, keepdims=True)
         packed = pack_bits(descriptor)
-        looks = np.ma.MaskedArray(packed, np.broadcast_to(absent, packed.shape))
+        vectors = np.ma.MaskedArray(packed, np.broadcast_to(absent, packed.shape))
     else:
-        looks = descriptor.astype(np.float32)
-    return {"label": label.astype(np.int32), "descriptor": looks}
+        vectors = descriptor.astype(np.float32)
+    return {"label": label.astype(np.int32), "descriptor": vectors}
 
 
 def appearance_schema(table_schema: pa.Schema, columns: Mapping[str, np.ndarray]) -> pa.Schema:

@@ -204,10 +204,10 @@ def _ends(values: Float) -> Float:
     The result equals that of `np.quantile`, which is several times slower than a sort.
     """
     ranked = np.sort(values)
-    place = np.array([_OUTLIER_SHARE, 1 - _OUTLIER_SHARE]) * (len(ranked) - 1)
-    below = place.astype(np.int64)
+    position = np.array([_OUTLIER_SHARE, 1 - _OUTLIER_SHARE]) * (len(ranked) - 1)
+    below = position.astype(np.int64)
     low, high = ranked[below], ranked[np.minimum(below + 1, len(ranked) - 1)]
-    share = place - below
+    share = position - below
     # interpolate from the nearer value, as `np.quantile` does
     return np.where(share < 0.5, low + (high - low) * share, high - (high - low) * (1 - share))
 

@@ -402,8 +402,8 @@ class _DeadlockMonitor:
 
     def record(self, now: Sequence[Pose]) -> None:
         """Record poses and progress of the robots at a frame."""
-        for own, driver, pose in zip(self._records, self._drivers, now, strict=True):
-            own.add(pose, driver.progress(pose), driver.stopping_m())
+        for robot_records, driver, pose in zip(self._records, self._drivers, now, strict=True):
+            robot_records.add(pose, driver.progress(pose), driver.stopping_m())
 
     def apply_holds(self, now: Sequence[Pose]) -> None:
         """Update the robots that each driver's holds wait for."""

@@ -225,9 +225,11 @@ def wall_shape(points_m: Float, mirrored: bool) -> Float:
 
 def segment_distance_m(points: Float, starts: Float, ends: Float) -> Float:
     """Return the distances of points (..., 2) to segments (..., 2), broadcast."""
-    along = ends - starts
-    share = np.sum((points - starts) * along, -1) / np.maximum(np.sum(along**2, -1), 1e-300)
-    nearest = starts + np.clip(share, 0, 1)[..., None] * along
+    direction = ends - starts
+    fraction = np.sum((points - starts) * direction, -1) / np.maximum(
+        np.sum(direction**2, -1), 1e-300
+    )
+    nearest = starts + np.clip(fraction, 0, 1)[..., None] * direction
     return np.linalg.norm(points - nearest, axis=-1)
 
 

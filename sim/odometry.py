@@ -106,6 +106,10 @@ def add_noise(increments: ArrayLike, noise: OdometryNoise, rng: np.random.Genera
 
     yaw_variance = noise.yaw_rad_per_sqrt_m**2 * distance + noise.yaw_rad_per_sqrt_rad**2 * turned
     yaw = true[:, 2] * scale / track + np.sqrt(yaw_variance) * walk[:, 0]
-    along = distance * scale + noise.translation_m_per_sqrt_m * np.sqrt(distance) * walk[:, 1]
+    noisy_distance = (
+        distance * scale + noise.translation_m_per_sqrt_m * np.sqrt(distance) * walk[:, 1]
+    )
     direction += (yaw - true[:, 2]) / 2  # angle between a chord and the start of its arc
-    return np.stack([along * np.cos(direction), along * np.sin(direction), yaw], -1)
+    return np.stack(
+        [noisy_distance * np.cos(direction), noisy_distance * np.sin(direction), yaw], -1
+    )

@@ -52,8 +52,12 @@ def egl_driver() -> str:
     if tried.returncode:
         raise InputError(NEEDED.format(reason="it drew no image"))
     lines = tried.stdout.decode(errors="replace").splitlines()
-    told = dict(line.split("=", 1) for line in lines if line.startswith("GL_") and "=" in line)
-    return ", ".join(told[name] for name in ("GL_RENDERER", "GL_VERSION") if name in told)
+    properties = dict(
+        line.split("=", 1) for line in lines if line.startswith("GL_") and "=" in line
+    )
+    return ", ".join(
+        properties[name] for name in ("GL_RENDERER", "GL_VERSION") if name in properties
+    )
 
 
 def renderer_name(renderer: Renderer) -> str:

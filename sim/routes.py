@@ -78,13 +78,13 @@ def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
     for number, route in enumerate(routes):
         # room at the waypoints and between them
         points = np.concatenate([route.T_world_start[None, :2], route.waypoints_m])
-        said = [f"waypoint {i} {format_point(p)}" for i, p in enumerate(points[1:], start=1)]
-        said.insert(0, route.start_text)
+        texts = [f"waypoint {i} {format_point(p)}" for i, p in enumerate(points[1:], start=1)]
+        texts.insert(0, route.start_text)
         fields = [f"robots.{number}.start"]
         fields += [f"robots.{number}.route.{i}" for i in range(len(points) - 1)]
         on_floor, clearance = plan.contains(points), plan.clearance_m(points)
-        for own, text, inside, room in zip(fields, said, on_floor, clearance, strict=True):
-            where = f"{own}: robot {route.robot}: {text}"
+        for field_name, text, inside, room in zip(fields, texts, on_floor, clearance, strict=True):
+            where = f"{field_name}: robot {route.robot}: {text}"
             if not inside:
                 raise InputError(f"{where} lies outside the world")
             if room < 0:
@@ -97,7 +97,9 @@ def check_routes(plan: FloorPlan, routes: Sequence[Route]) -> None:
         starts = list(range(len(ends)))
         for start, end in zip(starts, ends, strict=True):
             room = plan.leg_clearance_m(points[start], points[end])
-            where = f"{fields[end]}: robot {route.robot}: the way from {said[start]} to {said[end]}"
+            where = (
+                f"{fields[end]}: robot {route.robot}: the way from {texts[start]} to {texts[end]}"
+            )
             if room < 0:
                 raise InputError(f"{where} leads through a wall")
             if room < WIDTH_M / 2:

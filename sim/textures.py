@@ -117,20 +117,25 @@ def paint(
     n = (picture.shape[1] - gap) // (width + gap)
     if n < 1 or picture.shape[0] < foot + height:
         return picture
-    left = (picture.shape[1] - n * (width + gap) + gap) // 2
+    first_column = (picture.shape[1] - n * (width + gap) + gap) // 2
     top = picture.shape[0] - foot - height
     for i, kind in enumerate(rng.integers(0, len(posters), n)):
-        u = left + i * (width + gap)
+        u = first_column + i * (width + gap)
         picture[top : top + height, u : u + width] = posters[kind]
     return picture
 
 
 def paint_posters(texture: Texture, rng: np.random.Generator) -> list[np.ndarray]:
     """Return the posters of a world, painted like a wall with default settings."""
-    size_m = texture.poster_m
+    poster_size_m = texture.poster_m
     if texture.poster_width_m is not None:
-        size_m = float(np.exp(rng.uniform(*np.log(texture.poster_width_m)))), size_m[1]
-    return [_paint_shapes("wall", size_m, rng, DEFAULT_TEXTURE) for _ in range(texture.posters)]
+        poster_size_m = (
+            float(np.exp(rng.uniform(*np.log(texture.poster_width_m)))),
+            poster_size_m[1],
+        )
+    return [
+        _paint_shapes("wall", poster_size_m, rng, DEFAULT_TEXTURE) for _ in range(texture.posters)
+    ]
 
 
 def _paint_shapes(

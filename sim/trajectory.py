@@ -175,10 +175,10 @@ class BodySway:
     def tilts(self, time_s: Float, rng: np.random.Generator) -> Float:
         """Draw roll and pitch (T, 2) at times (T,)."""
         drawn = rng.standard_normal((len(time_s), 2))
-        left = np.exp(-np.diff(time_s) / self.correlation_s)
+        decays = np.exp(-np.diff(time_s) / self.correlation_s)
         tilt = np.array(drawn)
-        for k, share in enumerate(left.tolist(), start=1):
-            tilt[k] = share * tilt[k - 1] + np.sqrt(1 - share**2) * drawn[k]
+        for k, decay in enumerate(decays.tolist(), start=1):
+            tilt[k] = decay * tilt[k - 1] + np.sqrt(1 - decay**2) * drawn[k]
         return self.sigma_rad * tilt
 
 

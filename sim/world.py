@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from mapfusion.errors import DamagedFileError
-from mapfusion.files import name_in_text, require_file, write_whole
+from mapfusion.files import name_in_text, require_file, write_atomically
 from mapfusion.geometry.numerics import Float
 from sim.floorplan import FloorPlan
 from sim.renderer import BulletRenderer, egl_driver, load_egl, require_pybullet
@@ -212,17 +212,21 @@ def write_faces(
     faces = plan.faces()
     *children, of_posters = rng.spawn(len(faces) + 1)
     posters = paint_posters(texture, of_posters)
-    seen: dict[str, np.ndarray] = {}
+    painted_faces: dict[str, np.ndarray] = {}
     for i, (face, child) in enumerate(zip(faces, children, strict=True)):
         mesh, path = face_files(folder, i)
-        painted = seen[face.look] if face.look in seen else paint(face, child, texture, posters)
+        painted = (
+            painted_faces[face.look]
+            if face.look in painted_faces
+            else paint(face, child, texture, posters)
+        )
         if face.look:
-            seen[face.look] = painted
+            painted_faces[face.look] = painted
         shown = np.ascontiguousarray(painted[:, ::-1]) if face.mirrored else painted
         picture = cv2.cvtColor(shown, cv2.COLOR_RGB2BGR)
         encoded = cv2.imencode(PICTURE, picture)[1].tobytes()
         # files are written whole: another run may write or read the same faces
-        write_whole(path, lambda file, data=encoded: file.write_bytes(data))
+        write_atomically(path, lambda file, data=encoded: file.write_bytes(data))
         # OBJ text, with the normals and texture coordinates that PyBullet needs. All normals point
         # up: they only affect the lighting, and the lamp of EGL is above.
         lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in face.corners_m]
@@ -230,10 +234,10 @@ def write_faces(
         lines += ["vn 0 0 1"]
         lines += ["f 1/1/1 2/2/1 3/3/1", "f 1/1/1 3/3/1 4/4/1"]
         text = "\n".join(lines) + "\n"
-        write_whole(mesh, lambda file, text=text: file.write_text(text, "ascii"))
+        write_atomically(mesh, lambda file, text=text: file.write_text(text, "ascii"))
     corners = io.BytesIO()
     np.save(corners, np.stack([face.corners_m for face in faces]))
-    write_whole(folder / CORNERS, lambda file: file.write_bytes(corners.getvalue()))
+    write_atomically(folder / CORNERS, lambda file: file.write_bytes(corners.getvalue()))
 
 
 def read_corners(path: Path) -> Float:

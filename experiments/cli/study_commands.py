@@ -459,7 +459,9 @@ def independence(
         store = Store.of(results)
         found = independence_trial.run_independence(loaded, sizes, store, jobs, show)
         skipped = write_independence(folder, loaded, found)
-    study_screen.print_independence(folder, independence_trial.at_the_end(found), skipped)
+    study_screen.print_independence(
+        folder, independence_trial.medians_at_last_iteration(found), skipped
+    )
 
 
 @studies.command()

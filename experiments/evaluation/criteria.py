@@ -107,9 +107,9 @@ def alignment_consistency(errors: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(nees_per_dof=nees / _MOTION_DOF, inside=inside)[nees.notna()]
 
 
-def at_the_end(rows: pd.DataFrame) -> pd.DataFrame:
+def at_last_iteration(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows at the last iteration of each robot pair of each run."""
-    return rows[rows["iteration"] == _of_robot_pair(rows, "iteration")]
+    return rows[rows["iteration"] == _largest_of_robot_pair(rows, "iteration")]
 
 
 def with_common_ground_at_any_time(rows: pd.DataFrame) -> pd.DataFrame:
@@ -118,11 +118,11 @@ def with_common_ground_at_any_time(rows: pd.DataFrame) -> pd.DataFrame:
     For pools of several scenarios: large errors of pairs without common ground would hide the
     differences between methods.
     """
-    return rows[_of_robot_pair(rows, "n_common") >= COMMON_LANDMARKS]
+    return rows[_largest_of_robot_pair(rows, "n_common") >= COMMON_LANDMARKS]
 
 
-def _of_robot_pair(rows: pd.DataFrame, column: str) -> pd.Series:
-    """Return for each row the largest value of its robot pair in its run."""
+def _largest_of_robot_pair(rows: pd.DataFrame, column: str) -> pd.Series:
+    """Return the largest value of a column over the rows with the same robot pair and run."""
     keys = [name for name in _ROBOT_PAIR if name in rows]
     return rows.groupby(keys)[column].transform("max")
 
@@ -176,7 +176,7 @@ def nothing_merged(result: Path) -> NothingMerged | None:
     errors = tables.read(tables.table_path(result, "errors"), "errors")
     if errors.empty:
         return NothingMerged(None)
-    return NothingMerged(bool(has_common_ground(at_the_end(errors)).any()))
+    return NothingMerged(bool(has_common_ground(at_last_iteration(errors)).any()))
 
 
 RUN_KEYS = ("run_id", "scenario", "seed")

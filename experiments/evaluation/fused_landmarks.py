@@ -94,13 +94,16 @@ class FusedTeam:
         return self.robots[fused.members[0]]
 
     def truth_of(self, fused: FusedMap) -> Float:
-        """Return the true points (N, 3) of fused landmarks, or NaN.
+        """Return the true positions (N, 3) of fused landmarks; NaN if unknown.
 
         The true point of a fused landmark is the mean of the true points of its parents.
         """
         points = self.parent_points(fused)
-        known = np.all(np.isfinite(points), axis=2, keepdims=True)
-        total, count = np.where(known, points, 0.0).sum(axis=1), np.count_nonzero(known, axis=1)
+        is_known = np.all(np.isfinite(points), axis=2, keepdims=True)
+        total, count = (
+            np.where(is_known, points, 0.0).sum(axis=1),
+            np.count_nonzero(is_known, axis=1),
+        )
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def parent_points(self, fused: FusedMap) -> Float:
@@ -111,8 +114,8 @@ class FusedTeam:
         """
         points = np.full((*fused.parents.shape, 3), np.nan)
         for k, robot in enumerate(self.robots):
-            has = fused.parents[:, k] != ABSENT
-            points[has, k] = robot.at(self.iteration)[1][fused.parents[has, k]]
+            has_parent = fused.parents[:, k] != ABSENT
+            points[has_parent, k] = robot.at(self.iteration)[1][fused.parents[has_parent, k]]
         return points
 
 
@@ -131,14 +134,14 @@ def fusion_rows(
         fused = pair.fused
         assert fused is not None
         (map_a, points_a), (map_b, points_b) = a.at(pair.iteration), b.at(pair.iteration)
-        both = np.flatnonzero((fused.parents != ABSENT).all(axis=1))
-        i, j = fused.parents[both].T
+        fused_rows = np.flatnonzero((fused.parents != ABSENT).all(axis=1))
+        i, j = fused.parents[fused_rows].T
         # [:, None]: the matrix product of all points at once would differ in the last bits
         truth = a.in_map_frame(((points_a[i] + points_b[j]) / 2)[:, None])[:, 0]
         moved_b = se2.transform_points(fused.T_first_map[1], map_b.position_m[j][:, None])[:, 0]
-        error = fused.landmarks.position_m[both] - truth
+        error = fused.landmarks.position_m[fused_rows] - truth
         used = fused.landmarks.n_dimensions
-        covariance = fused.landmarks.covariance_m2[both, :used, :used]
+        covariance = fused.landmarks.covariance_m2[fused_rows, :used, :used]
         vectors = {
             "error_a_m": map_a.position_m[i] - truth,
             "error_b_m": moved_b - truth,

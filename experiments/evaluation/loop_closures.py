@@ -1,4 +1,4 @@
-"""Loop closures of a robot: landmarks that come into view again after new ground.
+"""Loop closures of a robot: landmarks that come into view again after newly explored areas.
 
 The paper (section 4, figures 2 and 3) says that the particles spread on new ground and draw
 together when the robot closes a loop and sees landmarks again that it had mapped before.
@@ -16,8 +16,9 @@ from mapfusion.robot_log import RobotLog
 OUT_OF_VIEW_FRAMES = 50
 # Frames before and after a closure that are compared; a robot drives about 5 m in this time.
 WINDOW_FRAMES = 50
-# Share of landmarks that have come back among those that come into view. On new ground, few are
-# old ones seen from afar. On known ground, most are, and the others are corners that were missed.
+# Share of landmarks that have come back among those that come into view. In newly explored areas,
+# few are old ones seen from afar. On known ground, most are, and the others are corners that were
+# missed.
 _MOST_ON_NEW_GROUND, _LEAST_ON_KNOWN_GROUND = 0.25, 0.5
 # Landmarks that come into view in a window; shares of fewer are chance.
 _LEAST_LANDMARKS = 20

@@ -259,7 +259,7 @@ def load_smoothed(
         log: its log.
         smooth: folder of the stage `smooth`.
     """
-    truth, maps = truth_or_unknown(folders.log, log), read_smoothed(smooth, last_whole=True)
+    truth, maps = truth_or_unknown(folders.log, log), read_smoothed(smooth, only_last_joint=True)
     points = landmark_truth(truth, partial(smoothed_owners, smooth, folders.slam), maps)
     endings = read_endings(smooth)
     reasons = dict(zip(endings["iteration"].tolist(), endings["not_smoothed"], strict=True))

@@ -57,14 +57,18 @@ ALIGNER_METRICS: dict[str, Metric] = {}  # metrics ALIGNER.NAME of each aligner
 _PAIR = ["seed", "robot_a", "robot_b"]
 
 
-def metric(**which: str) -> Callable[[Metric], Metric]:
-    """Register a metric under the name of the function, or one metric for each given name."""
+def metric(**variants: str) -> Callable[[Metric], Metric]:
+    """Register a metric under the name of its function, or several variants of it.
+
+    Args:
+        variants: value of the function's argument `variant`, by the name of the metric.
+    """
 
     def register(function: Metric) -> Metric:
-        of_aligner = "aligner" in inspect.signature(function).parameters
-        known = ALIGNER_METRICS if of_aligner else METRICS
-        variants = {name: partial(function, which=value) for name, value in which.items()}
-        known.update(variants or {function.__name__: function})
+        is_aligner_metric = "aligner" in inspect.signature(function).parameters
+        registry = ALIGNER_METRICS if is_aligner_metric else METRICS
+        functions = {name: partial(function, variant=value) for name, value in variants.items()}
+        registry.update(functions or {function.__name__: function})
         return function
 
     return register
@@ -75,9 +79,9 @@ def _of(errors: pd.DataFrame, aligner: str) -> pd.DataFrame:
 
 
 @metric(path_rmse_m="path_m", odometry_rmse_m="odometry_m")
-def _path_rmse_m(tables: Tables, which: str) -> float:
+def _path_rmse_m(tables: Tables, variant: str) -> float:
     """Return the RMS error of online paths or odometry, median over robots and seeds."""
-    return path_rms(tables["robots"], ("seed", "robot"))[which].median()
+    return path_rms(tables["robots"], ("seed", "robot"))[variant].median()
 
 
 @metric()
@@ -113,9 +117,9 @@ _SMOOTHER += ("nees_per_dof", "coverage_95")
 
 
 @metric(**{f"smoother.{name}": name for name in _SMOOTHER})
-def _smoother_column(tables: Tables, which: str) -> float:
+def _smoother_column(tables: Tables, variant: str) -> float:
     """Return a column of the table `smoother`, median over robots and seeds."""
-    return tables["smoother"][which].median()
+    return tables["smoother"][variant].median()
 
 
 @metric(
@@ -123,10 +127,10 @@ def _smoother_column(tables: Tables, which: str) -> float:
     oracle_rotation_rad="refined_rotation_error_rad",
     true_pairs_at_end="n_true",
 )
-def _oracle_at_the_end(tables: Tables, which: str) -> float:
+def _oracle_at_the_end(tables: Tables, variant: str) -> float:
     """Return an error or the true pairs of the oracle at the end, median over seeds and pairs."""
-    rows = criteria.at_the_end(_of(tables["errors"], ORACLE))
-    return criteria.absolute_errors(rows, [which])[which].median()
+    rows = criteria.at_last_iteration(_of(tables["errors"], ORACLE))
+    return criteria.absolute_errors(rows, [variant])[variant].median()
 
 
 def _truly_fused(tables: Tables) -> pd.DataFrame:
@@ -141,23 +145,24 @@ def fused_over_parents(tables: Tables) -> float:
     The result is the median over seeds and robot pairs.
     """
     a, b, fused = (
-        _truly_fused(tables).groupby(_PAIR)[f"error_{of}_m"].agg(rms) for of in ("a", "b", "fused")
+        _truly_fused(tables).groupby(_PAIR)[f"error_{name}_m"].agg(rms)
+        for name in ("a", "b", "fused")
     )
     return (fused / ((a + b) / 2)).median()
 
 
 @metric(fused_nees_with_drift="nees_with_drift", fused_nees_without_drift="nees_without_drift")
-def _nees_per_dof(tables: Tables, which: str) -> float:
+def _nees_per_dof(tables: Tables, variant: str) -> float:
     """Return the mean NEES per degree of freedom of fused landmarks; 1 is consistent."""
     rows = _truly_fused(tables)
-    return (rows[which] / rows["degrees_of_freedom"]).mean()
+    return (rows[variant] / rows["degrees_of_freedom"]).mean()
 
 
 @metric(landmark_rmse_median_m="median", landmark_rmse_worst_m="max")
-def _landmark_rmse_m(tables: Tables, which: str) -> float:
+def _landmark_rmse_m(tables: Tables, variant: str) -> float:
     """Return the landmark RMSE after a rigid fit: median or maximum over robots, then seeds."""
     fits = tables["map_fits"]
-    return fits[fits["map"] != "fused"].groupby("seed")["rmse_m"].agg(which).agg(which)
+    return fits[fits["map"] != "fused"].groupby("seed")["rmse_m"].agg(variant).agg(variant)
 
 
 @metric()
@@ -167,15 +172,15 @@ def fused_landmark_rmse_m(tables: Tables) -> float:
 
 
 @metric(**{MERGED_ROBOTS: "tx_m"})
-def _merged_robots(tables: Tables, which: str) -> float:
+def _merged_robots(tables: Tables, variant: str) -> float:
     """Return the number of robots whose maps were merged, median over seeds."""
-    return tables["fused_motions"].groupby("seed")[which].agg(merged_robots).median()
+    return tables["fused_motions"].groupby("seed")[variant].agg(merged_robots).median()
 
 
 @metric(**{"team.ate_rmse_m": "rmse"})
-def _team_ate_m(tables: Tables, which: str) -> float:
+def _team_ate_m(tables: Tables, variant: str) -> float:
     """Return the ATE (RMSE) of the final paths of all merged robots, median over seeds."""
-    return tables["team"].query("component == 1 and source == 'final'")[which].median()
+    return tables["team"].query("component == 1 and source == 'final'")[variant].median()
 
 
 @metric(
@@ -184,16 +189,16 @@ def _team_ate_m(tables: Tables, which: str) -> float:
         "team.rotation_rad": "team_rotation_error_rad",
     }
 )
-def _team_pair_error(tables: Tables, which: str) -> float:
+def _team_pair_error(tables: Tables, variant: str) -> float:
     """Return the error of T_a_b in the fused map, median over seeds and merged pairs."""
-    return tables["team_pairs"][which].abs().median()
+    return tables["team_pairs"][variant].abs().median()
 
 
 @metric(**{"team.edge_precision": "precision", "team.edge_recall": "recall"})
-def _team_edges(tables: Tables, which: str) -> float:
+def _team_edges(tables: Tables, variant: str) -> float:
     """Return precision or recall of the alignments that the team uses, over all seeds."""
-    of = {"precision": edge_precision, "recall": edge_recall}[which]
-    return of(tables["team_pairs"])
+    measure = {"precision": edge_precision, "recall": edge_recall}[variant]
+    return measure(tables["team_pairs"])
 
 
 @metric()
@@ -206,11 +211,11 @@ def refined_oracle_distance_m(tables: Tables, aligner: str) -> float:
 @metric(
     refined_over_oracle="refined_translation_error_m", estimated_over_oracle="translation_error_m"
 )
-def _over_oracle(tables: Tables, aligner: str, which: str) -> float:
+def _over_oracle(tables: Tables, aligner: str, variant: str) -> float:
     """Return the median translation error over the oracle's, for rich pairs."""
     errors = rich(tables["errors"])
     maps = summarise_alignments(errors[errors["aligner"].isin([aligner, ORACLE])])
-    return error_over_oracle(maps, which).get(aligner, np.nan)
+    return error_over_oracle(maps, variant).get(aligner, np.nan)
 
 
 @metric()
@@ -228,10 +233,10 @@ def largest_translation_m(tables: Tables, aligner: str) -> float:
 
 
 @metric(motion_nees_per_dof="nees_per_dof", motion_coverage_90="inside")
-def _alignment_consistency(tables: Tables, aligner: str, which: str) -> float:
+def _alignment_consistency(tables: Tables, aligner: str, variant: str) -> float:
     """Return the consistency of T_a_b: the median NEES per degree of freedom, or the coverage."""
-    of_maps = criteria.alignment_consistency(_of(tables["errors"], aligner))[which]
-    return of_maps.median() if which == "nees_per_dof" else of_maps.mean()
+    values = criteria.alignment_consistency(_of(tables["errors"], aligner))[variant]
+    return values.median() if variant == "nees_per_dof" else values.mean()
 
 
 @metric()
@@ -257,7 +262,7 @@ def scatter_m(tables: Tables, aligner: str) -> float:
 
 
 @metric(false_merges="")
-def _all_false_merges(tables: Tables, which: str) -> float:
+def _all_false_merges(tables: Tables, variant: str) -> float:
     """Return the share of false merges among all alignments of all aligners.
 
     Alignments of the filter's maps and of the smoothed maps count.
@@ -278,13 +283,13 @@ def missed_merges(tables: Tables, aligner: str) -> float:
     return (~criteria.mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
 
 
-def on_smoothed(tables: Tables, aligner: str, of_aligner: Metric) -> float:
+def on_smoothed(tables: Tables, aligner: str, aligner_metric: Metric) -> float:
     """Return a metric of an aligner's alignments of smoothed maps."""
-    return of_aligner({**tables, "errors": tables["smoothed_errors"]}, aligner)
+    return aligner_metric({**tables, "errors": tables["smoothed_errors"]}, aligner)
 
 
 ALIGNER_METRICS |= {
-    f"smoothed_{name}": partial(on_smoothed, of_aligner=ALIGNER_METRICS[name])
+    f"smoothed_{name}": partial(on_smoothed, aligner_metric=ALIGNER_METRICS[name])
     for name in SMOOTHED_METRICS
 }
 
@@ -360,11 +365,13 @@ def check(scenario: AnyScenario, results: Mapping[int, Path]) -> list[Outcome]:
         for name in USED_TABLES:
             rows = tables.read(tables.table_path(result, name), name)
             by_seed[seed][name] = rows.assign(seed=seed)
-    parts = {name: [own[name] for own in by_seed.values()] for name in USED_TABLES}
+    parts = {
+        name: [tables_of_seed[name] for tables_of_seed in by_seed.values()] for name in USED_TABLES
+    }
     pooled = {name: pd.concat(each, ignore_index=True) for name, each in parts.items()}
     outcomes = []
     for name, bound in scenario.expect.items():
-        per_seed = {seed: compute(name, own) for seed, own in by_seed.items()}
+        per_seed = {seed: compute(name, tables_of_seed) for seed, tables_of_seed in by_seed.items()}
         value = compute(name, pooled)
         outcomes.append(Outcome(scenario.name, name, value, bound, per_seed))
     return outcomes

@@ -253,7 +253,7 @@ def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.Da
     if edges.empty:
         return edges
     used = (errors["aligner"] == aligner) & (errors["repetition"] == 0)
-    of_judged = criteria.at_the_end(errors[used])[[*_PAIR, *_OWN_ALIGNMENT]]
+    of_judged = criteria.at_last_iteration(errors[used])[[*_PAIR, *_OWN_ALIGNMENT]]
     rows = edges.merge(of_judged, "inner", _PAIR)
     if rows.empty:
         return rows

@@ -114,15 +114,15 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
         return run.load_fusions(team.robots, smoothed())
 
     def fused_map() -> pd.DataFrame:
-        own = [fusion for fusion in fusions() if fusion.fuser == scenario.merge.fuser]
-        last = max(own, key=lambda fusion: fusion.iteration, default=None)
+        chosen = [fusion for fusion in fusions() if fusion.fuser == scenario.merge.fuser]
+        last = max(chosen, key=lambda fusion: fusion.iteration, default=None)
         return pd.DataFrame() if last is None else fused_landmarks.fused_rows(last.team())
 
     def team_paths() -> list[dict[str, Any]]:
         # The last fusion of smoothed maps, if possible by `merge.fuser`, places smoothed paths.
         smoothing = [fusion for fusion in fusions() if make_fuser(fusion.fuser).smoothed]
-        own = [fusion for fusion in smoothing if fusion.fuser == scenario.merge.fuser]
-        last = max(own or smoothing, key=lambda fusion: fusion.iteration, default=None)
+        chosen = [fusion for fusion in smoothing if fusion.fuser == scenario.merge.fuser]
+        last = max(chosen or smoothing, key=lambda fusion: fusion.iteration, default=None)
         return team_rows(team, paths(), None if last is None else last.fusion.T_first_map)
 
     def sightings() -> pd.DataFrame:
@@ -148,12 +148,12 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
         return pd.concat(parts, ignore_index=True)
 
     def timings() -> list[dict[str, Any]]:
-        of_stages = [
-            timing_row(stage.name, stage.key, seconds, figure)
+        rows = [
+            timing_row(stage.name, stage.key, seconds, quantity)
             for stage in run.folders()
-            for figure, seconds in stage.figures().items()
+            for quantity, seconds in stage.quantities().items()
         ]
-        return of_stages + [timing_row(part, "run", s) for part, s in run.outside_s.items()]
+        return rows + [timing_row(part, "run", s) for part, s in run.outside_s.items()]
 
     def landmarks() -> pd.DataFrame:
         iteration, rows = team.iteration, fused_landmarks.landmark_rows

@@ -29,7 +29,7 @@ from mapfusion.datasets.log_consistency import Finding, gate_finding
 from mapfusion.datasets.stereo_recording import StereoDrive
 from mapfusion.errors import InputError
 from mapfusion.fastslam.mapping import run_log
-from mapfusion.files import write_together
+from mapfusion.files import write_all_atomically
 from mapfusion.fusion.map_merging import MapAlignment, MergedMaps, align_maps, load_maps, merge_maps
 from mapfusion.geometry.numerics import Float, generator
 from mapfusion.landmark_map import LandmarkMap, map_writes
@@ -167,7 +167,7 @@ def save_maps(path: Path, made: SlamResult) -> list[Path]:
         paths.append(path.with_name(f"{path.stem}.smoothed{path.suffix}"))
         writes |= map_writes(paths[-1], made.smoothed)
     try:
-        write_together(writes)
+        write_all_atomically(writes)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
     return paths

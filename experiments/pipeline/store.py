@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 
 from experiments.pipeline.stage import RecordedLog, Stage
 from mapfusion.errors import DamagedFileError, StoreRepairWarning
-from mapfusion.files import PART, digest_of, read_json, require_file, write_json, write_whole
+from mapfusion.files import PART, digest_of, read_json, require_file, write_atomically, write_json
 
 # Number of digests that a process keeps in memory: those of some thousand stages.
 _DIGESTS_KEPT = 100_000
@@ -88,7 +88,7 @@ def link_or_copy(source: Path, target: Path) -> None:
         except OSError:
             shutil.copyfile(source, temporary)
 
-    write_whole(target, place)
+    write_atomically(target, place)
 
 
 _MARK = "done"
@@ -132,8 +132,8 @@ class StageFolder:
         known = {"stage": self.name, "key": self.key}
         write_json(mark, {**known, "figures": dict(figures), "files": entries})
 
-    def figures(self) -> dict[str, Any]:
-        """Return the figures of `finish`, summed over the finished parts.
+    def quantities(self) -> dict[str, Any]:
+        """Return the quantities stored by `finish`, such as times, summed over the finished parts.
 
         Raises:
             DamagedFileError: a mark is damaged.

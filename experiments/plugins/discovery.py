@@ -237,16 +237,16 @@ def _find_spec(package: str) -> ModuleSpec | None:
 
 @functools.cache
 def fingerprint(package: str) -> str:
-    """Return a hash of the code files of a top-level package, module or file; empty if absent."""
+    """Return the SHA-256 of the code files of a top-level package, module or file; "" if absent."""
     is_file = package.endswith(".py")
     spec = None if is_file else _find_spec(package)
     if spec is None and not is_file:
         return ""
-    roots = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
-    files = [(root, path) for root in roots for path in sorted(root.rglob("*"))]
+    folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
+    files = [(root, path) for root in folders for path in sorted(root.rglob("*"))]
     if is_file:
         files = [(Path(package).parent, Path(package))]
-    elif spec and spec.origin and not roots:
+    elif spec and spec.origin and not folders:
         files = [(Path(spec.origin).parent, Path(spec.origin))]
     digest = hashlib.sha256()
     for root, path in files:

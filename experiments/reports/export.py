@@ -25,7 +25,7 @@ from experiments.reports.layout import plain
 from mapfusion import attitude, landmark_map, robot_log, viewing
 from mapfusion.align.alignment import Status
 from mapfusion.datasets.log_consistency import Finding
-from mapfusion.files import default_of, description_of, write_whole
+from mapfusion.files import default_of, description_of, write_atomically
 from mapfusion.fusion.map_merging import MapAlignment, MergedMaps, advice
 from mapfusion.geometry.joint_covariance import RANK
 from mapfusion.landmark_map import LandmarkMap
@@ -45,7 +45,7 @@ def write_tables(folder: Path, tables: dict[str, pd.DataFrame]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file as a whole."""
     data = text.encode("utf-8", "backslashreplace")  # text of users may contain lone surrogates
-    write_whole(path, lambda file: file.write_bytes(data))
+    write_atomically(path, lambda file: file.write_bytes(data))
 
 
 def to_markdown(table: pd.DataFrame) -> str:
@@ -79,14 +79,21 @@ _AXES = ("xx_m2", "xy_m2", "xt_m_rad", "yy_m2", "yt_m_rad", "tt_rad2")  # in the
 
 
 def publish_json(
-    kind: str, content: Mapping[str, Any], shown: bool, path: Path | None = None
+    kind: str, content: Mapping[str, Any], is_printed: bool, path: Path | None = None
 ) -> None:
-    """Print the document of a command if it is shown, and write it if there is a path."""
+    """Write the JSON document of a command.
+
+    Args:
+        kind: kind of the document.
+        content: entries of the document.
+        is_printed: if true, the document is printed.
+        path: file to write; None for none.
+    """
     document = {"schema_version": JSON_SCHEMA_VERSION, "kind": kind} | _json_able(content)
     text = json.dumps(document, indent=1, allow_nan=False) + "\n"
     if path is not None:
         write_text(path, text)
-    if shown:
+    if is_printed:
         sys.stdout.write(text)
 
 
@@ -95,9 +102,9 @@ def _json_able(value: Any) -> Any:
     if isinstance(value, pd.DataFrame):
         return _json_able(value.to_dict("records"))
     if isinstance(value, Mapping):
-        return {str(name): _json_able(held) for name, held in value.items()}
+        return {str(name): _json_able(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_json_able(held) for held in value]
+        return [_json_able(item) for item in value]
     if isinstance(value, np.generic):
         return _json_able(value.item())
     if isinstance(value, float):
@@ -260,7 +267,9 @@ def write_junit(path: Path, checks: Sequence[CheckedScenario]) -> None:
         _add_totals(suite)
     _add_totals(root)
     document = ET.ElementTree(root)
-    write_whole(path, lambda file: document.write(file, encoding="utf-8", xml_declaration=True))
+    write_atomically(
+        path, lambda file: document.write(file, encoding="utf-8", xml_declaration=True)
+    )
 
 
 def _add_case(

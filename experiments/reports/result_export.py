@@ -25,7 +25,7 @@ from mapfusion.datasets.text_files import tum_text
 from mapfusion.errors import InputError, not_installed
 from mapfusion.exchange import G2oGraph
 from mapfusion.fastslam.motion import MotionNoise
-from mapfusion.files import POSE_FIELDS, write_whole
+from mapfusion.files import POSE_FIELDS, write_atomically
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import coloured_ply, joint_path, read_map
@@ -205,7 +205,7 @@ def write_rerun(data: ResultTables, path: Path) -> None:
         recording.add_fused_map()
         recording.close()
 
-    write_whole(path, write)
+    write_atomically(path, write)
 
 
 class _Recording:
@@ -234,7 +234,7 @@ class _Recording:
         for file in sorted((data.folder / "keyframes").glob(f"{robot}_[0-9]*.png")):
             iteration = int(file.stem.removeprefix(f"{robot}_"))
             now = tracks[tracks["iteration"] == iteration]
-            self._begin(iteration)
+            self._set_iteration(iteration)
             image = self._rerun.EncodedImage(contents=read_png(file), media_type="image/png")
             self._stream.log(f"images/{robot}", image)
             labels = [
@@ -250,12 +250,12 @@ class _Recording:
             self._stream.log(f"images/{robot}/features", features)
         path = _in_plan(*data.path_of(robot).T)
         for iteration, landmarks in self._map_history(robot).items():
-            self._begin(iteration)
+            self._set_iteration(iteration)
             self._add_lines(f"{where}/path", [path[: iteration + 1]], colour)
             self._add_points(f"{where}/map", landmarks, colour)
         clouds = data.rows("clouds")
         for iteration, cloud in clouds[clouds["robot"] == robot].groupby("iteration"):
-            self._begin(int(iteration))  # pyright: ignore[reportArgumentType]
+            self._set_iteration(int(iteration))  # pyright: ignore[reportArgumentType]
             position = _in_plan(cloud["x_m"].to_numpy(), cloud["y_m"].to_numpy())
             self._add_points(f"{where}/particles", position, colour, _PARTICLE_M)
 
@@ -273,7 +273,7 @@ class _Recording:
             a, b = maps[0][k], se2.transform_points(found.T_a_b, maps[1][k])
             own = offered[offered["iteration"] == k]
             index_a, index_b = own[["index_a", "index_b"]].to_numpy()[found.inlier].T
-            self._begin(k)
+            self._set_iteration(k)
             for robot, points in zip(pair, (a, b), strict=True):
                 self._add_points(f"{where}/{robot}", points, data.colours[robot])
             strips = list(np.stack([a[index_a], b[index_b]], axis=1))
@@ -286,7 +286,7 @@ class _Recording:
         """Log the last fused map, coloured by the robots of each landmark, and the walls."""
         data = self._data
         fused: pd.DataFrame = data.fused_map()
-        self._begin(int(data.table("paths")["iteration"].max()))
+        self._set_iteration(int(data.table("paths")["iteration"].max()))
         position = fused[["x_m", "y_m", "z_m"]].to_numpy(np.float64)
         several = fused["n_parents"].to_numpy() > 1
         self._add_points("fused/several", position[several], FUSED_COLOUR)
@@ -302,9 +302,9 @@ class _Recording:
         rows = self._data.rows("map_history")
         rows = rows[rows["robot"] == robot].sort_values(["iteration", "landmark"])
         groups = rows.groupby("iteration")
-        return {int(k): _in_plan(own["x_m"], own["y_m"]) for k, own in groups}  # pyright: ignore[reportArgumentType]
+        return {int(k): _in_plan(landmarks["x_m"], landmarks["y_m"]) for k, landmarks in groups}  # pyright: ignore[reportArgumentType]
 
-    def _begin(self, iteration: int) -> None:
+    def _set_iteration(self, iteration: int) -> None:
         """Set the iteration of all later entries."""
         self._stream.set_time(_TIMELINE, sequence=iteration)
 

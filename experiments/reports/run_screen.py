@@ -16,7 +16,7 @@ from experiments.evaluation.criteria import (
     ANSWERABLE_PAIRS,
     ORACLE,
     answerable,
-    at_the_end,
+    at_last_iteration,
     has_common_ground,
     is_used_by_team,
     merged_robots,
@@ -175,7 +175,7 @@ def closing_lines(result: Path) -> tuple[str, str]:
         estimates = tables.read(tables.table_path(result, "estimates"), "estimates")
         advice = "Method to use: unknown. There are no two maps to align."
         if len(estimates):
-            last = at_the_end(estimates)
+            last = at_last_iteration(estimates)
             last = last[last["repetition"] == 0]
             accepted = last.groupby("aligner", sort=False)["accepted"].agg(["sum", "count"])
             n_most, n_pairs = int(accepted["sum"].max()), int(accepted["count"].max())
@@ -259,10 +259,10 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
             print_frame(rows, _SMOOTHED, "Refined errors on FastSLAM's and on smoothed maps", note)
         # Each pair at its last iteration: the first aligner, refined, beside the oracle
         names = ["refined_translation_error_m", "refined_rotation_error_rad"]
-        bands = at_the_end(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])
+        bands = at_last_iteration(error_bands(errors)).set_index([*ROBOT_PAIR, "aligner"])
         medians = bands[names].T.to_dict("list")
         rows = []
-        for last in at_the_end(errors).drop_duplicates(ROBOT_PAIR).to_dict("records"):
+        for last in at_last_iteration(errors).drop_duplicates(ROBOT_PAIR).to_dict("records"):
             pair = (last["robot_a"], last["robot_b"])
             found = (*medians[(*pair, aligners[0])], *medians[(*pair, ORACLE)])
             n_true = f"{last['n_true']} of {last['n_correspondences']}"

@@ -35,7 +35,7 @@ from experiments.studies.independence_trial import (
     STRATEGIES,
     TEAMS,
     Independence,
-    at_the_end,
+    medians_at_last_iteration,
     shown_numbers,
 )
 from experiments.studies.paper_claims import READINGS, VALUES, claims_table
@@ -81,7 +81,7 @@ def run_statistics(
         contents = {"n_runs": summary.n_runs, "n_configurations": summary.n_configurations}
         contents |= {"missing_tables": summary.missing, "failed_runs": summary.failed}
         publish_json(
-            "statistics", contents | {"written": output, "tables": summary.tables}, shown=True
+            "statistics", contents | {"written": output, "tables": summary.tables}, is_printed=True
         )
     return summary, skipped
 
@@ -149,12 +149,16 @@ def write_provenance(folder: Path, content: Mapping[str, Any]) -> None:
 
 def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
     """Return the whole table in Markdown, one section for each number of pairs."""
-    share = design.unpaired_share
-    alone = f"{share:.0%} of each map's landmarks without a partner; " if share else ""
+    unpaired_share = design.unpaired_share
+    unpaired_text = (
+        f"{unpaired_share:.0%} of each map's landmarks without a partner; "
+        if unpaired_share
+        else ""
+    )
     parts = [
         f"# Aligners on made-up maps\n\n"
         f"Planar maps of landmarks uniform in {SIZE_M:g} x {SIZE_M:g} m, residuals of true pairs "
-        f"{SIGMA_M:g} m per axis, false pairs uniform; {alone}"
+        f"{SIGMA_M:g} m per axis, false pairs uniform; {unpaired_text}"
         f"{design.trials} trials a cell, seed {design.seed}, the same maps for all methods.\n\n"
         f"Each cell: successes in % (accepted and within {RIGHT_WITHIN_M:g} m and "
         f"{RIGHT_WITHIN_RAD:g} rad as estimated) with Wilson's 95 % interval; the median "
@@ -166,10 +170,10 @@ def benchmark_markdown(design: BenchmarkDesign, summary: pd.DataFrame) -> str:
     ]
     for n_pairs, rows in summary.groupby("n_pairs", sort=False):
         columns = {
-            f"{share:.0%} outliers ({cells['n_true'].iloc[0]} true)": cells.set_index(
+            f"{unpaired_share:.0%} outliers ({cells['n_true'].iloc[0]} true)": cells.set_index(
                 "method"
             ).apply(cell_text, axis=1)
-            for share, cells in rows.groupby("outlier_share", sort=False)
+            for unpaired_share, cells in rows.groupby("outlier_share", sort=False)
         }
         table = pd.DataFrame(columns).reset_index(names="method")
         parts += [f"## {n_pairs} pairs\n", to_markdown(table)]
@@ -203,7 +207,7 @@ def write_independence(
     Returns:
         The reason if there is no figure, else an empty list.
     """
-    summary = at_the_end(found)
+    summary = medians_at_last_iteration(found)
     write_rows(folder / "teams.parquet", TEAMS, found.teams)
     write_rows(folder / "costs.parquet", COSTS, found.costs)
     write_text(folder / "summary.csv", summary.to_csv(index=False))

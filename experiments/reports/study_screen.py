@@ -76,7 +76,7 @@ def print_benchmark(folder: Path, summary: pd.DataFrame) -> None:
 
 
 def print_independence(folder: Path, summary: pd.DataFrame, skipped: Sequence[str]) -> None:
-    """Print costs and errors of each strategy (rows of `at_the_end`), and the folder."""
+    """Print costs and errors of each strategy (`medians_at_last_iteration`), and the folder."""
     headings = [("way", ""), *((heading, ">") for _, heading in COST_HEADINGS.values())]
     note = "; ".join(f"{strategy.name}: {strategy.label}" for strategy in STRATEGIES)
     for n_robots, rows in summary.groupby("n_robots"):
@@ -134,17 +134,17 @@ def print_sweep(dataset: SweepDataset, runs: Sequence[SweepRun], failed: Mapping
     if finished:
         summary = medians_over_runs(dataset, finished)
         keys = (key.rpartition(".")[2] for key in dataset.keys)
-        shown = columns("", setting=" ".join(("scenario", *keys)), aligner="aligner")
-        for error, given, stage in zip(ERRORS, GIVEN, ("estim.", "refined"), strict=True):
-            shown |= columns(".3f", **{error: f"{stage}\nm"})
-            shown |= columns(".0%", **{given: "\ngiven"})
-        shown |= columns("d", runs="runs")
+        shown_columns = columns("", setting=" ".join(("scenario", *keys)), aligner="aligner")
+        for error, column, stage in zip(ERRORS, GIVEN, ("estim.", "refined"), strict=True):
+            shown_columns |= columns(".3f", **{error: f"{stage}\nm"})
+            shown_columns |= columns(".0%", **{column: "\ngiven"})
+        shown_columns |= columns("d", runs="runs")
         title = f"Median translation errors over runs, {ANSWERABLE_PAIRS}+ true correspondences"
-        print_frame(summary.head(MAX_ROWS_SHOWN), shown, title, NO_ESTIMATE)
+        print_frame(summary.head(MAX_ROWS_SHOWN), shown_columns, title, NO_ESTIMATE)
         if len(summary) > MAX_ROWS_SHOWN:
             lines.append(f"... and {len(summary) - MAX_ROWS_SHOWN} more rows")
-    shown = sorted(failed)[:MAX_FAILURES_SHOWN]
-    lines += [f"  {run_id} failed: {failed[run_id]}" for run_id in shown]
+    shown_columns = sorted(failed)[:MAX_FAILURES_SHOWN]
+    lines += [f"  {run_id} failed: {failed[run_id]}" for run_id in shown_columns]
     if len(failed) > MAX_FAILURES_SHOWN:
         lines.append(f"  ... and {len(failed) - MAX_FAILURES_SHOWN} more failed")
     print_lines([*lines, f"{len(finished)} of {len(runs)} runs finished; tables: {dataset.folder}"])

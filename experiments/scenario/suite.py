@@ -280,7 +280,7 @@ def copy_to_edit(name: str) -> tuple[Path, Path]:
         InputError: the name is unknown, or the file exists.
     """
     from experiments.scenario.loading import schema_text  # slow imports
-    from mapfusion.files import write_whole
+    from mapfusion.files import write_atomically
 
     shipped = {path.stem: path for path in _files(SHIPPED)}
     if name not in shipped:
@@ -290,7 +290,7 @@ def copy_to_edit(name: str) -> tuple[Path, Path]:
     if copy.exists():
         raise InputError(f"{copy}: exists; edit it, or rename it to get the shipped one again")
     for path, text in ((schema, schema_text()), (copy, with_common_settings(source))):
-        write_whole(path, lambda file, text=text: file.write_text(text, encoding="utf-8"))
+        write_atomically(path, lambda file, text=text: file.write_text(text, encoding="utf-8"))
     return copy, schema
 
 

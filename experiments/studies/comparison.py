@@ -285,9 +285,9 @@ def _compared(
     table["p_holm"] = intervals.holm(table["p"].to_numpy())
     table["verdict"] = [_verdict(row) for row in table.to_dict("records")]
     notes += _differing_settings(a, b)
-    for names, which in ((runs_a - runs_b, "first"), (runs_b - runs_a, "second")):
+    for names, side_name in ((runs_a - runs_b, "first"), (runs_b - runs_a, "second")):
         if names:
-            runs = f"{len(names)} run{'s' * (len(names) > 1)} of the {which}"
+            runs = f"{len(names)} run{'s' * (len(names) > 1)} of the {side_name}"
             notes.append(f"left out: {runs} that the other has not ({_some(names)})")
     is_common = match_names(a.described, apart_from).isin(common)
     n_worlds = len(a.described.loc[is_common, ["scenario", "seed"]].drop_duplicates())
@@ -378,26 +378,26 @@ def _all_values(
             parts = []
             for batch in runs.batches(table, columns, optional):
                 of_run = [*RUN_KEYS, *setting_columns(batch)]
-                named = batch.drop(columns=of_run)
-                parts.append(reduce(named.assign(run_id=match_names(batch, apart_from))))
+                value_columns = batch.drop(columns=of_run)
+                parts.append(reduce(value_columns.assign(run_id=match_names(batch, apart_from))))
             # A run of one robot has no rows, and its columns have no useful types.
             parts = [part for part in parts if len(part)] or parts[:1]
             frames.append(pd.concat(parts, ignore_index=True))
         # Join the rows of both by run and keys; counts are the smaller ones of both.
         keys = [name for name in _KEYS if name in frames[0]]
         joined = frames[0].merge(frames[1], on=keys, suffixes=("_a", "_b"))
-        lesser = {
+        smaller_counts = {
             name: joined.filter(like=name).min(axis=1) for name in COUNTS if name in frames[0]
         }
-        rows = joined.assign(**lesser)
+        rows = joined.assign(**smaller_counts)
         methods = methods_in(rows, oracle=True) if "aligner" in rows else []
         for method in [*methods, ""]:
-            own = rows[rows["aligner"] == method] if method else rows
-            of = method if method in ("", ORACLE) else EACH_METHOD
+            method_rows = rows[rows["aligner"] == method] if method else rows
+            method_kind = method if method in ("", ORACLE) else EACH_METHOD
             for quantity in QUANTITIES:
-                if (quantity.table, quantity.of) != (table, of):
+                if (quantity.table, quantity.of) != (table, method_kind):
                     continue
-                chosen = own.query(quantity.where) if quantity.where else own
+                chosen = method_rows.query(quantity.where) if quantity.where else method_rows
                 x, y = (
                     chosen[f"{quantity.column}_{side}"].to_numpy(dtype=np.float64) for side in "ab"
                 )
@@ -410,7 +410,7 @@ def _all_values(
                         np.abs(intervals.log_ratio(v, np.ones(1))) for v in (x, y)
                     )
                     change = from_1_b - from_1_a
-                known = np.isfinite(x) & np.isfinite(change)
-                if known.any():
+                is_finite = np.isfinite(x) & np.isfinite(change)
+                if is_finite.any():
                     values = {"run_id": chosen["run_id"], "a": x, "b": y, "change": change}
-                    yield quantity, method, pd.DataFrame(values)[known]
+                    yield quantity, method, pd.DataFrame(values)[is_finite]

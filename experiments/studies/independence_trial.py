@@ -182,21 +182,21 @@ class RecordedTeam:
         found = list[Stage]()
         for pair in self.run.pipeline.pairs:
             aligned = next(iter(pair.smoothed.aligners.values()))
-            matched, own = pair.smoothed.match.settings, aligned.settings
+            matched, settings = pair.smoothed.match.settings, aligned.settings
             assert isinstance(matched, MatchSettings)
-            assert isinstance(own, AlignerSettings)
+            assert isinstance(settings, AlignerSettings)
             # the batches of iterations in which the aligner ran do not change its cost
-            own = replace(own, iterations=())
-            before = {"log_a": pair.a.log, "slam_a": pair.a.slam, "smooth_a": pair.a.smooth}
-            before |= {"log_b": pair.b.log, "slam_b": pair.b.slam, "smooth_b": pair.b.smooth}
+            settings = replace(settings, iterations=())
+            inputs = {"log_a": pair.a.log, "slam_a": pair.a.slam, "smooth_a": pair.a.smooth}
+            inputs |= {"log_b": pair.b.log, "slam_b": pair.b.slam, "smooth_b": pair.b.smooth}
             found.append(
                 Stage(
                     "pair_costs",
                     _TEAM_LABEL,
-                    measured_work.PairCostSettings(matched.match, own, self.iterations),
+                    measured_work.PairCostSettings(matched.match, settings, self.iterations),
                     measured_work.measure_pair,
                     (measured_work.COSTS_FILE,),
-                    before,
+                    inputs,
                     loads=aligned.loads,
                 )
             )
@@ -267,8 +267,8 @@ def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     fusers = {name: costs_of(stage) for name, stage in team.by_fuser.items()}
     for strategy in STRATEGIES:
         for k in team.iterations:
-            asked = strategy.asked(team.iterations, k)
-            smoothed_at = asked if make_fuser(strategy.fuser).smoothed else []
+            requested = strategy.asked(team.iterations, k)
+            smoothed_at = requested if make_fuser(strategy.fuser).smoothed else []
             own = []  # rows of the filter, and of the smoothing that was asked for, by robot
             for costs in robots:
                 filtered = _of(
@@ -276,8 +276,8 @@ def cost_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
                 )
                 at = _own_iterations(costs["iteration"], smoothed_at)
                 own.append((filtered, _of(costs, measured_work.SMOOTHING, at)))
-            aligned = pd.concat([_of(costs, measured_work.ALIGNMENT, asked) for costs in pairs])
-            fused = _of(fusers[strategy.fuser], measured_work.FUSION, asked)
+            aligned = pd.concat([_of(costs, measured_work.ALIGNMENT, requested) for costs in pairs])
+            fused = _of(fusers[strategy.fuser], measured_work.FUSION, requested)
             filtered, smoothed = (pd.concat(parts) for parts in zip(*own, strict=True))
             busiest = max(float(each["cpu_s"].sum()) for each in map(pd.concat, own))
             yield {
@@ -301,20 +301,20 @@ def sent_rows(team: RecordedTeam) -> Iterator[dict[str, Any]]:
     ]
     for strategy in STRATEGIES:
         for k in team.iterations:
-            asked = strategy.asked(team.iterations, k)
+            requested = strategy.asked(team.iterations, k)
             own_mb = []
             for rows in sent:
                 what = rows[rows["what"] == strategy.sends]
-                when = _own_iterations(what["iteration"], asked)
+                when = _own_iterations(what["iteration"], requested)
                 own_mb.append(float(what[what["iteration"].isin(when)]["n_bytes"].sum()) / _MB)
-            about = {"strategy": strategy.name, "iteration": k}
-            yield about | {"sent_mb": sum(own_mb), "most_sent_mb": max(own_mb)}
+            row = {"strategy": strategy.name, "iteration": k}
+            yield row | {"sent_mb": sum(own_mb), "most_sent_mb": max(own_mb)}
 
 
-def _own_iterations(known: pd.Series, asked: list[int]) -> list[int]:
+def _own_iterations(available: pd.Series, requested: list[int]) -> list[int]:
     """Limit iterations to a robot's own: its log may end before those of others."""
-    last = int(known.max())
-    return sorted({min(k, last) for k in asked})
+    last = int(available.max())
+    return sorted({min(k, last) for k in requested})
 
 
 def _of(costs: pd.DataFrame, work: str, iterations: list[int]) -> pd.DataFrame:
@@ -375,8 +375,8 @@ def _given_path(
     for k, landmarks in smoothed.maps.items():
         if given.landmarks is landmarks:
             return smoothed.paths[k]
-    own = filter_paths[given.robot.name]
-    return own[max(k for k in own if k <= iteration)]
+    filter_path = filter_paths[given.robot.name]
+    return filter_path[max(k for k in filter_path if k <= iteration)]
 
 
 @dataclass(frozen=True)
@@ -438,15 +438,16 @@ def _tables(
     return pd.concat(found), pd.concat(costs)
 
 
-def at_the_end(found: Independence) -> pd.DataFrame:
+def medians_at_last_iteration(found: Independence) -> pd.DataFrame:
     """Return medians over seeds at the last iteration, one row per size of team and strategy.
 
     Columns: those of the tables; n_seeds; n_whole, the number of seeds with one map of all robots;
     robots_s and team_s, sums of the columns of robots and of the team.
     """
-    both = found.teams.merge(found.costs, "left", _COLUMNS)
-    last = both[
-        both["iteration"] == both.groupby(["seed", "n_robots"])["iteration"].transform("max")
+    teams_with_costs = found.teams.merge(found.costs, "left", _COLUMNS)
+    last = teams_with_costs[
+        teams_with_costs["iteration"]
+        == teams_with_costs.groupby(["seed", "n_robots"])["iteration"].transform("max")
     ]
     last = last.assign(
         robots_s=last["filter_s"] + last["smoothing_s"],
@@ -458,15 +459,15 @@ def at_the_end(found: Independence) -> pd.DataFrame:
     numbers = [name for name in last.select_dtypes("number") if name not in (*_COLUMNS, "n_merged")]
     counts = {"n_seeds": groups.size(), "n_whole": groups["whole"].sum()}
     rows = pd.concat([pd.DataFrame(counts), groups[numbers].median()], axis=1).reset_index()
-    place = rows["strategy"].map(order.index)
+    strategy_index = rows["strategy"].map(order.index)
     return (
-        rows.assign(place=place)
+        rows.assign(place=strategy_index)
         .sort_values(["n_robots", "place"], ignore_index=True)
         .drop(columns="place")
     )
 
 
-# Columns of `at_the_end` in reports: headings of a page and of a screen.
+# Columns of `medians_at_last_iteration` in reports: headings of a page and of a screen.
 COST_HEADINGS = {
     "robots_s": ("robots' own work, CPU s", "robots'\nCPU s"),
     "busiest_robot_s": ("of the busiest robot", "busiest\nCPU s"),

@@ -18,7 +18,7 @@ from experiments.evaluation.criteria import (
     MAP_PAIR,
     ORACLE,
     answerable,
-    at_the_end,
+    at_last_iteration,
     error_over_oracle,
     has_common_ground,
     methods_in,
@@ -86,7 +86,7 @@ def success_rates(
         raise ValueError(f"by: is {by}, expected one of {', '.join(BY)}")
     if by != LAST and by not in maps:
         raise ValueError(f"by: these rows have no {by}")
-    used = at_the_end(maps) if by == LAST else maps
+    used = at_last_iteration(maps) if by == LAST else maps
     clusters = clusters_of(used)
     # for LAST a single bin holds all rows
     values = used["n_common" if by == LAST else by].to_numpy(dtype=np.float64)

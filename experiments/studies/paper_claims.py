@@ -24,7 +24,7 @@ from experiments.evaluation.criteria import (
     MERGEABLE_PAIRS,
     RIGHT_WITHIN_M,
     answerable,
-    at_the_end,
+    at_last_iteration,
     has_common_ground,
     mergeable,
     merged_robots,
@@ -340,7 +340,7 @@ def _scatter(aligner: str) -> Measure:
     "U-SURF descriptors of the same corner agree if both robots saw it from similar places.",
 )
 def _true_share(of: TablesOfRun) -> float:
-    last = at_the_end(of.maps).drop_duplicates(["robot_a", "robot_b"])
+    last = at_last_iteration(of.maps).drop_duplicates(["robot_a", "robot_b"])
     return float((last["n_true"] / last["n_correspondences"]).median())
 
 
@@ -746,7 +746,7 @@ def _merged_share(of: TablesOfRun) -> float:
 )
 def _right_at_the_end(of: TablesOfRun) -> float:
     errors = of("errors")
-    last = at_the_end(errors[errors["aligner"] == "ransac"])
+    last = at_last_iteration(errors[errors["aligner"] == "ransac"])
     last = last[has_common_ground(last)]
     return float(right_refined(last).mean())
 

@@ -160,18 +160,18 @@ def path_summary(path_statistics: pd.DataFrame, rng: np.random.Generator) -> pd.
         (medians over paths), and the interval of the median rmse (whole runs are resampled).
     """
     rows = []
-    for keys, own in path_statistics.groupby(_PATH_KEYS, sort=False, dropna=False):
+    for keys, group_rows in path_statistics.groupby(_PATH_KEYS, sort=False, dropna=False):
         row = dict(zip(_PATH_KEYS, keys, strict=True))
-        row |= {"n_runs": intervals.clusters_of(own).n, "n_paths": len(own)}
-        rows.append(row | _path_medians(own, rng))
+        row |= {"n_runs": intervals.clusters_of(group_rows).n, "n_paths": len(group_rows)}
+        rows.append(row | _path_medians(group_rows, rng))
     return pd.DataFrame(rows)
 
 
-def _path_medians(own: pd.DataFrame, rng: np.random.Generator) -> dict[str, float]:
+def _path_medians(path_rows: pd.DataFrame, rng: np.random.Generator) -> dict[str, float]:
     """Return the median of each of evo's statistics, and the interval of the median rmse."""
-    runs = intervals.clusters_of(own)
-    _, low, high = intervals.median_interval(own["rmse"].to_numpy(), runs, rng)
-    return dict(own[list(STATISTICS)].median()) | {"rmse_low": low, "rmse_high": high}
+    runs = intervals.clusters_of(path_rows)
+    _, low, high = intervals.median_interval(path_rows["rmse"].to_numpy(), runs, rng)
+    return dict(path_rows[list(STATISTICS)].median()) | {"rmse_low": low, "rmse_high": high}
 
 
 def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
@@ -185,13 +185,19 @@ def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.Da
         single map is inconsistent. The interval over runs is valid.
     """
     rows = []
-    known = landmark_nees[landmark_nees["n_landmarks"] > 0]
-    for kind, own in known.groupby("landmarks", sort=False):
-        runs, weight = intervals.clusters_of(own), own["n_landmarks"].to_numpy(dtype=np.float64)
-        dof, share = own["degrees_of_freedom"].to_numpy(), own["share_in_gate"].to_numpy()
-        per_dof = own["nees_mean"].to_numpy() / dof
+    rows_with_nees = landmark_nees[landmark_nees["n_landmarks"] > 0]
+    for kind, kind_rows in rows_with_nees.groupby("landmarks", sort=False):
+        runs, weight = (
+            intervals.clusters_of(kind_rows),
+            kind_rows["n_landmarks"].to_numpy(dtype=np.float64),
+        )
+        dof, share_in_gate = (
+            kind_rows["degrees_of_freedom"].to_numpy(),
+            kind_rows["share_in_gate"].to_numpy(),
+        )
+        per_dof = kind_rows["nees_mean"].to_numpy() / dof
         nees = intervals.weighted_mean_interval(per_dof, dof * weight, runs, rng)
-        inside = intervals.weighted_mean_interval(share, weight, runs, rng)
+        inside = intervals.weighted_mean_interval(share_in_gate, weight, runs, rng)
         # the degrees of freedom of a sum add up
         band = dict(zip(("band_low", "band_high"), mean_nees_band(dof @ weight, 1), strict=True))
         row = {"landmarks": kind, "n_runs": runs.n, "n_landmarks": int(weight.sum())}
@@ -201,15 +207,15 @@ def nees_of_maps(landmark_nees: pd.DataFrame, rng: np.random.Generator) -> pd.Da
 
 
 def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
-    """Return the same for landmarks fused in pairs (table `fusion`), with and without s_drift.
+    """Summarise the NEES of landmarks fused in pairs (table `fusion`), with and without s_drift.
 
     Only true pairs count. That table has no share in the gate, so it is NaN.
     """
     labels = {name: f"fused in pairs, {name[5:].replace('_', ' ')}" for name in FUSION_COLUMNS[:2]}
     true = fusion[fusion["true_pair"]].rename(columns=labels)
     keys, values = ["run_id", "degrees_of_freedom"], list(labels.values())
-    known = true.melt(keys, values, "landmarks", "nees_mean").dropna(subset="nees_mean")
-    return nees_of_maps(known.assign(n_landmarks=1, share_in_gate=np.nan), rng)
+    rows = true.melt(keys, values, "landmarks", "nees_mean").dropna(subset="nees_mean")
+    return nees_of_maps(rows.assign(n_landmarks=1, share_in_gate=np.nan), rng)
 
 
 def alignment_nees(
@@ -227,13 +233,16 @@ def alignment_nees(
         (share of true motions in the 90 % ellipsoid) with intervals over runs.
     """
     rows = []
-    known = criteria.alignment_consistency(errors)
-    for aligner, own in known.groupby("aligner", sort=False):
-        runs, inside = intervals.clusters_of(own), own["inside"].to_numpy(dtype=np.float64)
-        row = {"aligner": aligner, "maps": maps, "n_runs": runs.n, "n_maps": len(own)}
-        row |= _medians(own, ("nees_per_dof",), rng)
-        share = intervals.weighted_mean_interval(inside, np.ones(len(own)), runs, rng)
-        rows.append(row | share.columns("coverage_90"))
+    accepted = criteria.alignment_consistency(errors)
+    for aligner, aligner_rows in accepted.groupby("aligner", sort=False):
+        runs, inside = (
+            intervals.clusters_of(aligner_rows),
+            aligner_rows["inside"].to_numpy(dtype=np.float64),
+        )
+        row = {"aligner": aligner, "maps": maps, "n_runs": runs.n, "n_maps": len(aligner_rows)}
+        row |= _medians(aligner_rows, ("nees_per_dof",), rng)
+        coverage = intervals.weighted_mean_interval(inside, np.ones(len(aligner_rows)), runs, rng)
+        rows.append(row | coverage.columns("coverage_90"))
     return pd.DataFrame(rows)
 
 
@@ -254,9 +263,9 @@ def fuser_summary(fusers: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
         One row per fuser: fuser, n_runs, and each numeric column with the interval of its median.
     """
     rows = []
-    for fuser, own in last_fused(fusers).groupby("fuser", sort=False):
-        about = {"fuser": fuser, "n_runs": intervals.clusters_of(own).n}
-        rows.append(about | _medians(own, _FUSER_FIGURES, rng))
+    for fuser, fuser_rows in last_fused(fusers).groupby("fuser", sort=False):
+        row = {"fuser": fuser, "n_runs": intervals.clusters_of(fuser_rows).n}
+        rows.append(row | _medians(fuser_rows, _FUSER_FIGURES, rng))
     return pd.DataFrame(rows)
 
 
@@ -287,10 +296,10 @@ def team_paths(team: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
         of the median rmse.
     """
     rows = []
-    for source, own in team[team["component"] == 1].groupby("source", sort=False):
-        row: dict[str, Any] = {"source": source, "n_runs": len(own)}
-        row |= dict(own[["n_robots", "n_team"]].sum())
-        rows.append(row | _path_medians(own, rng))
+    for source, source_rows in team[team["component"] == 1].groupby("source", sort=False):
+        row: dict[str, Any] = {"source": source, "n_runs": len(source_rows)}
+        row |= dict(source_rows[["n_robots", "n_team"]].sum())
+        rows.append(row | _path_medians(source_rows, rng))
     return pd.DataFrame(rows)
 
 

@@ -40,7 +40,7 @@ from experiments.studies.sweep_tables import (
     locked_folder,
 )
 from mapfusion.errors import InputError
-from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_whole
+from mapfusion.files import PART, remove_abandoned, temporary_prefix, write_atomically
 from sim.renderer import require_pybullet
 
 _EXPECTED = "expected key=value,value, for example slam.filter.n_particles=50,200"
@@ -245,7 +245,7 @@ def rows_of(
     times = [
         {"stage": folder.name, "key": folder.key, "figure": name, "seconds": seconds}
         for folder in evaluated.folders()
-        for name, seconds in folder.figures().items()
+        for name, seconds in folder.quantities().items()
     ]
     return dataset.finished(run, renderer(evaluated.scenario), stages, {**made, RUN_TIMES: times})
 
@@ -381,7 +381,7 @@ class SweepDriver:
                     self._counted_at = time.monotonic()
                 limit = TASKS_PER_WORKER * max(self._n_workers, MIN_WORKERS)
                 while len(self._futures) < limit and (run := next(todo, None)) is not None:
-                    self._begin(run)
+                    self._start_run(run)
                 self._on_progress(self.progress)
                 if not self._open:
                     break
@@ -389,7 +389,7 @@ class SweepDriver:
         finally:  # also after Ctrl-C
             self._tables.write()
 
-    def _begin(self, run: SweepRun) -> None:
+    def _start_run(self, run: SweepRun) -> None:
         """Plan a run and submit its tasks, except those that others have submitted."""
         try:
             plan = plan_run(run, self._sweep.store, self._tables, self._jobs)
@@ -480,7 +480,7 @@ class SweepDriver:
         del self._open[plan]
         if plan in self._again:
             self._again.remove(plan)
-            self._begin(plan.run)
+            self._start_run(plan.run)
             return
         # All possible tasks were done, so the first failure does not depend on timing.
         failures = (self._failures.get(task.name) for task in plan.left)
@@ -496,7 +496,7 @@ class SweepDriver:
         path.unlink(missing_ok=True)
         if traceback:
             text = traceback.encode("utf-8", "backslashreplace")  # an exception's text may be any
-            write_whole(path, lambda file: file.write_bytes(text))
+            write_atomically(path, lambda file: file.write_bytes(text))
             reason += f"; its traceback: {path}"
             self.progress.defects.add(run.run_id)
         self.progress.failed[run.run_id] = reason

@@ -42,8 +42,8 @@ from mapfusion.files import (
     read_parquet,
     row_groups,
     schema,
+    write_atomically,
     write_json,
-    write_whole,
 )
 
 _HASH_LENGTH = 8  # hexadecimal digits of a run's values: 32 bits, and clashes are refused
@@ -325,7 +325,7 @@ class JoinedTables:
         with pq.ParquetWriter(buffer, own_schema, **options) as writer:
             for start in range(0, len(of_file[:RUNS_PER_FILE]), _RUNS_PER_GROUP):
                 writer.write_table(merged(of_file[start:][:_RUNS_PER_GROUP]))
-        write_whole(path, lambda file: file.write_bytes(buffer.getvalue()))
+        write_atomically(path, lambda file: file.write_bytes(buffer.getvalue()))
 
 
 def _hashes(runs: pa.Table) -> dict[str, int]:

@@ -53,8 +53,8 @@ from mapfusion.files import (
     float_fields,
     named_columns,
     schema,
-    write_together,
-    write_whole,
+    write_all_atomically,
+    write_atomically,
 )
 from mapfusion.landmark_map import map_writes, read_map
 from mapfusion.verification.verdict import Verifier
@@ -287,7 +287,7 @@ def _add_run(
             if iteration != iterations[-1]:  # joint covariances are most of the data
                 landmarks = replace(landmarks, joint=None)
             writes = map_writes(folder / "maps" / files[name], landmarks)
-            write_together(writes)
+            write_all_atomically(writes)
             yield from (path for path, write in writes.items() if write is not None)
             of_map = named_columns(POSITION_FIELDS, points_world_m)
             rows[_POINTS].append(pd.DataFrame(of_map).assign(map=files[name]))
@@ -341,7 +341,7 @@ def _write_card(
         "softwareVersions": library_versions(simulator=False),
         "distribution": distribution,
     }
-    write_whole(folder / CARD, lambda path: path.write_text(json.dumps(card, indent=1) + "\n"))
+    write_atomically(folder / CARD, lambda path: path.write_text(json.dumps(card, indent=1) + "\n"))
 
 
 def _set_digest(files: Mapping[str, str]) -> str:

@@ -27,7 +27,7 @@ from experiments.studies import refusal_trial
 from experiments.studies.refusal_trial import Case, MappedWorld, worlds_of
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Oracle
-from mapfusion.files import write_whole
+from mapfusion.files import write_atomically
 from mapfusion.geometry.numerics import Float
 from mapfusion.verification import fitted_rates, fitted_twins
 from mapfusion.verification.likelihood import (
@@ -216,7 +216,9 @@ def write_twins(worlds: Sequence[MappedWorld], source: dict[str, str]) -> None:
 
 def _write(module: ModuleType, text: str) -> None:
     """Replace the source of a module, and print it."""
-    write_whole(Path(str(module.__file__)), lambda path: path.write_text(text, encoding="utf-8"))
+    write_atomically(
+        Path(str(module.__file__)), lambda path: path.write_text(text, encoding="utf-8")
+    )
     sys.stdout.write(text)
 
 

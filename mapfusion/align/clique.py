@@ -284,13 +284,13 @@ def larger_clique(
                     for j in range(count):
                         if contains(graph[rows[i]], rows[j]):
                             small[i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
-                found, budget = _branch_and_bound(small, at_least - 1, budget)
-                if len(found):
-                    at_least = len(found) + 1
+                clique, budget = _branch_and_bound(small, at_least - 1, budget)
+                if len(clique):
+                    at_least = len(clique) + 1
                     best = np.empty(at_least, np.int64)
                     best[0] = v
-                    for k in range(len(found)):
-                        best[k + 1] = rows[found[k]]
+                    for k in range(len(clique)):
+                        best[k + 1] = rows[clique[k]]
                 if budget <= 0:
                     return best, False
         before[v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
@@ -413,8 +413,8 @@ class CliqueSearch:
         """Return the support (N,) of the best motion, refitted with s_drift 0 or the largest."""
         inside = np.zeros(len(self._pairs.p_a), np.bool_)
         if self.level >= 0:
-            given = self._pairs, self._spread.own_m2, self._scales_m2[scale], self._bound
-            refit_to_support(self.T_a_b.copy(), *given, inside)
+            arguments = self._pairs, self._spread.own_m2, self._scales_m2[scale], self._bound
+            refit_to_support(self.T_a_b.copy(), *arguments, inside)
         return inside
 
     def offer_twos(self) -> None:

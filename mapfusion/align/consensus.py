@@ -66,8 +66,8 @@ def _coarse(
         bx[i], by[i] = (rows[i, 2] - rows[0, 2]) / extent, (rows[i, 3] - rows[0, 3]) / extent
         worst = _worst(rows[i, 4], rows[i, 5], rows[i, 6])
         worst += _worst(rows[i, 7], rows[i, 8], rows[i, 9])
-        own = bound * (worst + variance_m2) / (extent * extent)
-        most[i] = (1 + _SHARE) * own + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
+        coarse_bound = bound * (worst + variance_m2) / (extent * extent)
+        most[i] = (1 + _SHARE) * coarse_bound + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
     return ax, ay, bx, by, most
 
 
@@ -223,8 +223,8 @@ class Consensus:
         if key not in fits:
             inlier, level = np.zeros(len(pairs), dtype=bool), -1
             if np.all(np.isfinite(T_a_b)):
-                given = planar, pair_spread(pairs), self.variances_m2, self.bound
-                _, level = refit_at_best_drift(T_a_b, *given, inlier)
+                arguments = planar, pair_spread(pairs), self.variances_m2, self.bound
+                _, level = refit_at_best_drift(T_a_b, *arguments, inlier)
             fits[key] = self.fit_of(T_a_b, inlier, level, pairs, planar)
         return fits[key]
 

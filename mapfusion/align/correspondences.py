@@ -243,8 +243,8 @@ def _take_nearer(
 @kernel
 def _take(side: _Side, i: int, j: int, distance2: float) -> None:
     """Replace the nearest of i by j if j is nearer, or equally near and earlier."""
-    known = side.distance2[i]
-    if distance2 < known or (distance2 == known and j < side.nearest[i]):
+    nearest_distance2 = side.distance2[i]
+    if distance2 < nearest_distance2 or (distance2 == nearest_distance2 and j < side.nearest[i]):
         side.nearest[i], side.distance2[i] = j, distance2
 
 
@@ -403,11 +403,11 @@ def match(
                 f"{len(common) or 'none'} {both} ({map_a.called}: {a}; {map_b.called}: {b}); "
                 "where both maps have labels, landmarks are matched by them alone"
             )
-        named = Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
+        by_label = Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
         if one_floor:
-            return named
-        offset_m = _height_offset(map_a, map_b, named, parameters.height)
-        return _placed(map_a, map_b, replace(named, height_offset_m=offset_m))
+            return by_label
+        offset_m = _height_offset(map_a, map_b, by_label, parameters.height)
+        return _placed(map_a, map_b, replace(by_label, height_offset_m=offset_m))
     for landmarks in (map_a, map_b):
         if not len(landmarks):
             return _no_pairs(f"{landmarks.called} is empty")
@@ -448,8 +448,8 @@ def match(
     shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
     parts = (rows[kept], nearest_b[kept], distance[kept])
     heights = {"height_offset_m": offset_m, "at_any_height": free}
-    found = Correspondences(*parts, shortage, **heights)
-    return found if one_floor else _placed(map_a, map_b, found)
+    by_descriptor = Correspondences(*parts, shortage, **heights)
+    return by_descriptor if one_floor else _placed(map_a, map_b, by_descriptor)
 
 
 def _height_offset(
@@ -469,29 +469,29 @@ _DIAMETER_OVER_MEDIAN = 2 * math.sqrt(2)
 
 def _placed(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Correspondences) -> Correspondences:
     """Drop the pairs of landmarks whose standard deviation exceeds the size of their map."""
-    kept, told = np.ones(len(pairs), dtype=bool), []
+    kept, notes = np.ones(len(pairs), dtype=bool), []
     for landmarks, index in ((map_a, pairs.index_a), (map_b, pairs.index_b)):
-        plan = landmarks.position_m[:, :2]
-        off_m = np.linalg.norm(plan - np.median(plan, axis=0), axis=1)
+        p_planar = landmarks.position_m[:, :2]
+        off_m = np.linalg.norm(p_planar - np.median(p_planar, axis=0), axis=1)
         size_m = _DIAMETER_OVER_MEDIAN * float(np.median(off_m))
         sigma_m = np.sqrt(np.trace(landmarks.covariance_m2[:, :2, :2], axis1=1, axis2=2) / 2)
         wide = np.flatnonzero(sigma_m > size_m)
         # where most landmarks are that uncertain, the covariances or their units are wrong
-        if size_m > 0 and 0 < len(wide) < len(plan) / 2:
+        if size_m > 0 and 0 < len(wide) < len(p_planar) / 2:
             kept &= ~np.isin(index, wide)
             number = "landmark" if len(wide) == 1 else "landmarks"
-            told.append(
+            notes.append(
                 f"{len(wide)} {number} of {landmarks.name} left aside: sigma up to "
                 f"{_short(float(sigma_m[wide].max()))} m in a map of {_short(size_m)} m"
             )
-    if not told:
+    if not notes:
         return pairs
     return replace(
         pairs,
         index_a=pairs.index_a[kept],
         index_b=pairs.index_b[kept],
         distance=pairs.distance[kept],
-        set_aside="; ".join(told),
+        set_aside="; ".join(notes),
     )
 
 
@@ -555,32 +555,32 @@ def why_few(map_a: LandmarkMap, map_b: LandmarkMap, parameters: MatchParameters)
     )
     described = known_a[rows] & known_b[nearest]
     rows, nearest, distance = rows[described], nearest[described], distance[described]
-    said = f"{len(rows)} mutually nearest descriptors"
+    reason = f"{len(rows)} mutually nearest descriptors"
     if len(rows) < FEW:
         a, b = np.count_nonzero(known_a), np.count_nonzero(known_b)
-        return f"{said} ({map_a.called} has {a} descriptors, {map_b.called} {b})"
+        return f"{reason} ({map_a.called} has {a} descriptors, {map_b.called} {b})"
     alike = distance <= parameters.max_descriptor_distance
     n_alike = np.count_nonzero(alike)
     if n_alike < FEW:
-        said += (
+        reason += (
             f", {n_alike} at most {parameters.max_descriptor_distance:g} apart "
             f"(median {_short(np.median(distance))})"
         )
-        return f"{said}: the maps show other things, or their descriptors are of different kinds"
+        return f"{reason}: the maps show other things, or their descriptors are of different kinds"
     if n_alike < len(rows):
-        said += f", {n_alike} at most {parameters.max_descriptor_distance:g} apart"
+        reason += f", {n_alike} at most {parameters.max_descriptor_distance:g} apart"
     rows, nearest = rows[alike], nearest[alike]
     up_m = map_b.position_m[nearest, 2] - map_a.position_m[rows, 2]
     variances = map_a.covariance_m2[rows, 2, 2], map_b.covariance_m2[nearest, 2, 2]
     agree = parameters.height.agrees(up_m, variances[0], np.zeros(1), variances[1])
     reach = np.sqrt(parameters.height.bound * (sum(variances) + parameters.height.floor_m**2))
     higher = map_b if np.median(up_m) > 0 else map_a
-    said += (
+    reason += (
         f", {np.count_nonzero(agree)} within {np.median(reach):.2g} m of height "
         f"(median difference {np.median(np.abs(up_m)):.2f} m, {higher.called} higher)"
     )
     scale = scale_note(map_a, map_b, rows, nearest)
-    return f"{said}; {scale}" if scale else said
+    return f"{reason}; {scale}" if scale else reason
 
 
 def scale_note(
@@ -596,8 +596,8 @@ def scale_note(
     if math.isnan(scale):
         extents = []  # twice the median distance of the landmarks to their median, in plan
         for landmarks in (map_a, map_b):
-            plan = landmarks.position_m[:, :2]
-            off = np.linalg.norm(plan - np.median(plan, axis=0), axis=1)
+            p_planar = landmarks.position_m[:, :2]
+            off = np.linalg.norm(p_planar - np.median(p_planar, axis=0), axis=1)
             extents.append(2 * float(np.median(off)))
         if not min(extents) > 0 or max(extents) < _OTHER_WORLD * min(extents):
             return ""
@@ -610,10 +610,10 @@ def scale_note(
     large, small = (map_b, map_a) if scale > 1 else (map_a, map_b)
     factor = max(scale, 1 / scale)
     units = (name for name, size in UNITS_PER_M.items() if abs(factor / size - 1) < _RATIO_WIDTH)
-    asked = f"is it in {unit}?" if (unit := next(units, "")) else "are both in metres?"
+    question = f"is it in {unit}?" if (unit := next(units, "")) else "are both in metres?"
     return (
         f"distances between landmarks of {large.called} are {_short(factor)} times those of "
-        f"{small.called}: {asked}"
+        f"{small.called}: {question}"
     )
 
 

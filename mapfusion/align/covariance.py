@@ -167,16 +167,16 @@ def alignment_covariance(
     a, b = pairs.map_a.joint, pairs.map_b.joint
     if a is None or b is None:
         if independent is None:
-            own = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
-            independent = motion_covariance(gain, own + drift_sigma_m**2 * np.eye(2))
+            C_residual = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
+            independent = motion_covariance(gain, C_residual + drift_sigma_m**2 * np.eye(2))
         return MotionCovariance(independent + by_calibration, True)
     R = rotation(T_a_b[2])
     by_shared = np.zeros((3, 3))
     for joint, index, turn in ((a, pairs.index_a, np.eye(2)), (b, pairs.index_b, R)):
         moved = np.tensordot(gain @ turn, joint.common_m[index][:, :, :2], axes=((0, 2), (0, 2)))
         by_shared += moved @ moved.T
-    own = residual_covariances(T_a_b, a.own_m2[pairs.index_a], b.own_m2[pairs.index_b])
-    by_own = motion_covariance(gain, own + DRIFT_FLOOR_M**2 * np.eye(2))
+    C_residual = residual_covariances(T_a_b, a.own_m2[pairs.index_a], b.own_m2[pairs.index_b])
+    by_own = motion_covariance(gain, C_residual + DRIFT_FLOOR_M**2 * np.eye(2))
     factor = _residual_factor(T_a_b, pairs, gain, by_own)
     lower_bound = not (a.complete and b.complete)
     return MotionCovariance(factor * by_own + by_shared + by_calibration, lower_bound)
@@ -198,14 +198,14 @@ def _residual_factor(T_a_b: Float, pairs: Pairs, gain: Float, stated: Float) -> 
     a = pairs.map_a.joint.leading[pairs.index_a]
     b = pairs.map_b.joint.leading[pairs.index_b]
     e = residuals(T_a_b, pairs.p_a, pairs.p_b)
-    own = residual_covariances(T_a_b, a.own_m2, b.own_m2) + DRIFT_FLOOR_M**2 * np.eye(2)
+    C_residual = residual_covariances(T_a_b, a.own_m2, b.own_m2) + DRIFT_FLOOR_M**2 * np.eye(2)
     by_a = np.swapaxes(a.common_m[:, :, :2], 1, 2)
     by_b = -rotation(T_a_b[2]) @ np.swapaxes(b.common_m[:, :, :2], 1, 2)
     # e = X u + error, where u are the shared variables of both maps and the error of the motion
     X = np.concatenate([by_a, by_b, motion_jacobian(T_a_b, pairs.p_b)], axis=2)
     n_shared = a.rank + b.rank
     prior = np.diag(np.concatenate([np.ones(n_shared), np.zeros(X.shape[2] - n_shared)]))
-    whiten = np.linalg.inv(np.linalg.cholesky(own))
+    whiten = np.linalg.inv(np.linalg.cholesky(C_residual))
     X_white, e_white = whiten @ X, np.einsum("nij,nj->ni", whiten, e)
     weight, left, r = np.ones(len(e)), prior, e_white
     for _ in range(_ROUNDS):

@@ -39,11 +39,11 @@ def origin_of(landmarks: LandmarkMap) -> Float:
 
     The origin is the centroid in whole metres, so that the subtraction is exact.
     """
-    plan = landmarks.position_m[:, :2]
-    if not len(plan):
+    p_planar = landmarks.position_m[:, :2]
+    if not len(p_planar):
         return np.zeros(2)
-    middle = plan.mean(axis=0)
-    extent_m = math.sqrt(np.mean(np.sum((plan - middle) ** 2, axis=1)))
+    middle = p_planar.mean(axis=0)
+    extent_m = math.sqrt(np.mean(np.sum((p_planar - middle) ** 2, axis=1)))
     far = np.hypot(*middle) > _FAR * max(extent_m, _LEAST_EXTENT_M)
     return np.round(middle) if far else np.zeros(2)
 
@@ -111,11 +111,11 @@ class Overlap(NamedTuple):
 
     def document(self) -> dict[str, float]:
         """Return all numbers by name, for files."""
-        found = {"a_x_m": self.p_a[0], "a_y_m": self.p_a[1]}
-        found |= {"b_x_m": self.p_b[0], "b_y_m": self.p_b[1]}
+        content = {"a_x_m": self.p_a[0], "a_y_m": self.p_a[1]}
+        content |= {"b_x_m": self.p_b[0], "b_y_m": self.p_b[1]}
         axes = ("xx_m2", "xy_m2", "xt_m_rad", "yy_m2", "yt_m_rad", "tt_rad2")
         upper = self.covariance[np.triu_indices(3)]
-        return found | {f"cov_{name}": x for name, x in zip(axes, upper, strict=True)}
+        return content | {f"cov_{name}": x for name, x in zip(axes, upper, strict=True)}
 
     def moved(self, by_a: Float, by_b: Float) -> "Overlap":
         """Return the same motion in frames in which all points are larger by (2,)."""
@@ -123,8 +123,8 @@ class Overlap(NamedTuple):
 
     def motion(self, origin_a: Float, origin_b: Float) -> tuple[Float, Float]:
         """Return T_a_b and its covariance in local frames with these origins."""
-        about = np.array([0.0, 0.0, self.theta_rad])
-        return moved_motion(about, self.covariance, self.p_a - origin_a, self.p_b - origin_b)
+        turn = np.array([0.0, 0.0, self.theta_rad])
+        return moved_motion(turn, self.covariance, self.p_a - origin_a, self.p_b - origin_b)
 
 
 def height_offset_m(up_m: Float, variance_m2: Float, bound: float) -> float:
@@ -147,10 +147,10 @@ def height_offset_m(up_m: Float, variance_m2: Float, bound: float) -> float:
     first = int(np.argmax(inside))
     offset_m = float(np.median(ranked[first : first + inside[first]]))
     here, there = np.abs(up_m) <= reach, np.abs(up_m - offset_m) <= reach
-    own, others = np.count_nonzero(there & ~here), np.count_nonzero(here & ~there)
+    wins, losses = np.count_nonzero(there & ~here), np.count_nonzero(here & ~there)
     n_gates = 1 + (ranked[-1] - ranked[0]) / width_m
     # P(X >= own) for equally likely sides
-    by_chance = scipy.special.bdtrc(own - 1, own + others, 0.5) if own else 1.0
+    by_chance = scipy.special.bdtrc(wins - 1, wins + losses, 0.5) if wins else 1.0
     return offset_m if by_chance * n_gates <= _HEIGHT_FALSE_ALARM else 0.0
 
 
@@ -276,19 +276,20 @@ def height_difference(
     level = _fit_heights(constant[supports], up_m[supports], variance_m2[supports])
     offset_m, sigma_m = float(level.value[0]), math.sqrt(level.covariance[0, 0])
     # pairs from at least two places in each direction, with a pair to spare
-    plan = p_a[:, :2] - middle
-    if len(up_m) < 4 or np.linalg.matrix_rank(plan - plan.mean(axis=0)) < 2:
+    p_planar = p_a[:, :2] - middle
+    if len(up_m) < 4 or np.linalg.matrix_rank(p_planar - p_planar.mean(axis=0)) < 2:
         return HeightDifference(removed_m + offset_m, sigma_m)
-    plane = _fit_heights(np.hstack([constant, plan]), up_m, variance_m2)
+    plane = _fit_heights(np.hstack([constant, p_planar]), up_m, variance_m2)
     slope, S = plane.value[1:], plane.covariance[1:, 1:]
     steepness = float(np.hypot(*slope))
     along = slope / steepness if steepness > 0 else np.array([1.0, 0.0])
     tilt_sigma_rad = math.sqrt(along @ S @ along) / (1 + steepness**2)
     reach = np.sqrt(bound * variance_m2)
     by_offset = np.abs(up_m - offset_m) <= reach
-    by_plane = np.abs(up_m - plane.value[0] - plan @ slope) <= reach
-    own, others = np.count_nonzero(by_plane & ~by_offset), np.count_nonzero(by_offset & ~by_plane)
-    by_chance = scipy.special.bdtrc(own - 1, own + others, 0.5) if own else 1.0
+    by_plane = np.abs(up_m - plane.value[0] - p_planar @ slope) <= reach
+    wins = np.count_nonzero(by_plane & ~by_offset)
+    losses = np.count_nonzero(by_offset & ~by_plane)
+    by_chance = scipy.special.bdtrc(wins - 1, wins + losses, 0.5) if wins else 1.0
     square = float(slope @ np.linalg.solve(S, slope))
     steep = square > chi_square_bound(1 - _HEIGHT_FALSE_ALARM, 2)
     is_tilted = bool(steep and by_chance <= _HEIGHT_FALSE_ALARM)

@@ -223,12 +223,14 @@ def _slot(x: int, y: int, mask: int) -> int:
 
 
 @kernel
-def insert_bin(best: Float, n: int, found: tuple[float, float, float, float], bins: Bins) -> int:
+def insert_bin(
+    best: Float, n: int, bin_values: tuple[float, float, float, float], bins: Bins
+) -> int:
     """Insert a bin (votes, theta, x, y) in descending order of votes; return the number of bins.
 
     Of bins next to each other only the fullest is kept. `best` (most, 4) holds n bins.
     """
-    votes, theta, x, y = found
+    votes, theta, x, y = bin_values
     for k in range(n - 1, -1, -1):
         turn = abs(best[k, 1] - theta) % (2 * math.pi)
         if (
@@ -242,11 +244,11 @@ def insert_bin(best: Float, n: int, found: tuple[float, float, float, float], bi
                 best[m] = best[m + 1]
             n -= 1
     n = min(n + 1, len(best))
-    place = n - 1
-    while place > 0 and best[place - 1, 0] < votes:
-        best[place] = best[place - 1]
-        place -= 1
-    best[place, 0], best[place, 1], best[place, 2], best[place, 3] = votes, theta, x, y
+    position = n - 1
+    while position > 0 and best[position - 1, 0] < votes:
+        best[position] = best[position - 1]
+        position -= 1
+    best[position, 0], best[position, 1], best[position, 2], best[position, 3] = votes, theta, x, y
     return n
 
 
@@ -294,8 +296,8 @@ def cast_votes(
             for e in range(start, len(of_a.length)):
                 if of_a.length[e] > length + tolerance_m:
                     break
-                rise = of_a.rise[e] - b_rise
-                if rise * rise > of_a.most_z_m2[e] + of_b.most_z_m2[f]:
+                height_difference = of_a.rise[e] - b_rise
+                if height_difference * height_difference > of_a.most_z_m2[e] + of_b.most_z_m2[f]:
                     continue
                 if size_tolerance >= 0 and not (
                     attributes_agree(a, b, of_a.ends[e, 0], of_b.ends[f, 0], size_tolerance)
@@ -357,8 +359,10 @@ def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, most: int) -
         for k in range(first[t], first[t + 1]):
             u, v = places[k, 0], places[k, 1]
             # a bin with few votes of its own is next to a full one, or there is none
-            own = counts[t % 3, _slot(u, v, mask)]
-            if own < 2 or _SHARE_OF_BIN * own < (best[most - 1, 0] if n_best == most else 0):
+            votes_of_bin = counts[t % 3, _slot(u, v, mask)]
+            if votes_of_bin < 2 or _SHARE_OF_BIN * votes_of_bin < (
+                best[most - 1, 0] if n_best == most else 0
+            ):
                 continue
             votes = 0
             for du in range(-1, 2):
@@ -368,8 +372,8 @@ def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, most: int) -
             if n_best == most and votes <= best[most - 1, 0]:
                 continue
             middle = ((t + 0.5) * bins.theta_rad, (u + 0.5) * bins.shift_m)
-            found = (float(votes), *middle, (v + 0.5) * bins.shift_m)
-            n_best = insert_bin(best, n_best, found, bins)
+            bin_values = (float(votes), *middle, (v + 0.5) * bins.shift_m)
+            n_best = insert_bin(best, n_best, bin_values, bins)
         before = (t - 1) % n
         for k in range(first[before], first[before + 1]):
             counts[(t - 1) % 3, _slot(places[k, 0], places[k, 1], mask)] = 0
@@ -485,13 +489,13 @@ class PlacedSearch:
         near, distance = self._near(rows_b, transform_points(T_a_b, b.p[rows_b]), gate_m)
         i, j, share = near[:, 0], rows_b[near[:, 1]], 1.0
         if len(i) and self._has_heights:
-            rise, reach2 = a.z[i] - b.z[j], a.most_z_m2[i] + b.most_z_m2[j]
+            height_difference, reach2 = a.z[i] - b.z[j], a.most_z_m2[i] + b.most_z_m2[j]
             if math.isnan(up_m):  # median of the densest interval of this length
-                length, ordered = 2 * math.sqrt(np.median(reach2)), np.sort(rise)
+                length, ordered = 2 * math.sqrt(np.median(reach2)), np.sort(height_difference)
                 ends = np.searchsorted(ordered, ordered + length, side="right")
                 first = int(np.argmax(ends - np.arange(len(ordered))))
                 up_m = float(np.median(ordered[first : ends[first]]))
-            agree = (rise - up_m) ** 2 <= reach2
+            agree = (height_difference - up_m) ** 2 <= reach2
             share = (np.count_nonzero(agree) + 1) / (len(i) + 1)
             i, j, distance = i[agree], j[agree], distance[agree]
         kept = mutually_nearest(i, j, distance)
@@ -510,9 +514,9 @@ class PlacedSearch:
         near, _ = self._near(rows_b, moved, gate_m)
         i, j = near[:, 0], rows_b[near[:, 1]]
         agree = (a.z[i] - b.z[j] - up_m) ** 2 <= a.most_z_m2[i] + b.most_z_m2[j]
-        found = np.zeros(len(rows_b), np.bool_)
-        found[near[agree, 1]] = True
-        return found
+        agrees = np.zeros(len(rows_b), np.bool_)
+        agrees[near[agree, 1]] = True
+        return agrees
 
     def refit(self, T_a_b: Float, centre: Float, reach_m: float, tolerance_m: float) -> Float:
         """Return a motion refitted to its support, which grows from a part of map b.
@@ -622,25 +626,25 @@ def find_placements(a: Site, b: Site, tolerance_m: float, size_tolerance: float)
     most = _CANDIDATES if len(parts) == 1 else _OF_PART
     sizes = size_tolerance if have_attributes(a, b) else -1.0
     for rows, centre in parts:
-        own = Segments(*(part[rows] for part in of_b))
-        reach_m = float(np.hypot(*(own.middle - centre).T).max()) + longest / 2
-        places, first = cast_votes((a, b), of_a, own, centre, bins, off_m, sizes)
+        segments = Segments(*(part[rows] for part in of_b))
+        reach_m = float(np.hypot(*(segments.middle - centre).T).max()) + longest / 2
+        places, first = cast_votes((a, b), of_a, segments, centre, bins, off_m, sizes)
         for votes, theta, x, y in fullest_bins(places, first, bins, most):
             T_a_b = np.array([x, y, theta])
             T_a_b[:2] -= rotation(theta) @ centre
             proposed.append((votes, T_a_b, centre, reach_m))
     proposed.sort(key=lambda each: -each[0])
-    search, found = PlacedSearch(a, b, size_tolerance), list[Placement]()
+    search, placements = PlacedSearch(a, b, size_tolerance), list[Placement]()
     for _, T_a_b, centre, reach_m in proposed[:_CANDIDATES]:
         T_a_b = search.refit(T_a_b, centre, reach_m, tolerance_m)
-        found.append(search.place(T_a_b, tolerance_m * _GATES))
-    return distinct_placements(found, b.p)
+        placements.append(search.place(T_a_b, tolerance_m * _GATES))
+    return distinct_placements(placements, b.p)
 
 
-def distinct_placements(found: Sequence[Placement], p_b: Float) -> list[Placement]:
+def distinct_placements(placements: Sequence[Placement], p_b: Float) -> list[Placement]:
     """Return the distinct placements of map b (N, 2) of largest surprise, best first."""
     distinct = list[Placement]()
-    for each in sorted(found, key=lambda each: -each.surprise):
+    for each in sorted(placements, key=lambda each: -each.surprise):
         apart = (rms_distance_m(each.T_a_b, other.T_a_b, p_b) for other in distinct)
         if each.surprise > 0 and all(distance_m >= DISTINCT_M for distance_m in apart):
             distinct.append(each)

@@ -127,11 +127,13 @@ class Refinement:
             reason = f"{np.count_nonzero(inlier)} correspondences agree, {MIN_PAIRS} are needed"
         else:
             others = PlanarPairs(*(np.delete(part, left_out, axis=0) for part in planar))
-            solved, _, T_without, sure, drift_m2, *_ = maximise_likelihood(others, T_a_b, *limits)
+            solved, _, T_without, without_outliers, drift_m2, *_ = maximise_likelihood(
+                others, T_a_b, *limits
+            )
             may_move_m = gate_m
             # a labelled pair of high leverage is false only if it is an outlier to the others
             if pairs.by_name and solved:
-                rest = (T_without, sure, drift_m2)
+                rest = (T_without, without_outliers, drift_m2)
                 if is_outlier_to_others(*rest, planar, left_out):
                     may_move_m = self.gate_m
             reason = why_rests_on_one_pair(
@@ -145,8 +147,8 @@ class Refinement:
             J = motion_jacobian(T_a_b, used.p_b)
             weighted = np.swapaxes(J, 1, 2) @ W
             gain = np.linalg.solve(np.sum(weighted @ J, axis=0), weighted)
-            made = alignment_covariance(T_a_b, used, gain, drift_m, covariance)
-            covariance, lower_bound = made
+            covariance_of_motion = alignment_covariance(T_a_b, used, gain, drift_m, covariance)
+            covariance, lower_bound = covariance_of_motion
         T_a_b[2] = wrap(T_a_b[2])
         return Alignment(
             T_a_b,
@@ -310,7 +312,7 @@ class Oracle:
         if reason:
             return undetermined(f"true ones: {reason}", len(pairs), started_s)
         start = fit_rigid(pairs.p_a, pairs.p_b, rows)
-        found = self.refinement.refine(pairs[rows], np.array(start))
+        refined = self.refinement.refine(pairs[rows], np.array(start))
         inlier = np.zeros(len(pairs), dtype=bool)
-        inlier[rows] = found.inlier
-        return replace(found, inlier=inlier, elapsed_s=time.perf_counter() - started_s)
+        inlier[rows] = refined.inlier
+        return replace(refined, inlier=inlier, elapsed_s=time.perf_counter() - started_s)

@@ -79,10 +79,10 @@ def residual_covariances(T_a_b: Float, covariance_a: Float, covariance_b: Float)
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     a, b = (S.T[[0, 0, 1], [0, 1, 1]] for S in (covariance_a, covariance_b))
     xx, xy, yy = source_of(add_turned)(*a, cos, sin, *b)
-    found = np.empty((len(xx), 2, 2))
-    found[:, 0, 0], found[:, 1, 1] = xx, yy
-    found[:, 0, 1] = found[:, 1, 0] = xy
-    return found
+    covariances = np.empty((len(xx), 2, 2))
+    covariances[:, 0, 0], covariances[:, 1, 1] = xx, yy
+    covariances[:, 0, 1] = covariances[:, 1, 0] = xy
+    return covariances
 
 
 def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) -> Float:
@@ -91,16 +91,16 @@ def least_squares_gain(T_a_b: Float, p_b: Float, weight: Float | None = None) ->
     To first order the error of T_a_b is the sum of the gains times the residuals. Points p_b
     (N, 2 or more) must not coincide; `weight` (N,) is equal by default.
     """
-    given = np.ones(len(p_b)) if weight is None else weight
+    weights = np.ones(len(p_b)) if weight is None else weight
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     of_turn = np.stack(source_of(lever)(cos, sin, p_b, _ALL), axis=1)
     # normal matrix: sum of weight J'J with J = `motion_jacobian`, summed in the order of kernels
     x, y = of_turn.T
-    terms = np.stack([given, given * x, given * y, given * (x * x + y * y)])
+    terms = np.stack([weights, weights * x, weights * y, weights * (x * x + y * y)])
     total, x, y, square = np.cumsum(terms, axis=1)[:, -1]
     inverse = np.linalg.inv(np.array([[total, 0.0, x], [0.0, total, y], [x, y, square]]))
     gain = inverse[:, :2] + inverse[:, 2, None] * of_turn[:, None]
-    return given[:, None, None] * gain
+    return weights[:, None, None] * gain
 
 
 def motion_covariance(gain: Float, covariance_m2: Float) -> Float:

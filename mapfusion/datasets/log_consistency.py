@@ -25,7 +25,7 @@ from mapfusion.datasets.motion_agreement import (
     MIN_SIGMAS,
     ORDER_OF_QUATERNIONS,
     UPRIGHT,
-    Stated,
+    ReportedMotions,
     compare,
     likely_cause,
     odometry_mistakes,
@@ -129,47 +129,59 @@ class Jump:
 
 
 def disagreement(
-    kind: str, subject: str, spans: Sequence[Motions], stated: Stated, mistakes: Mapping[str, Float]
+    kind: str,
+    subject: str,
+    spans: Sequence[Motions],
+    reported: ReportedMotions,
+    mistakes: Mapping[str, Float],
 ) -> Finding | None:
-    """Return the finding about stated motions that contradict observed ones; None if they agree.
+    """Return the finding about reported motions that contradict observed ones; None if they agree.
 
     Args:
         kind: kind of the finding.
         subject: beginning of its text.
         spans: observed motions over spans of several lengths.
-        stated: stated motions.
+        reported: motions reported by odometry or truth.
         mistakes: corrected poses by mistake, see `likely_cause`.
     """
-    comparisons = [compare(observed, stated, FALSE_ALARM / len(spans)) for observed in spans]
+    comparisons = [compare(observed, reported, FALSE_ALARM / len(spans)) for observed in spans]
     # Shifts or rotations count if they lie below the limit in at least half of the spans: noise and
-    # the resolution of stated motions affect short spans only.
+    # the resolution of reported motions affect short spans only.
     quantities = []
     for name, limit in MIN_AGREEMENT.items():
-        medians = [found.median for found in (getattr(c, name) for c in comparisons) if found.known]
+        medians = [
+            comparison.median
+            for comparison in (getattr(c, name) for c in comparisons)
+            if comparison.is_defined
+        ]
         if 2 * sum(median < limit for median in medians) >= len(medians) > 0:
             quantities.append(name)
-    wrong = [k for k, found in enumerate(comparisons) if any(map(found.contradicts, quantities))]
-    if not wrong:
-        return None
-    most = max(wrong, key=lambda k: comparisons[k].n)
-    shown = [
-        f"{name}s {found.median:.2f}"
-        for name, found in comparisons[most]._asdict().items()
-        if found.known
+    contradicting = [
+        k
+        for k, comparison in enumerate(comparisons)
+        if any(map(comparison.contradicts, quantities))
     ]
-    cause = likely_cause(spans[most], mistakes, stated.noise)
-    text = f"{subject} in most frames (agreement of {', '.join(shown)}; 1 is full): {cause}"
+    if not contradicting:
+        return None
+    clearest = max(contradicting, key=lambda k: comparisons[k].n)
+    medians_text = [
+        f"{name}s {comparison.median:.2f}"
+        for name, comparison in comparisons[clearest]._asdict().items()
+        if comparison.is_defined
+    ]
+    cause = likely_cause(spans[clearest], mistakes, reported.noise)
+    text = f"{subject} in most frames (agreement of {', '.join(medians_text)}; 1 is full): {cause}"
     return Finding(kind, -1, text)
 
 
-def _agrees_on_average(observed: Motions, stated: Stated) -> bool:
-    """Return True if noise alone explains the differences between stated and observed motions.
+def _agrees_on_average(observed: Motions, reported: ReportedMotions) -> bool:
+    """Return True if noise alone explains the differences between reported and observed motions.
 
-    Noise has the mean zero: the regression u = b m of stated motions u on observed motions m has a
-    slope b of 1. Mistakes change it. Shifts or rotations without information on b do not count.
+    Noise has the mean zero: the regression u = b m of reported motions u on observed motions m has
+    a slope b of 1. Mistakes change it. Shifts or rotations without information on b do not count.
     """
-    sigma, slopes = stated.sigma(observed), list[tuple[float, float]]()
-    moved = motions_of_poses(stated.poses, observed.start, observed.end)
+    sigma, slopes = reported.sigma(observed), list[tuple[float, float]]()
+    moved = motions_of_poses(reported.poses, observed.start, observed.end)
     for axis, (u, limit) in enumerate(zip(moved, MIN_AGREEMENT.values(), strict=True)):
         m = observed.motion[:, 3 * axis : 3 * axis + 3]
         squares = np.sum(m**2, axis=1)
@@ -192,7 +204,7 @@ def truth_finding(reference: str, spans: Sequence[Motions], poses: Float) -> Fin
         text = f"the truth stands on end or on its head in most frames: {ORDER_OF_QUATERNIONS}"
         return Finding("truth", -1, text)
     subject = f"the truth contradicts {reference}"
-    return disagreement("truth", subject, spans, Stated(poses), pose_mistakes(poses))
+    return disagreement("truth", subject, spans, ReportedMotions(poses), pose_mistakes(poses))
 
 
 def find_jumps(log: RobotLog, observed: Motions, noise: MotionNoise) -> list[Jump]:
@@ -432,10 +444,12 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
     spans = observed_spans(log if named else tracked_by_position(log))
     mistakes = odometry_mistakes(log.odometry)
     subject = "the odometry contradicts the motion that the observations show"
-    finding = disagreement("odometry", subject, spans, Stated(mistakes[""], noise), mistakes)
+    finding = disagreement(
+        "odometry", subject, spans, ReportedMotions(mistakes[""], noise), mistakes
+    )
     found = estimate_odometry_noise(log, spans, noise)
     if finding is not None:
-        noisier = found.is_larger and Stated(mistakes[""], noise.scaled(found.factor))
+        noisier = found.is_larger and ReportedMotions(mistakes[""], noise.scaled(found.factor))
         if not (noisier and _agrees_on_average(spans[0], noisier)):
             return LogConsistency((finding,), (), found)
     used_noise = noise.scaled(found.factor) if found.is_larger else noise
@@ -458,10 +472,10 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
 
 
 def outside_gate(log: RobotLog, landmark: np.ndarray) -> tuple[int, int]:
-    """Count the observations outside the gate of the landmark that they are known to show.
+    """Count the reobservations that the filter's gate rejected.
 
-    An observation is known to show the landmark of earlier observations with the same label or
-    track.
+    A reobservation has the label or the track of an earlier observation, so both show the same
+    landmark.
 
     Args:
         log: log that was filtered.
@@ -469,18 +483,18 @@ def outside_gate(log: RobotLog, landmark: np.ndarray) -> tuple[int, int]:
             negative for none, shape (N,).
 
     Returns:
-        Number of observations that were dropped or started a new landmark in spite of an earlier
-        one, and number of observations with an earlier one.
+        Number of reobservations that were dropped or started a new landmark, and number of all
+        reobservations.
     """
-    seen = log.observations
-    names = seen.track if seen.label is None else seen.label
-    if names is None:
+    observations = log.observations
+    identity = observations.track if observations.label is None else observations.label
+    if identity is None:
         return 0, 0
-    order = np.argsort(names, kind="stable")  # by name, then by time
-    before, after = order[:-1], order[1:]
-    again = (names[before] == names[after]) & (names[after] != NO_TRACK)
-    missed = (landmark[after] < 0) | (landmark[after] == after)
-    return int(np.count_nonzero(again & missed)), int(np.count_nonzero(again))
+    order = np.argsort(identity, kind="stable")  # by label or track, then by time
+    earlier, later = order[:-1], order[1:]
+    reobserved = (identity[earlier] == identity[later]) & (identity[later] != NO_TRACK)
+    missed = (landmark[later] < 0) | (landmark[later] == later)
+    return int(np.count_nonzero(reobserved & missed)), int(np.count_nonzero(reobserved))
 
 
 def gate_finding(log: RobotLog, landmark: np.ndarray) -> Finding | None:

@@ -22,7 +22,8 @@ from mapfusion.robot_log import NO_TRACK, RobotLog
 from mapfusion.tables import NO_LABEL
 from mapfusion.vision.visual_odometry import MIN_LINKS, RigidMotion, estimate_rigid_motion
 
-PLANAR = [0, 1, 5]  # x, y and the rotation about z, within shifts and rotation vectors in space
+# Indices of x, y and the rotation about z within a translation and a rotation vector in space.
+PLANAR = [0, 1, 5]
 MIN_MOTIONS = 4  # of which a median is computed
 _LINK_PROBABILITY = 0.999  # that a true link of consecutive frames lies inside the gate
 _MAX_DESCRIPTOR_DISTANCE = 0.5  # as `FastSlamParameters.descriptor_threshold`
@@ -44,9 +45,9 @@ class Motions(NamedTuple):
     """Motions from frame `start` to frame `end` of a log, in the robot frame at the start.
 
     Attributes:
-        start: first frames, shape (N,).
-        end: last frames, shape (N,).
-        motion: shifts in m and rotation vectors in rad, shape (N, 6).
+        start: index of the first frame in the log, shape (N,).
+        end: index of the last frame in the log, shape (N,).
+        motion: translations in m and rotation vectors in rad, shape (N, 6).
         covariance: error covariances, shape (N, 6, 6). For planar data only the entries of x, y
             and the rotation about z are not zero.
         n_links: number of points that both frames show, shape (N,).
@@ -62,7 +63,7 @@ class Motions(NamedTuple):
 
     @property
     def sigma(self) -> Float:
-        """Root of the trace for shifts (m) and for rotations (rad), shape (N, 2)."""
+        """Root of the trace for translations (m) and for rotations (rad), shape (N, 2)."""
         variance = np.diagonal(self.covariance, axis1=1, axis2=2).reshape(-1, 2, 3)
         return np.sqrt(variance.sum(axis=2))
 
@@ -93,25 +94,25 @@ def links(
     Returns:
         Rows of the log's observations in the first and in the second frame, each of shape (n,).
     """
-    seen = log.observations
+    observations = log.observations
     a, b = (np.arange(starts[k], starts[k + 1]) for k in (first, second))
-    for names, none in ((seen.label, NO_LABEL), (seen.track, NO_TRACK)):
-        if names is not None:
-            a, b = a[names[a] != none], b[names[b] != none]
-            _, own, other = np.intersect1d(names[a], names[b], return_indices=True)
-            return a[own], b[other]
-    if seen.descriptor is None or not len(a) or not len(b):
+    for identity, no_identity in ((observations.label, NO_LABEL), (observations.track, NO_TRACK)):
+        if identity is not None:
+            a, b = a[identity[a] != no_identity], b[identity[b] != no_identity]
+            _, index_a, index_b = np.intersect1d(identity[a], identity[b], return_indices=True)
+            return a[index_a], b[index_b]
+    if observations.descriptor is None or not len(a) or not len(b):
         return a[:0], b[:0]
-    one, two = seen.descriptor[a], seen.descriptor[b]
-    similarity = one @ two.T  # 1 - d^2 / 2 of unit vectors with the distance d
-    if seen.descriptor_kind != USURF:
-        squares = (np.einsum("ij,ij->i", each, each) for each in (one, two))
+    descriptor_a, descriptor_b = observations.descriptor[a], observations.descriptor[b]
+    similarity = descriptor_a @ descriptor_b.T  # 1 - d^2 / 2 of unit vectors with the distance d
+    if observations.descriptor_kind != USURF:
+        squares = (np.einsum("ij,ij->i", each, each) for each in (descriptor_a, descriptor_b))
         similarity += 1 - np.add.outer(*squares) / 2
-    other, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
-    most = euclidean_distance_at(_MAX_DESCRIPTOR_DISTANCE, seen.descriptor_kind)
-    similar = similarity.max(axis=1) > 1 - most**2 / 2
-    mutual = similar & (back[other] == np.arange(len(a)))
-    return a[mutual], b[other[mutual]]
+    index_b, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    max_distance = euclidean_distance_at(_MAX_DESCRIPTOR_DISTANCE, observations.descriptor_kind)
+    similar = similarity.max(axis=1) > 1 - max_distance**2 / 2
+    mutual = similar & (back[index_b] == np.arange(len(a)))
+    return a[mutual], b[index_b[mutual]]
 
 
 def links_needed(log: RobotLog) -> int:
@@ -146,12 +147,12 @@ def _tracked(log: RobotLog, motion: Float) -> RobotLog:
         a, b = (np.arange(starts[k], starts[k + 1]) for k in (frame - 1, frame))
         if not len(a) or not len(b):
             continue
-        before, after = position[a], position[b].copy()
-        after[:, :2] = after[:, :2] @ rotation(motion[frame, 2]).T + motion[frame, :2]
-        distance, nearest = (np.asarray(each) for each in KDTree(before).query(after, k=2))
-        back = np.asarray(KDTree(after).query(before)[1])
+        p_before, p_after = position[a], position[b].copy()
+        p_after[:, :2] = p_after[:, :2] @ rotation(motion[frame, 2]).T + motion[frame, :2]
+        distance, nearest = (np.asarray(result) for result in KDTree(p_before).query(p_after, k=2))
+        nearest_back = np.asarray(KDTree(p_after).query(p_before)[1])
         clear = distance[:, 0] < _NEIGHBOUR_RATIO * distance[:, 1]
-        clear[clear] &= back[nearest[clear, 0]] == np.flatnonzero(clear)
+        clear[clear] &= nearest_back[nearest[clear, 0]] == np.flatnonzero(clear)
         track[b[clear]] = track[a[nearest[clear, 0]]]
     return replace(log, observations=replace(log.observations, track=track))
 
@@ -169,11 +170,18 @@ def _planar_motion(
     weight, agree, gate = np.ones(n), np.ones(n, dtype=bool), chi_square_bound(_LINK_PROBABILITY, 2)
     for tolerance in _TOLERANCES:
         # Closed-form weighted least squares (Umeyama 1991).
-        before, after, share = p_before[agree], p_after[agree], weight[agree] / weight[agree].sum()
-        mean_before, mean_after = share @ before, share @ after
-        a, b = before - mean_before, after - mean_after
-        sine = share @ (b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0])
-        theta = float(np.arctan2(sine, share @ np.sum(a * b, axis=1)))
+        p_before_agree, p_after_agree, normalized_weight = (
+            p_before[agree],
+            p_after[agree],
+            weight[agree] / weight[agree].sum(),
+        )
+        mean_before, mean_after = (
+            normalized_weight @ p_before_agree,
+            normalized_weight @ p_after_agree,
+        )
+        a, b = p_before_agree - mean_before, p_after_agree - mean_after
+        sine = normalized_weight @ (b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0])
+        theta = float(np.arctan2(sine, normalized_weight @ np.sum(a * b, axis=1)))
         R = rotation(theta)
         t = mean_before - R @ mean_after
         # Gate and weights of the next fit.
@@ -208,8 +216,8 @@ def _pair_motion(
     directions, and their variance is `factor` times the mean of the stated variances.
     """
     a, b = links(log, starts, first, second)
-    seen = log.observations
-    p, S = seen.position_m, seen.covariance_m2
+    observations = log.observations
+    p, S = observations.position_m, observations.covariance_m2
     if factor is not None:
         axes = np.diag([1.0, 1.0, 0.0 if log.planar else 1.0])
         mean = np.trace(S, axis1=1, axis2=2) / np.trace(axes)
@@ -218,21 +226,23 @@ def _pair_motion(
         return _planar_motion(p[a, :2], S[a, :2, :2], p[b, :2], S[b, :2, :2])
     if log.planar or len(a) < MIN_LINKS:
         return None
-    _, found = estimate_rigid_motion(p[a], S[a], p[b], S[b], _LINK_PROBABILITY)
-    if found is None:
+    _, rigid_motion = estimate_rigid_motion(p[a], S[a], p[b], S[b], _LINK_PROBABILITY)
+    if rigid_motion is None:
         return None
-    return _PairMotion(found.T_before_after, found.covariance, len(a), found.n_links)
+    return _PairMotion(
+        rigid_motion.T_before_after, rigid_motion.covariance, len(a), rigid_motion.n_links
+    )
 
 
 def _motion_vectors(T: Float) -> Float:
-    """Return shifts and rotation vectors (N, 6) of motions (N, 4, 4); NaN where unknown."""
+    """Return translations and rotation vectors (N, 6) of motions (N, 4, 4); NaN where unknown."""
     from scipy.spatial.transform import Rotation  # the import takes a quarter of a second
 
     vectors = np.full((len(T), 6), np.nan)
-    known = np.isfinite(T).all(axis=(1, 2))
-    vectors[known, :3] = T[known, :3, 3]
-    if known.any():
-        vectors[known, 3:] = Rotation.from_matrix(T[known, :3, :3]).as_rotvec()
+    is_known = np.isfinite(T).all(axis=(1, 2))
+    vectors[is_known, :3] = T[is_known, :3, 3]
+    if is_known.any():
+        vectors[is_known, 3:] = Rotation.from_matrix(T[is_known, :3, :3]).as_rotvec()
     return vectors
 
 
@@ -360,10 +370,12 @@ def composed_spans(steps: Motions, n_frames: int) -> list[Motions]:
         for k in range(lag):
             T = T @ T_step[end - lag + 1 + k]
             covariance += step_covariance[end - lag + 1 + k]
-        known = np.isfinite(covariance).all(axis=(1, 2))
-        none = np.zeros(int(known.sum()), dtype=np.int64)
-        motion = _motion_vectors(T[known])
-        spans.append(Motions(end[known] - lag, end[known], motion, covariance[known], none, none))
+        is_known = np.isfinite(covariance).all(axis=(1, 2))
+        none = np.zeros(int(is_known.sum()), dtype=np.int64)
+        motion = _motion_vectors(T[is_known])
+        spans.append(
+            Motions(end[is_known] - lag, end[is_known], motion, covariance[is_known], none, none)
+        )
     return spans
 
 
@@ -376,13 +388,22 @@ def _span_lengths(n_frames: int) -> list[int]:
 def poses_from_increments(increments: Float) -> Float:
     """Return poses (T, 3) in the first frame from increments (T, 3); the first row is ignored."""
     heading = np.cumsum(increments[:, 2]) - increments[0, 2]
-    before = np.concatenate([[0.0], heading[:-1]])
-    step = np.einsum("nij,nj->ni", rotation(before), increments[:, :2])
+    heading_before = np.concatenate([[0.0], heading[:-1]])
+    step = np.einsum("nij,nj->ni", rotation(heading_before), increments[:, :2])
     return np.column_stack([np.cumsum(step, axis=0) - step[0], wrap(heading)])
 
 
 def motions_of_poses(poses: Float, start: np.ndarray, end: np.ndarray) -> tuple[Float, Float]:
-    """Return shifts (N, 3) and rotation vectors (N, 3) between poses (T, 3) or (T, 4, 4)."""
+    """Return the relative motions between pairs of poses.
+
+    Args:
+        poses: poses, shape (T, 3) or (T, 4, 4).
+        start: indices of the first pose of each pair, shape (N,).
+        end: indices of the second pose of each pair, shape (N,).
+
+    Returns:
+        Translations and rotation vectors, each of shape (N, 3).
+    """
     if poses.ndim == 3:
         vectors = _motion_vectors(se3.between(poses[start], poses[end]))
         return vectors[:, :3], vectors[:, 3:]

@@ -40,7 +40,7 @@ from mapfusion.datasets.stereo_recording import (
 )
 from mapfusion.datasets.text_files import NS, TimedPoses
 from mapfusion.errors import InputError, did_you_mean, one_line
-from mapfusion.files import PART, temporary_prefix, write_whole
+from mapfusion.files import PART, temporary_prefix, write_atomically
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float
 
@@ -545,7 +545,7 @@ def write_rosbag(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Pa
         with Writer(temporary) as bag:
             _Messages(drive, _Ros1()).put_all(bag, on_frame)
 
-    write_whole(path, fill)
+    write_atomically(path, fill)
     return [path]
 
 

@@ -23,7 +23,7 @@ from mapfusion.datasets.levelling import (
     choose_attitude_source,
 )
 from mapfusion.datasets.log_consistency import Finding, disagreement, truth_finding
-from mapfusion.datasets.motion_agreement import Stated, pose_mistakes
+from mapfusion.datasets.motion_agreement import ReportedMotions, pose_mistakes
 from mapfusion.datasets.relative_motion import composed_spans, motions_between_frames
 from mapfusion.datasets.stereo_recording import StereoRecording, sample_indices
 from mapfusion.datasets.text_files import NS, TimedPoses
@@ -471,8 +471,8 @@ def _find_contradictions(
     found = []
     if reckoned is not None:
         subject = "the odometry contradicts the motion that the pictures show"
-        stated = Stated(reckoned, MotionNoise())
-        found.append(disagreement("odometry", subject, spans, stated, pose_mistakes(reckoned)))
+        reported = ReportedMotions(reckoned, MotionNoise())
+        found.append(disagreement("odometry", subject, spans, reported, pose_mistakes(reckoned)))
     if T_world_robot is not None and np.isnan(T_world_robot[:, 0, 0]).all():
         gap = f"over gaps longer than {_LONGEST_TRUTH_GAP_S:g} s it is not interpolated"
         found.append(Finding("truth", -1, f"the truth is known at none of the frames: {gap}"))

@@ -14,7 +14,7 @@ from mapfusion.datasets.camera_calibration import R_ROBOT_OPTICAL, StereoCalibra
 from mapfusion.datasets.imu import ImuData
 from mapfusion.datasets.text_files import NS, ODOMETRY_FILE, TimedPoses, tum_text
 from mapfusion.errors import InputError, TellingWarning
-from mapfusion.files import write_whole
+from mapfusion.files import write_atomically
 from mapfusion.geometry import se2, se3
 from mapfusion.geometry.numerics import Float, require_shape
 from mapfusion.vision.depth import DepthParameters
@@ -317,10 +317,10 @@ def write_dead_reckoning(folder: Path, drive: StereoDrive) -> None:
 def write_text(path: Path, lines: list[str]) -> None:
     """Write lines of text atomically."""
     text = "\n".join([*lines, ""])
-    write_whole(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def write_picture(path: Path, image: np.ndarray) -> None:
     """Write a picture (H, W) uint8 or uint16 as PNG atomically."""
     data = cv2.imencode(".png", image)[1].tobytes()
-    write_whole(path, lambda temporary: temporary.write_bytes(data))
+    write_atomically(path, lambda temporary: temporary.write_bytes(data))

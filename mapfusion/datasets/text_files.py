@@ -70,26 +70,26 @@ def require_columns(
     n, wanted = len(words), len(columns.split())
     if n == wanted or (more and n > wanted):
         return
-    other = f"; {formats[n]}" if formats and n in formats else ""
-    for separator, named in _SEPARATORS.items():
+    hint = f"; {formats[n]}" if formats and n in formats else ""
+    for separator, separator_name in _SEPARATORS.items():
         parts = " ".join(words).split(separator)
         if n < wanted <= len(parts) and (more or len(parts) == wanted):
-            other = f"; its columns are separated by {named}"
-    least = " or more" if more else ""
+            hint = f"; its columns are separated by {separator_name}"
+    or_more = " or more" if more else ""
     raise InputError(
-        f"{path}, line {line}: has {n} columns, expected {wanted}{least} ({columns}){other}"
+        f"{path}, line {line}: has {n} columns, expected {wanted}{or_more} ({columns}){hint}"
     )
 
 
 def parse_numbers(path: Path, line: int, words: list[str]) -> list[float]:
     """Parse the numbers of a line; raise InputError for other words or huge numbers."""
     try:
-        found = [float(word) for word in words]
+        numbers = [float(word) for word in words]
     except ValueError:
         raise InputError(f"{path}, line {line}: not a number in {' '.join(words)!r}") from None
-    if not all(abs(each) <= _MAX_VALUE for each in found):  # NaN is not
+    if not all(abs(number) <= _MAX_VALUE for number in numbers):  # NaN is not
         raise InputError(f"{path}, line {line}: not finite, or above {_MAX_VALUE:g}")
-    return found
+    return numbers
 
 
 def parse_time_ns(path: Path, line: int, word: str, unit_ns: int) -> int:
@@ -191,37 +191,37 @@ class TimedPoses:
         linearly, rotations at constant angular velocity. Poses are NaN before the first time, after
         the last time and in gaps longer than `longest_gap_s`.
         """
-        found = np.full((len(time_ns), 4, 4), np.nan)
+        poses = np.full((len(time_ns), 4, 4), np.nan)
         if not len(self.time_ns):
-            return found
+            return poses
         after = np.clip(np.searchsorted(self.time_ns, time_ns), 1, max(len(self.time_ns) - 1, 1))
         before = after - 1
         after = np.minimum(after, len(self.time_ns) - 1)
-        own = np.where(
+        nearest = np.where(
             np.abs(self.time_ns[before] - time_ns) < np.abs(self.time_ns[after] - time_ns),
             before,
             after,
         )
-        same = np.abs(self.time_ns[own] - time_ns) <= _SAME_TIME_NS
-        found[same] = self.T[own[same]]
+        is_same_time = np.abs(self.time_ns[nearest] - time_ns) <= _SAME_TIME_NS
+        poses[is_same_time] = self.T[nearest[is_same_time]]
         gap_ns = self.time_ns[after] - self.time_ns[before]
         inside = (self.time_ns[before] <= time_ns) & (time_ns <= self.time_ns[after])
-        rest = np.flatnonzero(~same & inside & (gap_ns <= 1e9 * longest_gap_s))
-        if len(rest):
+        interpolated = np.flatnonzero(~is_same_time & inside & (gap_ns <= 1e9 * longest_gap_s))
+        if len(interpolated):
             from scipy.spatial.transform import Rotation
 
-            share = (time_ns - self.time_ns[before])[rest] / gap_ns[rest]
-            first, second = self.T[before[rest]], self.T[after[rest]]
+            fraction = (time_ns - self.time_ns[before])[interpolated] / gap_ns[interpolated]
+            first, second = self.T[before[interpolated]], self.T[after[interpolated]]
             between = np.array(first)
-            between[:, :3, 3] += share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+            between[:, :3, 3] += fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
             turn = Rotation.from_matrix(first[:, :3, :3].swapaxes(1, 2) @ second[:, :3, :3])
-            part = Rotation.from_rotvec(share[:, None] * turn.as_rotvec())
+            part = Rotation.from_rotvec(fraction[:, None] * turn.as_rotvec())
             between[:, :3, :3] = first[:, :3, :3] @ part.as_matrix()
-            found[rest] = between
-        return found
+            poses[interpolated] = between
+        return poses
 
 
-def tum_text(time_s: Float, T_frame_robot: Float, about: str) -> str:
+def tum_text(time_s: Float, T_frame_robot: Float, comment: str) -> str:
     """Return poses (T, 3) or (T, 4, 4) at times (T,) in the TUM format.
 
     Unknown poses (NaN) are left out. Reading the text restores every number exactly.
@@ -229,22 +229,24 @@ def tum_text(time_s: Float, T_frame_robot: Float, about: str) -> str:
     Args:
         time_s: times, shape (T,).
         T_frame_robot: planar poses, shape (T, 3), or poses in space, shape (T, 4, 4).
-        about: comment in the first line.
+        comment: comment in the first line.
     """
     if T_frame_robot.ndim == 3:
         require_shape("T_frame_robot", T_frame_robot, (len(time_s), 4, 4))
-        known = np.isfinite(T_frame_robot).all(axis=(1, 2))
-        T = T_frame_robot[known]
-        values = np.column_stack([time_s[known], T[:, :3, 3], se3.quaternions(T)])
+        is_known = np.isfinite(T_frame_robot).all(axis=(1, 2))
+        T = T_frame_robot[is_known]
+        values = np.column_stack([time_s[is_known], T[:, :3, 3], se3.quaternions(T)])
         lines = [" ".join(map(str, row)) for row in values.tolist()]
     else:
         require_shape("T_frame_robot", T_frame_robot, (len(time_s), 3))
-        known = np.isfinite(T_frame_robot).all(axis=1)
+        is_known = np.isfinite(T_frame_robot).all(axis=1)
         lines = []
-        for when, (x, y, theta) in zip(time_s[known].tolist(), T_frame_robot[known], strict=True):
+        for pose_time_s, (x, y, theta) in zip(
+            time_s[is_known].tolist(), T_frame_robot[is_known], strict=True
+        ):
             qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
-            lines.append(f"{when} {float(x)} {float(y)} 0 0 0 {qz} {qw}")
-    return "\n".join([f"# {about}", _COLUMNS, *lines, ""])
+            lines.append(f"{pose_time_s} {float(x)} {float(y)} 0 0 0 {qz} {qw}")
+    return "\n".join([f"# {comment}", _COLUMNS, *lines, ""])
 
 
 def read_tum(path: Path) -> TimedPoses:

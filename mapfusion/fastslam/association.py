@@ -82,10 +82,10 @@ def label_pairs(slot_of_label: Mapping[int, int], label: np.ndarray) -> tuple[Pa
         The pairs, and (K,) bool: True for an observation that may start a landmark.
     """
     slot = np.array([slot_of_label.get(name, -1) for name in label.tolist()], dtype=np.int64)
-    known = np.flatnonzero(slot >= 0)
+    has_slot = np.flatnonzero(slot >= 0)
     first = np.zeros(len(label), dtype=bool)
     first[np.unique(label, return_index=True)[1]] = True
-    return Pairs(known, slot[known]), first & (slot < 0)
+    return Pairs(has_slot, slot[has_slot]), first & (slot < 0)
 
 
 @kernel(error_model="numpy")
@@ -153,72 +153,87 @@ def associate(
     first = np.ones(len(order), dtype=bool)
     np.not_equal(ordered[1:], ordered[:-1], out=first[1:])
     used = ordered[first]
-    place = np.empty(len(order), dtype=np.int64)  # of each pair's slot in `used`
-    place[order] = np.cumsum(first) - 1
+    slot_position = np.empty(len(order), dtype=np.int64)  # of each pair's slot in `used`
+    slot_position[order] = np.cumsum(first) - 1
 
     alive = maps.bring_up_to_date(used)
     if not alive.all():
-        pairs, place = Pairs(*(values[alive[place]] for values in pairs)), place[alive[place]]
+        pairs, slot_position = (
+            Pairs(*(values[alive[slot_position]] for values in pairs)),
+            slot_position[alive[slot_position]],
+        )
     chosen = np.empty(seen.point_m.shape[:2], dtype=np.int64)
     chosen[:] = np.where(may_create, NEW, DROPPED)[:, None]
-    taken = np.zeros((len(used), seen.point_m.shape[1]), dtype=bool)
+    is_taken = np.zeros((len(used), seen.point_m.shape[1]), dtype=bool)
     assign = _assign_nearest if nearest else _assign_in_order
-    assign(maps.slots.own, maps.slots.row, pairs, place, taken, seen, gate, planar, chosen)
-    return chosen, used[taken.any(axis=1)]
+    assign(
+        maps.slots.by_particle,
+        maps.slots.row,
+        pairs,
+        slot_position,
+        is_taken,
+        seen,
+        gate,
+        planar,
+        chosen,
+    )
+    return chosen, used[is_taken.any(axis=1)]
 
 
 @kernel(error_model="numpy")
-def _distance(seen: MapObservations, k: int, own: Estimates, r: int, m: int, planar: bool) -> float:
+def _distance(
+    seen: MapObservations, k: int, by_particle: Estimates, r: int, m: int, planar: bool
+) -> float:
     """Return the squared Mahalanobis distance of observation k from row r in particle m."""
-    difference, inverse, _ = innovation(seen, k, own, r, m, planar)
+    difference, inverse, _ = innovation(seen, k, by_particle, r, m, planar)
     return quadratic_form(difference, inverse)
 
 
 @kernel(error_model="numpy")
 def _assign_in_order(
-    own: Estimates,
+    by_particle: Estimates,
     row_of: np.ndarray,
     pairs: Pairs,
-    place: np.ndarray,
-    taken: np.ndarray,
+    slot_position: np.ndarray,
+    is_taken: np.ndarray,
     seen: MapObservations,
     gate: float,
     planar: bool,
     chosen: np.ndarray,
 ) -> None:
-    """Write matches into `chosen` and `taken`, greedily in the order of the pairs."""
-    for i in range(len(place)):
-        k, s, j = pairs.observation[i], pairs.slot[i], place[i]
+    """Write matches into `chosen` and `is_taken`, greedily in the order of the pairs."""
+    for i in range(len(slot_position)):
+        k, s, j = pairs.observation[i], pairs.slot[i], slot_position[i]
         r = int(row_of[s])
         for m in range(chosen.shape[1]):
-            if chosen[k, m] >= 0 or taken[j, m] or own.count[r, m] == 0:
+            if chosen[k, m] >= 0 or is_taken[j, m] or by_particle.count[r, m] == 0:
                 continue
-            if _distance(seen, k, own, r, m, planar) <= gate:
+            if _distance(seen, k, by_particle, r, m, planar) <= gate:
                 chosen[k, m] = s
-                taken[j, m] = True
+                is_taken[j, m] = True
 
 
 @kernel(error_model="numpy")
 def _assign_nearest(
-    own: Estimates,
+    by_particle: Estimates,
     row_of: np.ndarray,
     pairs: Pairs,
-    place: np.ndarray,
-    taken: np.ndarray,
+    slot_position: np.ndarray,
+    is_taken: np.ndarray,
     seen: MapObservations,
     gate: float,
     planar: bool,
     chosen: np.ndarray,
 ) -> None:
-    """Write matches into `chosen` and `taken`, greedily by Mahalanobis distance."""
+    """Write matches into `chosen` and `is_taken`, greedily by Mahalanobis distance."""
     n_particles = chosen.shape[1]
-    distances = np.full((n_particles, len(place)), np.inf)
-    for i in range(len(place)):
+    distances = np.full((n_particles, len(slot_position)), np.inf)
+    for i in range(len(slot_position)):
         k, r = pairs.observation[i], int(row_of[pairs.slot[i]])
         for m in range(n_particles):
-            if own.count[r, m] > 0:
-                distances[m, i] = _distance(seen, k, own, r, m, planar)
-    order = np.empty(len(place), np.int64)
+            if by_particle.count[r, m] > 0:
+                distances[m, i] = _distance(seen, k, by_particle, r, m, planar)
+    order = np.empty(len(slot_position), np.int64)
     for m in range(n_particles):
         # Stable insertion sort of the pairs inside the gate: there are few in one particle.
         distance, n = distances[m], 0
@@ -231,7 +246,7 @@ def _assign_nearest(
                 order[at] = i
                 n += 1
         for i in order[:n]:
-            k, j = pairs.observation[i], place[i]
-            if chosen[k, m] < 0 and not taken[j, m]:
+            k, j = pairs.observation[i], slot_position[i]
+            if chosen[k, m] < 0 and not is_taken[j, m]:
                 chosen[k, m] = pairs.slot[i]
-                taken[j, m] = True
+                is_taken[j, m] = True

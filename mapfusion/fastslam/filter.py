@@ -195,9 +195,9 @@ class FastSlam:
             values = getattr(observations, name)
             if values is None or (name == "label" and np.any(values == NO_LABEL)):
                 raise ValueError(f"{name}: observations have none, and the association needs it")
-        kind, known = observations.descriptor_kind, self._descriptor_kind
-        if kind is not None and known is not None and kind.differs_from(known):
-            raise ValueError(f"descriptor: is {kind}, earlier ones were {known}")
+        kind, previous_kind = observations.descriptor_kind, self._descriptor_kind
+        if kind is not None and previous_kind is not None and kind.differs_from(previous_kind):
+            raise ValueError(f"descriptor: is {kind}, earlier ones were {previous_kind}")
 
         # R_t (K, 3, 3) and log p_new (K,). A landmark seen once has lost its track. Without the
         # offset of its track, every match would be less likely than a new landmark where R is
@@ -211,14 +211,18 @@ class FastSlam:
         sigma = settings.motion.standard_deviations(odometry) if sigma is None else sigma
 
         # Predict: landmarks lose certainty at the end of their tracks, and the poses move.
-        maps.inflate(self._tracked.ended(observations.track, maps.slots), self._stray_m2)
+        maps.inflate(
+            self._tracked.slots_of_ended_tracks(observations.track, maps.slots), self._stray_m2
+        )
         self._poses, log_ratio = self._propose(odometry, sigma, observations, noise)
 
         # Associate and update the landmarks (eq. 4-9), and create new ones.
         seen = observations_in_map(self._poses, observations.position_m, noise, planar)
         chosen, changed = self._associate(seen, observations)
         slots = maps.slots
-        log_likelihood = update_landmarks(slots.own, slots.row, chosen, seen, log_new, planar)
+        log_likelihood = update_landmarks(
+            slots.by_particle, slots.row, chosen, seen, log_new, planar
+        )
         maps.update_boxes(changed)
         created, rows = maps.create(chosen, seen, observations, self._n_observations)
         if len(observations):
@@ -239,8 +243,8 @@ class FastSlam:
         self._best = int(np.argmax(self._log_weights))
         if self._history is not None:
             # Source (K, M) of the landmark of each observation, -1 for dropped ones.
-            own = self._n_observations + np.arange(len(chosen))[:, None]
-            source = np.where(chosen == NEW, own, maps.slots.source[chosen])
+            observation_number = self._n_observations + np.arange(len(chosen))[:, None]
+            source = np.where(chosen == NEW, observation_number, maps.slots.source[chosen])
             source = np.where(chosen == DROPPED, -1, source).astype(np.int32)
             self._history.add(self._poses, source)
         self._n_observations += len(chosen)
@@ -267,16 +271,16 @@ class FastSlam:
 
     def best_map(self, min_count: int = 3) -> LandmarkMap:
         """Return the heaviest particle's landmarks seen at least `min_count` times, by age."""
-        which, known = self._maps.landmarks_of(self._best, min_count)
+        slot_indices, estimates = self._maps.landmarks_of(self._best, min_count)
         slots = self._maps.slots
-        covariance = known.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        covariance = estimates.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         return LandmarkMap(
-            position_m=known.mean_m,
+            position_m=estimates.mean_m,
             covariance_m2=covariance,
-            count=known.count,
-            source_observation=slots.source[which],
-            descriptor=None if self._descriptor_kind is None else slots.descriptor[which],
-            label=slots.label[which] if self._has_labels else None,
+            count=estimates.count,
+            source_observation=slots.source[slot_indices],
+            descriptor=None if self._descriptor_kind is None else slots.descriptor[slot_indices],
+            label=slots.label[slot_indices] if self._has_labels else None,
             planar=self._planar,
             descriptor_kind=self._descriptor_kind,
         )
@@ -328,7 +332,7 @@ class FastSlam:
             seen = observations_in_map(predicted, observations.position_m, noise, self._planar)
         slots = self._maps.slots
         eta, log_ratio = informed_disturbance(
-            slots.own,
+            slots.by_particle,
             slots.row,
             chosen,
             seen,

@@ -39,7 +39,7 @@ class Estimates(NamedTuple):
 class Slots(NamedTuple):
     """Arrays of S slots and R rows of M particles; entries of free slots and rows are undefined."""
 
-    own: Estimates  # (R, M, ...)
+    by_particle: Estimates  # (R, M, ...)
     slot_of_row: np.ndarray  # (R,); FREE
     common: Estimates  # (S, 1, ...)
     generation: np.ndarray  # (S,) in which the row was written, or FREE or COMMON
@@ -74,20 +74,22 @@ def allocate(capacity: int, n_rows: int, n_particles: int, length: int = 0) -> S
 
 def grow(slots: Slots, n_slots: int, n_rows: int) -> Slots:
     """Return the slots with room for at least `n_slots` and `n_rows`; full arrays are doubled."""
-    n_particles = slots.own.count.shape[1]
+    n_particles = slots.by_particle.count.shape[1]
     if n_slots > len(slots.label):
         length = slots.descriptor.shape[1]
         wider = allocate(_doubled(len(slots.label), n_slots), 0, n_particles, length)
         for new, old in zip([*wider.common, *wider[3:]], [*slots.common, *slots[3:]], strict=True):
             new[: len(old)] = old
-        slots = wider._replace(own=slots.own, slot_of_row=slots.slot_of_row)
+        slots = wider._replace(by_particle=slots.by_particle, slot_of_row=slots.slot_of_row)
     if n_rows > len(slots.slot_of_row):
         capacity = _doubled(len(slots.slot_of_row), n_rows)
-        own = _estimates(capacity, n_particles)
+        grown = _estimates(capacity, n_particles)
         slot_of_row = np.full(capacity, FREE, dtype=np.int64)
-        for new, old in zip([*own, slot_of_row], [*slots.own, slots.slot_of_row], strict=True):
+        for new, old in zip(
+            [*grown, slot_of_row], [*slots.by_particle, slots.slot_of_row], strict=True
+        ):
             new[: len(old)] = old
-        slots = slots._replace(own=own, slot_of_row=slot_of_row)
+        slots = slots._replace(by_particle=grown, slot_of_row=slot_of_row)
     return slots
 
 
@@ -104,38 +106,48 @@ def _doubled(capacity: int, needed: int) -> int:
 _ALONG_PLANE = (0, 3)  # xx and yy among a covariance's upper entries
 
 
-def update_boxes(slots: Slots, which: np.ndarray, gate: float) -> None:
-    """Compute the boxes of slots (n,), which are up to date, and of their blocks."""
-    is_common = slots.generation[which] == COMMON
-    common, rowed = which[is_common], which[~is_common]
-    low, high, spread = (np.empty((2, len(which))) for _ in range(3))  # along x and y
-    own, rows = slots.own, slots.row[rowed]
-    has = own.count[rows] > 0
+def update_boxes(slots: Slots, indices: np.ndarray, gate: float) -> None:
+    """Compute the bounding boxes of landmarks and of their blocks.
+
+    Args:
+        slots: landmark arrays, whose boxes are changed.
+        indices: (n,) slots, whose rows are of the present generation.
+        gate: largest squared Mahalanobis distance of a match.
+    """
+    is_common = slots.generation[indices] == COMMON
+    common, rowed = indices[is_common], indices[~is_common]
+    low, high, spread = (np.empty((2, len(indices))) for _ in range(3))  # along x and y
+    by_particle, rows = slots.by_particle, slots.row[rowed]
+    has_landmark = by_particle.count[rows] > 0
     for axis, variance in enumerate(_ALONG_PLANE):
         low[axis, is_common] = high[axis, is_common] = slots.common.mean_m[common, 0, axis]
         spread[axis, is_common] = slots.common.covariance_m2[common, 0, variance]
-        mean, of_mean = own.mean_m[rows, :, axis], own.covariance_m2[rows, :, variance]
-        low[axis, ~is_common] = np.where(has, mean, np.inf).min(axis=1)
-        high[axis, ~is_common] = np.where(has, mean, -np.inf).max(axis=1)
-        spread[axis, ~is_common] = np.where(has, of_mean, 0.0).max(axis=1)
+        mean, mean_variance = (
+            by_particle.mean_m[rows, :, axis],
+            by_particle.covariance_m2[rows, :, variance],
+        )
+        low[axis, ~is_common] = np.where(has_landmark, mean, np.inf).min(axis=1)
+        high[axis, ~is_common] = np.where(has_landmark, mean, -np.inf).max(axis=1)
+        spread[axis, ~is_common] = np.where(has_landmark, mean_variance, 0.0).max(axis=1)
     # Inside the gate, |dx| <= sqrt(gate (Sigma_xx + R_xx)) <= sqrt(gate Sigma_xx) +
     # sqrt(gate R_xx). The first term is the landmark's margin, the second the observation's.
     margin = np.sqrt(gate * spread)
-    slots.box_m[which, :2], slots.box_m[which, 2:] = (low - margin).T, (high + margin).T
-    update_block_boxes(slots, np.unique(which // BLOCK))
+    slots.box_m[indices, :2] = (low - margin).T
+    slots.box_m[indices, 2:] = (high + margin).T
+    update_block_boxes(slots, np.unique(indices // BLOCK))
 
 
-def transform_boxes(slots: Slots, which: np.ndarray, turn: Float, shift: Float) -> None:
+def transform_boxes(slots: Slots, slot_indices: np.ndarray, turn: Float, shift: Float) -> None:
     """Move the boxes of slots (n,) by rigid motions of the plane and enclose the result.
 
     A motion rotates by an angle with cosine and sine `turn` (n, 2), then shifts by `shift` (n, 2).
     """
     cos, sin = turn.T
-    low, high = slots.box_m[which, :2], slots.box_m[which, 2:]
+    low, high = slots.box_m[slot_indices, :2], slots.box_m[slot_indices, 2:]
     (x, y), (half_x, half_y) = (0.5 * (low + high)).T, (0.5 * (high - low)).T
     wide = np.stack([abs(cos) * half_x + abs(sin) * half_y, abs(sin) * half_x + abs(cos) * half_y])
     middle = np.stack([cos * x - sin * y + shift[:, 0], sin * x + cos * y + shift[:, 1]])
-    slots.box_m[which] = np.concatenate([middle - wide, middle + wide]).T
+    slots.box_m[slot_indices] = np.concatenate([middle - wide, middle + wide]).T
 
 
 def update_block_boxes(slots: Slots, blocks: np.ndarray) -> None:
@@ -156,8 +168,8 @@ def boxes_overlap(boxes: Float, i: int, box: Float) -> bool:
 def slots_near(slots: Slots, box: Float) -> np.ndarray:
     """Return slots, ascending, whose boxes overlap a box (4,)."""
     blocks = _overlapping(slots.block_box_m, box)
-    of_blocks = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
-    return of_blocks[_overlapping(slots.box_m[of_blocks], box)]
+    candidates = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+    return candidates[_overlapping(slots.box_m[candidates], box)]
 
 
 def _overlapping(boxes: Float, box: Float) -> np.ndarray:
@@ -171,23 +183,28 @@ class ActiveTracks:
     def __init__(self) -> None:
         self._track = self._slot = self._source = np.empty(0, dtype=np.int64)
 
-    def ended(self, track: np.ndarray | None, slots: Slots) -> np.ndarray:
-        """Return the distinct slots (n,) of tracks that end before a frame.
+    def slots_of_ended_tracks(self, track: np.ndarray | None, slots: Slots) -> np.ndarray:
+        """Return the landmarks whose track is not continued in a frame.
 
         Args:
             track: (K,) tracks of the frame's observations, or None.
-            slots: the landmarks.
+            slots: landmark arrays of all particles.
+
+        Returns:
+            (n,) distinct slots, which are indices of landmarks in `slots`.
         """
         if track is not None and len(track):
-            known = np.sort(track)
-            place = np.minimum(np.searchsorted(known, self._track), len(known) - 1)
-            over = known[place] != self._track
+            current_tracks = np.sort(track)
+            index = np.minimum(
+                np.searchsorted(current_tracks, self._track), len(current_tracks) - 1
+            )
+            has_ended = current_tracks[index] != self._track
         else:
-            over = np.ones(len(self._track), dtype=bool)
+            has_ended = np.ones(len(self._track), dtype=bool)
         # A landmark that no particle has is freed; its slot may hold another landmark by now.
-        over &= slots.generation[self._slot] != FREE
-        over &= slots.source[self._slot] == self._source
-        return np.unique(self._slot[over])
+        has_ended &= slots.generation[self._slot] != FREE
+        has_ended &= slots.source[self._slot] == self._source
+        return np.unique(self._slot[has_ended])
 
     def update(
         self, track: np.ndarray | None, chosen: np.ndarray, created: np.ndarray, slots: Slots

@@ -289,9 +289,14 @@ def _information_and_gradient(
     Returns:
         (3, 3) information, and (3,) gradient of the log likelihood.
     """
-    seen, m, own, r = frame.sightings, frame.particle, slots.own, slots.row[frame.chosen[rows]]
-    point, off = seen.point_m[rows, m], seen.point_m[rows, m] - own.mean_m[r, m]
-    Z = own.covariance_m2[r, m] + seen.covariance_m2[rows, m]
+    seen, m, by_particle, r = (
+        frame.sightings,
+        frame.particle,
+        slots.by_particle,
+        slots.row[frame.chosen[rows]],
+    )
+    point, off = seen.point_m[rows, m], seen.point_m[rows, m] - by_particle.mean_m[r, m]
+    Z = by_particle.covariance_m2[r, m] + seen.covariance_m2[rows, m]
     if frame.planar:  # see `innovation`
         off[:, 2] = Z[:, 2] = Z[:, 4] = 0.0
         Z[:, 5] = 1.0

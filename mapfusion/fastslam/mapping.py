@@ -121,8 +121,8 @@ def run_log(
     for iteration, odometry in enumerate(log.odometry):
         frame, sigma = log.observations[starts[iteration] : starts[iteration + 1]], None
         if odometry_covariance is not None and np.isfinite(odometry_covariance[iteration]).all():
-            own = odometry_covariance[iteration] / _HALF
-            sigma = parameters.motion.with_floor(own)
+            frame_covariance = odometry_covariance[iteration] / _HALF
+            sigma = parameters.motion.with_floor(frame_covariance)
             frame = replace(frame, covariance_m2=frame.covariance_m2 / _HALF)
         result = slam.step(odometry, frame, sigma)
         if iteration not in wanted:
@@ -138,9 +138,11 @@ def run_log(
             # The attitude's uncertainty adds to the variance of the heights.
             rows = np.flatnonzero(np.isin(source, landmarks.source_observation))
             order = np.argsort(landmarks.source_observation, kind="stable")
-            place = order[np.searchsorted(landmarks.source_observation[order], source[rows])]
-            own = log.iteration[rows].astype(np.int64)
-            lifted = attitude_height_errors(attitude, path, own, place, landmarks.position_m)
+            landmark_row = order[np.searchsorted(landmarks.source_observation[order], source[rows])]
+            frame = log.iteration[rows].astype(np.int64)
+            lifted = attitude_height_errors(
+                attitude, path, frame, landmark_row, landmarks.position_m
+            )
             covariance = landmarks.covariance_m2.copy()
             covariance[:, 2, 2] += np.sum(lifted**2, axis=0)
             landmarks = replace(landmarks, covariance_m2=covariance)

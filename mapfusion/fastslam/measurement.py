@@ -82,14 +82,19 @@ def inverse_and_determinant(
 
 @kernel(error_model="numpy")
 def innovation(
-    seen: MapObservations, k: int, own: Estimates, r: int, m: int, planar: bool
+    seen: MapObservations, k: int, by_particle: Estimates, r: int, m: int, planar: bool
 ) -> tuple[Vector, Upper, float]:
     """Return the innovation, the inverse of Z (eq. 6) and |Z| in particle m.
 
     The pair is observation k and the landmark of row r. In planar data, the height has innovation 0
     and variance 1 in Z, so that it does not affect the Mahalanobis distance and the determinant.
     """
-    point, noise, mean, covariance = seen.point_m, seen.covariance_m2, own.mean_m, own.covariance_m2
+    point, noise, mean, covariance = (
+        seen.point_m,
+        seen.covariance_m2,
+        by_particle.mean_m,
+        by_particle.covariance_m2,
+    )
     xx = covariance[r, m, 0] + noise[k, m, 0]
     xy = covariance[r, m, 1] + noise[k, m, 1]
     xz = covariance[r, m, 2] + noise[k, m, 2]
@@ -145,7 +150,7 @@ _MEAN, _OFF, _SIGMA, _NOISE, _ROWS = 2, 5, 8, 14, 20
 
 @kernel(error_model="numpy")
 def update_landmarks(
-    own: Estimates,
+    by_particle: Estimates,
     row_of: np.ndarray,
     chosen: np.ndarray,
     seen: MapObservations,
@@ -157,7 +162,8 @@ def update_landmarks(
     The likelihood is the product of eq. 10 over the observations.
 
     Args:
-        own: estimates of the slots, `Slots.own`; all of `Slots` would take long to compile.
+        by_particle: estimates of the slots, `Slots.by_particle`; all of `Slots` would take long to
+            compile.
         row_of: (S,) row of each slot, `Slots.row`.
         chosen: (K, M) slot, NEW or DROPPED.
         seen: the observations.
@@ -171,7 +177,7 @@ def update_landmarks(
         for first in range(0, n_particles, LANES):
             end = min(first + LANES, n_particles)
             # Gather the landmark and the observation of particles `first` to `end`.
-            mean, sigma = own.mean_m, own.covariance_m2
+            mean, sigma = by_particle.mean_m, by_particle.covariance_m2
             point, noise = seen.point_m, seen.covariance_m2
             for m in range(first, end):
                 s, lane = chosen[k, m], m - first
@@ -242,8 +248,8 @@ def update_landmarks(
                 log_likelihood[m] -= 0.5 * (distance + log_two_pi + log_determinant)  # eq. 10
                 r = int(row_of[s])
                 for i in range(3):
-                    own.mean_m[r, m, i] = rows[(_MEAN + i) * LANES + lane]
+                    by_particle.mean_m[r, m, i] = rows[(_MEAN + i) * LANES + lane]
                 for i in range(6):
-                    own.covariance_m2[r, m, i] = rows[(_SIGMA + i) * LANES + lane]
-                own.count[r, m] += 1
+                    by_particle.covariance_m2[r, m, i] = rows[(_SIGMA + i) * LANES + lane]
+                by_particle.count[r, m] += 1
     return log_likelihood

@@ -33,7 +33,7 @@ _ALONG_AXES = np.array([0, 3, 5])  # of the upper entries of a covariance
 _FIRST_SLOTS, _FIRST_ROWS = 4 * BLOCK, 64
 # Number of resamplings in which all rows are brought up to date once. Two updates of a row are then
 # less than twice this number apart, within the memory of the genealogy.
-_ROUND = MEMORY // 2
+_UPDATE_PERIOD = MEMORY // 2
 
 
 class ParticleMaps:
@@ -62,42 +62,42 @@ class ParticleMaps:
         """Number of slots that have a row."""
         return len(self._used_rows)
 
-    def bring_up_to_date(self, which: np.ndarray) -> np.ndarray:
+    def bring_up_to_date(self, slot_indices: np.ndarray) -> np.ndarray:
         """Update the rows of slots (n,) to the present generation; free slots without a particle.
 
         Returns:
             (n,) bool, True for a slot that is still in use.
         """
         genealogy = self._genealogy
-        self._assign_rows(which[self.slots.generation[which] == COMMON])
+        self._assign_rows(slot_indices[self.slots.generation[slot_indices] == COMMON])
         slots = self.slots
         alive = _inherit_rows(
-            slots.own,
+            slots.by_particle,
             slots.common,
             slots.row,
             slots.generation,
-            which,
+            slot_indices,
             genealogy.ancestors,
             genealogy.generation,
         )
         if not alive.all():
-            dead = which[~alive]
+            dead = slot_indices[~alive]
             self._free_rows(dead, FREE)
             self.slots.box_m[dead] = NOWHERE
             self._used_slots.release(dead)
         return alive
 
-    def update_boxes(self, which: np.ndarray) -> None:
-        """Compute the boxes of slots (n,), which are up to date, after their landmarks changed."""
-        update_boxes(self.slots, which, self._gate)
+    def update_boxes(self, slot_indices: np.ndarray) -> None:
+        """Compute the bounding boxes of slots (n,), whose rows are of the present generation."""
+        update_boxes(self.slots, slot_indices, self._gate)
 
-    def inflate(self, which: np.ndarray, variance_m2: float) -> None:
-        """Add a variance to each axis of the landmarks of slots (n,)."""
-        which = which[self.bring_up_to_date(which)]
+    def inflate(self, slot_indices: np.ndarray, variance_m2: float) -> None:
+        """Add a variance to the x, y and z covariance entries of the landmarks of slots (n,)."""
+        slot_indices = slot_indices[self.bring_up_to_date(slot_indices)]
         with np.errstate(invalid="ignore"):  # undefined values of particles without the landmark
-            own = self.slots.own.covariance_m2
-            own[self.slots.row[which, None], :, _ALONG_AXES] += variance_m2
-        self.update_boxes(which)
+            covariance_m2 = self.slots.by_particle.covariance_m2
+            covariance_m2[self.slots.row[slot_indices, None], :, _ALONG_AXES] += variance_m2
+        self.update_boxes(slot_indices)
 
     def transform(self, T_map_old: Float) -> None:
         """Move the landmarks of all slots (S,) by motions of the plane (S, 3), in every particle.
@@ -105,24 +105,24 @@ class ParticleMaps:
         The motions are small, so covariances are not rotated.
         """
         slots = self.slots
-        which = np.flatnonzero(slots.generation != FREE)
-        x, y, angle = T_map_old[which].T
+        slot_indices = np.flatnonzero(slots.generation != FREE)
+        x, y, angle = T_map_old[slot_indices].T
         turn = np.array([[math.cos(a), math.sin(a)] for a in angle]).reshape(-1, 2)
-        is_common = slots.generation[which] == COMMON
+        is_common = slots.generation[slot_indices] == COMMON
         for means, rows, moved in (
-            (slots.common.mean_m, which[is_common], is_common),
-            (slots.own.mean_m, slots.row[which[~is_common]], ~is_common),
+            (slots.common.mean_m, slot_indices[is_common], is_common),
+            (slots.by_particle.mean_m, slots.row[slot_indices[~is_common]], ~is_common),
         ):
-            (cos, sin), at = turn[moved].T[:, :, None], means[rows]
-            means[rows, :, 0] = cos * at[:, :, 0] - sin * at[:, :, 1] + x[moved, None]
-            means[rows, :, 1] = sin * at[:, :, 0] + cos * at[:, :, 1] + y[moved, None]
-        transform_boxes(slots, which, turn, np.stack([x, y], axis=1))
+            (cos, sin), mean_m = turn[moved].T[:, :, None], means[rows]
+            means[rows, :, 0] = cos * mean_m[:, :, 0] - sin * mean_m[:, :, 1] + x[moved, None]
+            means[rows, :, 1] = sin * mean_m[:, :, 0] + cos * mean_m[:, :, 1] + y[moved, None]
+        transform_boxes(slots, slot_indices, turn, np.stack([x, y], axis=1))
         update_block_boxes(slots, np.arange(len(slots.block_box_m)))
 
     def create(
         self,
         chosen: np.ndarray,
-        seen: MapObservations,
+        map_observations: MapObservations,
         observations: Observations,
         first_source: int,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +130,7 @@ class ParticleMaps:
 
         Args:
             chosen: (K, M) slot, NEW or DROPPED.
-            seen: K observations in M maps.
+            map_observations: K observations in M maps.
             observations: the same observations, for their descriptors and labels.
             first_source: running number of the first observation.
 
@@ -149,14 +149,17 @@ class ParticleMaps:
         if observations.descriptor is not None:
             length = observations.descriptor.shape[1]
             if slots.descriptor.shape[1] != length:  # the first descriptors
-                looks = np.full((len(slots.label), length), np.nan, dtype=np.float32)
-                slots = self.slots = slots._replace(descriptor=looks)
+                descriptors = np.full((len(slots.label), length), np.nan, dtype=np.float32)
+                slots = self.slots = slots._replace(descriptor=descriptors)
             slots.descriptor[created] = observations.descriptor[rows]
         if observations.label is not None:
             slots.label[created] = observations.label[rows]
         new, own_rows = chosen[rows] == NEW, slots.row[created]
-        slots.own.count[own_rows], slots.own.mean_m[own_rows] = new, seen.point_m[rows]
-        slots.own.covariance_m2[own_rows] = seen.covariance_m2[rows]
+        slots.by_particle.count[own_rows], slots.by_particle.mean_m[own_rows] = (
+            new,
+            map_observations.point_m[rows],
+        )
+        slots.by_particle.covariance_m2[own_rows] = map_observations.covariance_m2[rows]
         self.n_landmarks += np.count_nonzero(new, axis=0)
         self.update_boxes(created)
         return created, rows
@@ -164,24 +167,26 @@ class ParticleMaps:
     def resample(self, ancestors: np.ndarray) -> None:
         """Replace the particles by children of `ancestors` (M,), and update some rows.
 
-        Each call updates the next rows, so that all rows are updated in _ROUND resamplings. Rows
-        with equal estimates in all particles are freed.
+        Each call updates the next part of the rows, so that _UPDATE_PERIOD resamplings update all
+        rows. Rows with equal estimates in all particles are freed.
         """
         self._genealogy.resample(ancestors)
         self.n_landmarks = self.n_landmarks[ancestors]
-        left = _ROUND - (self._genealogy.generation - 1) % _ROUND
-        stop = self._n_visited + -(-(self._used_rows.n_ever - self._n_visited) // left)
-        which = self.slots.slot_of_row[self._n_visited : stop]
-        which = which[which != FREE]
-        which = which[self.bring_up_to_date(which)]
-        same = np.ones(len(which), dtype=np.bool_)
-        for common, own in zip(self.slots.common, self.slots.own, strict=True):
-            rows = own[self.slots.row[which]]
-            common[which, 0] = rows[:, 0]
-            same &= np.all(rows == rows[:, :1], axis=tuple(range(1, rows.ndim)))
-        self._free_rows(which[same], COMMON)
-        self.update_boxes(which)
-        self._n_visited = 0 if left == 1 else stop
+        n_remaining = _UPDATE_PERIOD - (self._genealogy.generation - 1) % _UPDATE_PERIOD
+        stop = self._n_visited + -(-(self._used_rows.n_ever - self._n_visited) // n_remaining)
+        slot_indices = self.slots.slot_of_row[self._n_visited : stop]
+        slot_indices = slot_indices[slot_indices != FREE]
+        slot_indices = slot_indices[self.bring_up_to_date(slot_indices)]
+        is_equal = np.ones(len(slot_indices), dtype=np.bool_)
+        for common_values, row_values in zip(
+            self.slots.common, self.slots.by_particle, strict=True
+        ):
+            rows = row_values[self.slots.row[slot_indices]]
+            common_values[slot_indices, 0] = rows[:, 0]
+            is_equal &= np.all(rows == rows[:, :1], axis=tuple(range(1, rows.ndim)))
+        self._free_rows(slot_indices[is_equal], COMMON)
+        self.update_boxes(slot_indices)
+        self._n_visited = 0 if n_remaining == 1 else stop
 
     def landmarks_of(self, particle: int, min_count: int) -> tuple[np.ndarray, Estimates]:
         """Return slots (n,) and estimates (n, ...) of one particle's landmarks, by age."""
@@ -191,25 +196,25 @@ class ParticleMaps:
         has_row = slots.generation[used] != COMMON
         rowed = used[has_row]
         column = genealogy.ancestors[slots.generation[rowed] % MEMORY, particle]
-        known = Estimates(*(values[used, 0] for values in slots.common))
-        for values, own in zip(known, slots.own, strict=True):
-            values[has_row] = own[slots.row[rowed], column]
-        has = known.count >= max(min_count, 1)
-        return used[has], Estimates(*(values[has] for values in known))
+        estimates = Estimates(*(values[used, 0] for values in slots.common))
+        for values, row_values in zip(estimates, slots.by_particle, strict=True):
+            values[has_row] = row_values[slots.row[rowed], column]
+        has = estimates.count >= max(min_count, 1)
+        return used[has], Estimates(*(values[has] for values in estimates))
 
-    def _assign_rows(self, which: np.ndarray) -> None:
+    def _assign_rows(self, slot_indices: np.ndarray) -> None:
         """Assign rows with undefined content to slots that have none."""
-        rows = self._used_rows.take(len(which))
+        rows = self._used_rows.take(len(slot_indices))
         self.slots = grow(self.slots, 0, self._used_rows.n_ever)
-        self.slots.row[which] = rows
-        self.slots.slot_of_row[rows] = which
+        self.slots.row[slot_indices] = rows
+        self.slots.slot_of_row[rows] = slot_indices
 
-    def _free_rows(self, which: np.ndarray, generation: int) -> None:
+    def _free_rows(self, slot_indices: np.ndarray, generation: int) -> None:
         """Free the rows of slots, and set the `generation` of these slots to FREE or COMMON."""
-        rows = self.slots.row[which]
+        rows = self.slots.row[slot_indices]
         self._used_rows.release(rows)
         self.slots.slot_of_row[rows] = FREE
-        self.slots.generation[which] = generation
+        self.slots.generation[slot_indices] = generation
 
 
 class _Pool:
@@ -224,9 +229,9 @@ class _Pool:
 
     def take(self, n: int) -> np.ndarray:
         """Return (n,) int64 numbers, which are in use until they are released."""
-        again = [self._free.pop() for _ in range(min(n, len(self._free)))]
-        first, self.n_ever = self.n_ever, self.n_ever + n - len(again)
-        return np.array([*again, *range(first, self.n_ever)], dtype=np.int64)
+        reused = [self._free.pop() for _ in range(min(n, len(self._free)))]
+        first, self.n_ever = self.n_ever, self.n_ever + n - len(reused)
+        return np.array([*reused, *range(first, self.n_ever)], dtype=np.int64)
 
     def release(self, numbers: np.ndarray) -> None:
         """Release numbers."""
@@ -235,38 +240,43 @@ class _Pool:
 
 @kernel
 def _inherit_rows(
-    own: Estimates,
+    by_particle: Estimates,
     common: Estimates,
     row_of: np.ndarray,
     generation_of: np.ndarray,
-    which: np.ndarray,
+    slot_indices: np.ndarray,
     ancestors: np.ndarray,
     generation: int,
 ) -> np.ndarray:
     """Update the rows of slots to a generation.
 
     Args:
-        own: estimates of the rows, `Slots.own`; all of `Slots` would take long to compile.
+        by_particle: estimates of the rows, `Slots.by_particle`; all of `Slots` would take long to
+            compile.
         common: common estimates, `Slots.common`.
         row_of: (S,) row of each slot, `Slots.row`.
         generation_of: (S,) generation of each slot, `Slots.generation`; updated.
-        which: (n,) slots.
+        slot_indices: (n,) slots.
         ancestors: ancestors of the particles, `Genealogy.ancestors`.
         generation: the present generation.
 
     Returns:
         (n,) bool, True if any particle has the landmark.
     """
-    n_particles = own.count.shape[1]
-    alive = np.zeros(len(which), np.bool_)
+    n_particles = by_particle.count.shape[1]
+    alive = np.zeros(len(slot_indices), np.bool_)
     old_mean, old_covariance = np.empty((n_particles, 3)), np.empty((n_particles, 6))
     old_count = np.empty(n_particles, np.int32)
-    for i in range(len(which)):
-        s = int(which[i])
+    for i in range(len(slot_indices)):
+        s = int(slot_indices[i])
         r = int(row_of[s])
         written = generation_of[s]
         generation_of[s] = generation
-        mean, covariance, count = own.mean_m[r], own.covariance_m2[r], own.count[r]
+        mean, covariance, count = (
+            by_particle.mean_m[r],
+            by_particle.covariance_m2[r],
+            by_particle.count[r],
+        )
         if written == generation:
             alive[i] = True
         elif written == COMMON:
@@ -325,12 +335,12 @@ class PathHistory:
         # Remove particles without descendants.
         step = len(self._poses) - 1
         while step >= 0:
-            kept, place = np.unique(self._ancestors[step], return_inverse=True)
+            kept, index_in_kept = np.unique(self._ancestors[step], return_inverse=True)
             all_kept = len(kept) == len(self._poses[step])
             if all_kept and step < self._n_pruned:
                 break  # unchanged since the last pruning, and so are all earlier steps
             if not all_kept:
-                self._ancestors[step] = place.astype(np.int32)
+                self._ancestors[step] = index_in_kept.astype(np.int32)
                 self._poses[step] = self._poses[step][kept]
                 self._sources[step] = self._sources[step][:, kept]
                 if step > 0:
@@ -346,33 +356,35 @@ class PathHistory:
 
     def correct(self, T_map_old: Float) -> None:
         """Move the poses of all particles by motions of the map (steps, 3), one for each step."""
-        known = np.zeros((len(T_map_old), 3))
-        known[: len(self._correction)] = self._correction
-        self._correction = compose(T_map_old, known)
+        previous_correction = np.zeros((len(T_map_old), 3))
+        previous_correction[: len(self._correction)] = self._correction
+        self._correction = compose(T_map_old, previous_correction)
 
     def path(self, particle: int) -> Float:
         """Return the poses (steps, 3) of a present particle and its ancestors."""
-        line = self._line(particle)
-        own = [poses[m] for poses, m in zip(self._poses, line, strict=True)]
-        path = np.array(own).reshape(-1, 3)
+        ancestor_indices = self._ancestor_indices(particle)
+        ancestor_poses = [poses[m] for poses, m in zip(self._poses, ancestor_indices, strict=True)]
+        path = np.array(ancestor_poses).reshape(-1, 3)
         n_corrected = len(self._correction)
         return np.concatenate([compose(self._correction, path[:n_corrected]), path[n_corrected:]])
 
     def associations(self, particle: int) -> np.ndarray:
         """Return the source (n,) int64 of each observation's landmark, -1 for dropped ones."""
-        line = self._line(particle)
-        own = [source[:, m] for source, m in zip(self._sources, line, strict=True)]
-        return np.concatenate([np.empty(0, dtype=np.int64), *own])
+        ancestor_indices = self._ancestor_indices(particle)
+        ancestor_sources = [
+            source[:, m] for source, m in zip(self._sources, ancestor_indices, strict=True)
+        ]
+        return np.concatenate([np.empty(0, dtype=np.int64), *ancestor_sources])
 
     @property
     def n_kept(self) -> int:
         """Number of stored particles, summed over all steps."""
         return sum(map(len, self._poses))
 
-    def _line(self, particle: int) -> list[int]:
+    def _ancestor_indices(self, particle: int) -> list[int]:
         """Return the index of a present particle's ancestor in each step."""
-        line = []
+        indices = []
         for ancestors in reversed(self._ancestors):
             particle = int(ancestors[particle])
-            line.append(particle)
-        return line[::-1]
+            indices.append(particle)
+        return indices[::-1]

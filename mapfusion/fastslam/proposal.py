@@ -65,7 +65,7 @@ def with_odometry_noise(
 
 @kernel(error_model="numpy")
 def informed_disturbance(
-    own: Estimates,
+    by_particle: Estimates,
     row_of: np.ndarray,
     chosen: np.ndarray,
     predicted: MapObservations,
@@ -83,7 +83,7 @@ def informed_disturbance(
     gate lets false matches pass.
 
     Args:
-        own: estimates of the slots, `Slots.own`.
+        by_particle: estimates of the slots, `Slots.by_particle`.
         row_of: (S,) row of each slot, `Slots.row`.
         chosen: (K, M) slots; negative if there is none.
         predicted: observations at the predicted poses.
@@ -117,7 +117,7 @@ def informed_disturbance(
                         row[i * LANES + lane] = 0.0
                     continue
                 is_any, r = True, int(row_of[s])
-                difference, inverse, _ = innovation(predicted, k, own, r, m, planar)
+                difference, inverse, _ = innovation(predicted, k, by_particle, r, m, planar)
                 row[lane], row[LANES + lane], row[2 * LANES + lane] = difference
                 row[3 * LANES + lane], row[4 * LANES + lane] = inverse[0], inverse[1]
                 row[5 * LANES + lane], row[6 * LANES + lane] = inverse[2], inverse[3]

@@ -34,8 +34,8 @@ def systematic_ancestors(log_weights: Float, rng: np.random.Generator) -> np.nda
     pointers = (np.arange(n) + rng.random()) * (cumulated[-1] / n)
     ancestors = np.minimum(np.searchsorted(cumulated, pointers, side="right"), n - 1)
     heaviest = int(np.argmax(log_weights))
-    place = min(int(np.searchsorted(ancestors, heaviest)), n - 1)
-    ancestors[place] = heaviest
+    child_of_heaviest = min(int(np.searchsorted(ancestors, heaviest)), n - 1)
+    ancestors[child_of_heaviest] = heaviest
     return ancestors.astype(np.int32)
 
 

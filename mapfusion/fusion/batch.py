@@ -44,11 +44,11 @@ class Batch:
     def fuse(self, component: Component, parameters: MergeParameters) -> FusedMap:
         """Fuse the maps of a component."""
         joint, members = JointFuser().fuse(component, parameters), component.members
-        known = dict(enumerate(component.recordings))
-        found = [known.get(int(k)) for k in members]
-        logs = [each for each in found if each is not None]
-        if len(logs) < len(found):
-            name = component.maps[members[found.index(None)]].name
+        recording_of_map = dict(enumerate(component.recordings))
+        recordings = [recording_of_map.get(int(k)) for k in members]
+        logs = [each for each in recordings if each is not None]
+        if len(logs) < len(recordings):
+            name = component.maps[members[recordings.index(None)]].name
             return replace(joint, fallback=f"the log of {name}'s smoothed map is not known")
         if len({each.parameters.stray_m for each in logs}) > 1:
             return replace(joint, fallback="the logs have different values of stray_m")
@@ -58,8 +58,10 @@ class Batch:
             rows = np.flatnonzero(parents != ABSENT)
             point = dict(zip(source[parents[rows]].tolist(), rows.tolist(), strict=True))
             names, inverse = np.unique(each.landmark, return_inverse=True)
-            own = np.array([point.get(name, _NO_POINT) for name in names.tolist()], np.int64)
-            points.append(own[inverse])
+            point_indices = np.array(
+                [point.get(name, _NO_POINT) for name in names.tolist()], np.int64
+            )
+            points.append(point_indices[inverse])
         start = joint.T_first_map[members]
         try:
             smoothed = smooth_jointly(logs, points, start, self.max_memory_gb)

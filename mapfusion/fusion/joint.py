@@ -305,9 +305,9 @@ def _neighbours(a: _PlacedMap, b: _PlacedMap, bound: float) -> tuple[np.ndarray,
         rows = np.flatnonzero(octave == each)
         radius_m = np.sqrt(bound * (bound_a + 2.0**each))
         tree = scipy.spatial.KDTree(b.position_m[rows])
-        found = tree.query_ball_point(a.position_m, radius_m, return_sorted=True)
-        rows_a.append(np.repeat(np.arange(len(bound_a)), [len(own) for own in found]))
-        rows_b.append(rows[np.fromiter(chain.from_iterable(found), np.int64)])
+        neighbours = tree.query_ball_point(a.position_m, radius_m, return_sorted=True)
+        rows_a.append(np.repeat(np.arange(len(bound_a)), [len(own) for own in neighbours]))
+        rows_b.append(rows[np.fromiter(chain.from_iterable(neighbours), np.int64)])
     i, j = np.concatenate(rows_a), np.concatenate(rows_b)
     off = a.position_m[i] - b.position_m[j]
     near = np.einsum("ni,ni->n", off, off) <= bound * (bound_a[i] + bound_b[j])

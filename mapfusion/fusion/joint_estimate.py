@@ -69,10 +69,10 @@ class JointMap:
         """
         joint = landmarks.joint
         if joint is None:
-            own = landmarks.covariance_m2.copy()
-            own[:, [0, 1], [0, 1]] += own_sigma_m**2
-            own[:, 2, 2] += height_sigma_m**2
-            joint = JointCovariance(own, np.zeros((len(landmarks), 0, 3)))
+            own_m2 = landmarks.covariance_m2.copy()
+            own_m2[:, [0, 1], [0, 1]] += own_sigma_m**2
+            own_m2[:, 2, 2] += height_sigma_m**2
+            joint = JointCovariance(own_m2, np.zeros((len(landmarks), 0, 3)))
         return cls(landmarks.position_m[:, :n_dimensions], joint, landmarks.calibration)
 
 
@@ -115,32 +115,34 @@ class LandmarkRows(NamedTuple):
         """Return the landmarks `rows` (n,) of a map."""
         position = own_map.position_m[rows]
         d, joint = position.shape[1], own_map.joint
-        own = joint.own_m2[rows][:, :d, :d]
+        own_m2 = joint.own_m2[rows][:, :d, :d]
         moved = np.swapaxes(joint.common_m[rows][:, :, :d], 1, 2)
-        return cls(position, own, inverses(own), np.ascontiguousarray(moved), own_map.calibration)
+        return cls(
+            position, own_m2, inverses(own_m2), np.ascontiguousarray(moved), own_map.calibration
+        )
 
 
 def transform_landmarks(
-    own: LandmarkRows, T: Float, shared: Float, arm_m: Float
+    landmarks: LandmarkRows, T: Float, shared: Float, arm_m: Float
 ) -> TransformedLandmarks:
     """Transform landmarks into the common frame.
 
     Args:
-        own: landmarks of a map.
+        landmarks: landmarks of a map.
         T: pose of the map, shape (3,).
         shared: shared variables of the map, shape (R,).
         arm_m: positions in the map that the errors of the camera displace, shape (n, D).
     """
-    (n, d), moved = own.position_m.shape, own.moved_m
-    if not own.calibration.is_none:
-        by_camera = own.calibration.moves_m(arm_m)[:, :, :d]
+    (n, d), moved = landmarks.position_m.shape, landmarks.moved_m
+    if not landmarks.calibration.is_none:
+        by_camera = landmarks.calibration.moves_m(arm_m)[:, :, :d]
         moved = np.concatenate([moved, np.swapaxes(by_camera, 1, 2)], axis=2)
     R = rotation_about_z(T[2])[:d, :d]
-    point = own.position_m + (moved.reshape(n * d, len(shared)) @ shared).reshape(n, d)
+    point = landmarks.position_m + (moved.reshape(n * d, len(shared)) @ shared).reshape(n, d)
     by = np.empty((n, d, 3 + len(shared)))
     by[:, :2, :3], by[:, 2:, :3] = motion_jacobian(T, point), 0.0
     np.matmul(R, moved, out=by[:, :, 3:])
-    turned = R @ own.own_m2 @ R.T, R @ own.information @ R.T
+    turned = R @ landmarks.own_m2 @ R.T, R @ landmarks.information @ R.T
     return TransformedLandmarks(transform_points(T, point), *turned, by)
 
 
@@ -177,18 +179,20 @@ class JointEstimate:
     @property
     def motion_covariance(self) -> Float:
         """Covariances of the poses, shape (K, 3, 3); zero for the first."""
-        found = np.zeros((len(self.T_first_map), 3, 3))
-        for k in range(1, len(found)):
-            own = slice(3 * k - 3, 3 * k)
-            found[k] = self.covariance[own, own]
-        return found
+        covariances = np.zeros((len(self.T_first_map), 3, 3))
+        for k in range(1, len(covariances)):
+            rows = slice(3 * k - 3, 3 * k)
+            covariances[k] = self.covariance[rows, rows]
+        return covariances
 
     def transformed(
         self, maps: Sequence[JointMap], k: int, rows: np.ndarray
     ) -> TransformedLandmarks:
         """Transform the landmarks `rows` (n,) of map k into the common frame."""
-        own = LandmarkRows.of(maps[k], rows)
-        return transform_landmarks(own, self.T_first_map[k], self.shared[k], own.position_m)
+        landmark_rows = LandmarkRows.of(maps[k], rows)
+        return transform_landmarks(
+            landmark_rows, self.T_first_map[k], self.shared[k], landmark_rows.position_m
+        )
 
     def unknowns(self, maps: Sequence[JointMap], k: int) -> np.ndarray:
         """Return the indices (U_k,) of map k's unknowns in u; ABSENT for the known first pose."""
@@ -218,17 +222,17 @@ class JointEstimate:
 
 def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
     """Return the indices of each map's unknowns in u; ABSENT for the pose of the first map."""
-    first, of_camera, found = 3 * (len(maps) - 1), dict[str, np.ndarray](), list[np.ndarray]()
+    first, of_camera, columns = 3 * (len(maps) - 1), dict[str, np.ndarray](), list[np.ndarray]()
     for k, own in enumerate(maps):
         motion = np.arange(3 * k - 3, 3 * k) if k else np.full(3, ABSENT)
         name = "" if own.calibration.is_none else own.calibration.camera
-        known = of_camera.get(name, np.empty(0, np.int64))
-        shared = np.arange(first, first + own.n_shared - len(known))
+        columns_of_camera = of_camera.get(name, np.empty(0, np.int64))
+        shared = np.arange(first, first + own.n_shared - len(columns_of_camera))
         first += len(shared)
-        found.append(np.concatenate([motion, shared, known]))
+        columns.append(np.concatenate([motion, shared, columns_of_camera]))
         if name:
-            of_camera[name] = found[-1][-N_OF_CAMERA:]
-    return found
+            of_camera[name] = columns[-1][-N_OF_CAMERA:]
+    return columns
 
 
 def estimate_jointly(

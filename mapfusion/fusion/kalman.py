@@ -64,16 +64,16 @@ def fuse_landmarks_sequentially(
         for pair in component.pairs:
             if k not in (pair.a, pair.b):
                 continue
-            known, index, own = pair.a, pair.inliers.index_a, pair.inliers.index_b
+            placed, index, index_in_new = pair.a, pair.inliers.index_a, pair.inliers.index_b
             if k == pair.a:
-                known, index, own = pair.b, own, index
+                placed, index, index_in_new = pair.b, index_in_new, index
             row_of = np.full(1 + index.max(initial=-1), ABSENT)
-            parent = fused.parents[:, known]
+            parent = fused.parents[:, placed]
             inside = (parent != ABSENT) & (parent < len(row_of))
             row_of[parent[inside]] = np.flatnonzero(inside)
             has = row_of[index] != ABSENT
             known_rows.append(row_of[index[has]])
-            other_rows.append(own[has])
+            other_rows.append(index_in_new[has])
             dissimilarity.append(pair.inliers.distance[has])
         rows, others = one_to_one(
             np.concatenate(known_rows), np.concatenate(other_rows), np.concatenate(dissimilarity)

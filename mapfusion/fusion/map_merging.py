@@ -26,7 +26,7 @@ from mapfusion.align.correspondences import (
 from mapfusion.align.rigid_motion import residuals
 from mapfusion.descriptors import DescriptorKind, require_one_kind
 from mapfusion.errors import InputError, TellingWarning
-from mapfusion.files import Write, write_together
+from mapfusion.files import Write, write_all_atomically
 from mapfusion.fusion.fusers import (
     USUAL,
     AlignedPair,
@@ -319,29 +319,30 @@ def in_degrees(landmarks: LandmarkMap) -> str:
 
     Their span is a small part of a metre, and they are far from the origin.
     """
-    plan = landmarks.position_m[:, :2]
-    if len(plan) < _FEWEST or np.abs(plan).max() > 180:
+    p_planar = landmarks.position_m[:, :2]
+    if len(p_planar) < _FEWEST or np.abs(p_planar).max() > 180:
         return ""
-    span, middle = float(np.ptp(plan, axis=0).max()), np.median(plan, axis=0)
+    span, middle = float(np.ptp(p_planar, axis=0).max()), np.median(p_planar, axis=0)
     if span >= min(_LARGEST_DEGREES, float(np.abs(middle).max()) / _FAR):
         return ""
-    found = f"all within {span:.2g} of ({middle[0]:.4f}, {middle[1]:.4f})"
-    looks = "look like longitude and latitude in degrees"
-    return f"x_m and y_m of {landmarks.name} {looks} ({found}): project them to metres, such as UTM"
+    extent_text = f"all within {span:.2g} of ({middle[0]:.4f}, {middle[1]:.4f})"
+    degrees_text = "look like longitude and latitude in degrees"
+    text = f"x_m and y_m of {landmarks.name} {degrees_text} ({extent_text})"
+    return f"{text}: project them to metres, such as UTM"
 
 
 def too_large_sigma(landmarks: LandmarkMap) -> str:
     """Say that the covariances of a map are too large for its span; empty if they are not."""
-    plan = landmarks.position_m[:, :2]
-    if len(plan) < _FEWEST:
+    p_planar = landmarks.position_m[:, :2]
+    if len(p_planar) < _FEWEST:
         return ""
     variance = np.trace(landmarks.covariance_m2[:, :2, :2], axis1=1, axis2=2) / 2
-    sigma_m, span_m = float(np.sqrt(np.median(variance))), float(np.ptp(plan, axis=0).max())
+    sigma_m, span_m = float(np.sqrt(np.median(variance))), float(np.ptp(p_planar, axis=0).max())
     if sigma_m <= _LARGEST_SIGMA * span_m:
         return ""
-    found = f"a median sigma of {sigma_m:.3g} m in a map that spans {span_m:.3g} m"
-    asked = "is --sigma, or are the covariances, too large or in another unit?"
-    return f"landmarks of {landmarks.name} have {found}: {asked}"
+    sigma_text = f"a median sigma of {sigma_m:.3g} m in a map that spans {span_m:.3g} m"
+    question = "is --sigma, or are the covariances, too large or in another unit?"
+    return f"landmarks of {landmarks.name} have {sigma_text}: {question}"
 
 
 def motion_text(T: Float) -> str:
@@ -366,13 +367,13 @@ def _html(text: str, table: "pd.DataFrame") -> str:
     return f"<p>{html.escape(text)}</p>{table.to_html(max_rows=6, float_format='{:.3f}'.format)}"
 
 
-def best_alignment(found: Sequence[MapAlignment]) -> MapAlignment:
+def best_alignment(alignments: Sequence[MapAlignment]) -> MapAlignment:
     """Return the accepted alignment that chance explains least; else the nearest to acceptance."""
-    return min(found, key=lambda each: (_RANKS.index(each.status), _log10_chance(each)))
+    return min(alignments, key=lambda each: (_RANKS.index(each.status), _log10_chance(each)))
 
 
-def _log10_chance(found: MapAlignment) -> float:
-    log10 = found.registered.verdict.log10_false_alarms
+def _log10_chance(alignment: MapAlignment) -> float:
+    log10 = alignment.registered.verdict.log10_false_alarms
     return math.inf if math.isnan(log10) else log10
 
 
@@ -540,7 +541,7 @@ class MergedMaps:
         writes: dict[Path, Write] = {}
         for place, each in zip(paths, fused, strict=True):
             writes |= map_writes(place, each.landmarks)
-        write_together(writes)
+        write_all_atomically(writes)
         return paths
 
     def to_pandas(self) -> "pd.DataFrame":
@@ -564,15 +565,16 @@ class MergedMaps:
         fused = self.fused
         title = f"fused map, in the frame of {self.maps[fused.members[0]].name}"
         plans = [fused_plan(title, fused.landmarks, fused.parents, self.maps)]
-        for (a, b), found in itertools.islice(self.alignments.items(), _MOST_PAIRS):
-            both = f"{found.map_a.name} and {found.map_b.name}"
+        for (a, b), alignment in itertools.islice(self.alignments.items(), _MOST_PAIRS):
+            pair_name = f"{alignment.map_a.name} and {alignment.map_b.name}"
             T_a, T_b = fused.T_first_map[a], fused.T_first_map[b]
-            title = f"{both}:\n{str(found.status).replace('_', ' ')}"
+            title = f"{pair_name}:\n{str(alignment.status).replace('_', ' ')}"
             if np.isnan(T_a).any() or np.isnan(T_b).any():
-                T_a, T_b = np.zeros(3), found.T_a_b
+                T_a, T_b = np.zeros(3), alignment.T_a_b
                 title = f"{title}, not merged"
-            title += f",\n{np.count_nonzero(found.inlier)} of {len(found.inlier)} correspondences"
-            plans.append(found.plan(title, T_a, T_b, found.inlier, (a, b)))
+            inlier = alignment.inlier
+            title += f",\n{np.count_nonzero(inlier)} of {len(inlier)} correspondences"
+            plans.append(alignment.plan(title, T_a, T_b, inlier, (a, b)))
         return plans
 
     def plot(self) -> "Figure":
@@ -597,12 +599,12 @@ def numbered_path(path: Path, k: int) -> Path:
 
 
 def load_maps(
-    given: Mapping[str, "MapLike"], sigma_m: float | None = None, descriptor_metric: str = ""
+    maps_by_name: Mapping[str, "MapLike"], sigma_m: float | None = None, descriptor_metric: str = ""
 ) -> list[LandmarkMap]:
-    """Return maps given as such, by path or as tables.
+    """Load maps from map objects, file paths or tables.
 
     Args:
-        given: the maps by the names of those that are tables.
+        maps_by_name: maps, paths or tables, by the name that a table's map gets.
         sigma_m: standard deviation per axis of landmarks without covariances.
         descriptor_metric: metric of descriptors that state none.
 
@@ -614,7 +616,7 @@ def load_maps(
         raise InputError(f"sigma_m: is {sigma_m:g}, expected a positive number of metres")
     loaded, kinds = list[LandmarkMap](), list[tuple[str, DescriptorKind | None]]()
     opened = list[tuple[str, LandmarkMap]]()
-    for name, each in given.items():
+    for name, each in maps_by_name.items():
         if isinstance(each, LandmarkMap):
             landmarks, place = each, each.called
         elif isinstance(each, str | os.PathLike):

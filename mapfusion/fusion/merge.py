@@ -108,14 +108,14 @@ def merge(
 
 def _in_local_frames(pair: AlignedPair, origins: Sequence[Float]) -> AlignedPair:
     """Return an alignment between local frames of its maps."""
-    a, b, found = origins[pair.a], origins[pair.b], pair.alignment
-    if not (a.any() or b.any()) or not np.isfinite(found.T_a_b).all():
+    a, b, alignment = origins[pair.a], origins[pair.b], pair.alignment
+    if not (a.any() or b.any()) or not np.isfinite(alignment.T_a_b).all():
         return pair
-    if found.overlap is not None:  # more precise than the covariance at a far origin
-        T_a_b, covariance = found.overlap.motion(a, b)
+    if alignment.overlap is not None:  # more precise than the covariance at a far origin
+        T_a_b, covariance = alignment.overlap.motion(a, b)
     else:
-        T_a_b, covariance = moved_motion(found.T_a_b, found.covariance, -a, -b)
-    return replace(pair, alignment=replace(found, T_a_b=T_a_b, covariance=covariance))
+        T_a_b, covariance = moved_motion(alignment.T_a_b, alignment.covariance, -a, -b)
+    return replace(pair, alignment=replace(alignment, T_a_b=T_a_b, covariance=covariance))
 
 
 def _in_given_frames(
@@ -182,12 +182,12 @@ def connect(
     components = []
     for name in several if len(several) else component[:1]:
         members = np.flatnonzero(component == name)
-        own = tuple(pair for pair in used if component[pair.a] == name)
+        used_pairs = tuple(pair for pair in used if component[pair.a] == name)
         left_out = _left_out(maps, members, pairs, status)
         T, covariance = np.full((len(maps), 3), np.nan), np.full((len(maps), 3, 3), np.nan)
         T[members] = graph.T_root_robot[rank[members]]
         covariance[members] = graph.covariance[rank[members]]
-        components.append(Component(tuple(maps), members, own, T, covariance, left_out))
+        components.append(Component(tuple(maps), members, used_pairs, T, covariance, left_out))
     return ConnectedMaps(tuple(components), status)
 
 
@@ -238,14 +238,14 @@ def _require_valid_pairs(maps: Sequence[LandmarkMap], pairs: Sequence[AlignedPai
     """Raise ValueError if the pairs do not fit the maps."""
     if len(maps) < 2:
         raise ValueError(f"maps: {len(maps)} given, at least 2 are needed")
-    known: set[frozenset[int]] = set()
+    seen_pairs: set[frozenset[int]] = set()
     for k, pair in enumerate(pairs):
         both = frozenset((pair.a, pair.b))
         if len(both) < 2 or not 0 <= min(both) <= max(both) < len(maps):
             raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are no two of {len(maps)} maps")
-        if both in known and pair.alignment.status is not Status.AMBIGUOUS:
+        if both in seen_pairs and pair.alignment.status is not Status.AMBIGUOUS:
             raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are given twice")
-        known.add(both)
+        seen_pairs.add(both)
         require_shape(
             f"pairs[{k}].alignment.inlier", pair.alignment.inlier, (len(pair.correspondences),)
         )

@@ -167,8 +167,8 @@ def optimize_poses(edges: AlignmentEdges, rows: np.ndarray, root: int | None = N
     at = np.full((n, 3), np.nan)
     at[0] = IDENTITY
     while not np.isfinite(at).all():
-        known = np.isfinite(at[:, 0])
-        forward, backward = known[a] & ~known[b], known[b] & ~known[a]
+        is_placed = np.isfinite(at[:, 0])
+        forward, backward = is_placed[a] & ~is_placed[b], is_placed[b] & ~is_placed[a]
         if not (forward | backward).any():
             raise ValueError("rows: these alignments do not connect their robots")
         at[b[forward]] = compose(at[a[forward]], T[forward])

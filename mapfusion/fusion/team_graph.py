@@ -129,11 +129,11 @@ class LoopSearch:
             for loops in self._closed_loops(placement, allowed):
                 for loop, distance in zip(*loops, strict=True):
                     distance_of.setdefault(tuple(np.union1d(seed, loop).tolist()), distance)
-        found: list[ConsistentSet] = []
+        sets: list[ConsistentSet] = []
         for loop in sorted(distance_of, key=lambda loop: (len(loop), distance_of[loop])):
-            if not any(np.isin(loop, edge_set.rows).all() for edge_set in found):
-                found.append(self._grow(np.array(loop), allowed))
-        return sorted(found, key=lambda edge_set: -len(edge_set.rows))
+            if not any(np.isin(loop, edge_set.rows).all() for edge_set in sets):
+                sets.append(self._grow(np.array(loop), allowed))
+        return sorted(sets, key=lambda edge_set: -len(edge_set.rows))
 
     def consistent_rows(self, placement: Placement, among: np.ndarray) -> np.ndarray:
         """Return the rows of `among` (E,) that agree with the placement."""
@@ -423,6 +423,6 @@ def _components(edges: AlignmentEdges, kept: np.ndarray) -> np.ndarray:
         low, high = sorted((label[a], label[b]))
         label[label == high] = low
     first, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
-    place = np.empty(len(first), dtype=np.int64)
-    place[np.lexsort([first, -count])] = np.arange(len(first))
-    return place[inverse]
+    position = np.empty(len(first), dtype=np.int64)
+    position[np.lexsort([first, -count])] = np.arange(len(first))
+    return position[inverse]

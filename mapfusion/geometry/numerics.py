@@ -218,13 +218,13 @@ def times_vectors(A: Float, x: Float) -> Float:
 @kernel
 def times_blocks(A: Float, B: Float) -> Float:
     """Return the products (N, 3, 3) of blocks (N, 3, 3)."""
-    made = np.empty(A.shape)
-    for i in range(len(made)):
+    product = np.empty(A.shape)
+    for i in range(len(product)):
         for r in range(3):
             x, y, z = A[i, r, 0], A[i, r, 1], A[i, r, 2]
             for q in range(3):
-                made[i, r, q] = x * B[i, 0, q] + y * B[i, 1, q] + z * B[i, 2, q]
-    return made
+                product[i, r, q] = x * B[i, 0, q] + y * B[i, 1, q] + z * B[i, 2, q]
+    return product
 
 
 def sums_by(group: np.ndarray, values: Float, n: int) -> Float:
@@ -275,11 +275,11 @@ def inverses(blocks: Float) -> Float:
         positive = (a00 > 0) & (d1 > 0) & (d2 > 0)
     if not positive.all():
         raise np.linalg.LinAlgError("a block is not positive definite")
-    found = np.empty(blocks.shape)
+    inverse_blocks = np.empty(blocks.shape)
     for (r, q), entry in zip(pairs, inverse, strict=True):
         if r < dimensions:
-            found[:, r, q] = found[:, q, r] = entry
-    return found
+            inverse_blocks[:, r, q] = inverse_blocks[:, q, r] = entry
+    return inverse_blocks
 
 
 WORD = 64

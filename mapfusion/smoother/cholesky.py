@@ -45,9 +45,9 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
     related.data[:] = 1.0
     starts, column = related.indptr[:-1], related.indices.astype(np.int64)
 
-    def cost(place: np.ndarray) -> int:
+    def cost(position: np.ndarray) -> int:
         """Return the cost of a factor: the sum of squared row lengths."""
-        return int(np.sum((place - np.minimum.reduceat(place[column], starts)) ** 2))
+        return int(np.sum((position - np.minimum.reduceat(position[column], starts)) ** 2))
 
     begins = np.unique(np.linspace(0, n_members - 1, _SEARCHES).round().astype(np.int64))
     found = [
@@ -66,24 +66,26 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
 
 def _places(order: np.ndarray) -> np.ndarray:
     """Return the place (n,) of each member in an order (n,) of all members."""
-    place = np.empty(len(order), dtype=np.int64)
-    place[order] = np.arange(len(order))
-    return place
+    position = np.empty(len(order), dtype=np.int64)
+    position[order] = np.arange(len(order))
+    return position
 
 
-def first_entries(group: np.ndarray, member: np.ndarray, place: np.ndarray) -> np.ndarray:
+def first_entries(group: np.ndarray, member: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Return the first related place of each place, shape (n,); its own if there is none before.
 
     Args:
         group: group numbers, as in `envelope_order`.
         member: members of these groups, as in `envelope_order`.
-        place: result of `envelope_order`, shape (n,).
+        position: result of `envelope_order`, shape (n,).
     """
-    n, at = len(place), place[member]
+    n, at = len(position), position[member]
     first, least = np.arange(n), np.full(int(group.max(initial=-1)) + 1, n)
     np.minimum.at(least, group, at)
     np.minimum.at(first, at, least[group])
-    np.minimum.at(first, np.maximum(place[1:], place[:-1]), np.minimum(place[1:], place[:-1]))
+    np.minimum.at(
+        first, np.maximum(position[1:], position[:-1]), np.minimum(position[1:], position[:-1])
+    )
     return first
 
 
@@ -149,13 +151,13 @@ class Envelope:
 
     def panels(self, entries: Float) -> list[tuple[slice, int, Float]]:
         """Return each block of rows with its first stored column and its entries."""
-        found = []
+        panels = []
         for rows, start in zip(self.blocks, self.starts, strict=True):
             first, height = start * _BLOCK, rows.stop - rows.start
             begin = self.offset[rows.start] + first
             stored = entries[begin : begin + height * (rows.stop - first)]
-            found.append((rows, first, stored.reshape(height, -1)))
-        return found
+            panels.append((rows, first, stored.reshape(height, -1)))
+        return panels
 
     def where(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the indices of the entries of 3 by 3 blocks, shape (m, 3, 3).
@@ -168,8 +170,8 @@ class Envelope:
 
     def between(self, entries: Float, rows: np.ndarray, columns: np.ndarray) -> Float:
         """Return blocks (m, 3, 3) of a symmetric matrix by their block numbers (m,)."""
-        found = entries[self.where(np.maximum(rows, columns), np.minimum(rows, columns))]
-        return np.where((rows < columns)[:, None, None], np.swapaxes(found, 1, 2), found)
+        blocks = entries[self.where(np.maximum(rows, columns), np.minimum(rows, columns))]
+        return np.where((rows < columns)[:, None, None], np.swapaxes(blocks, 1, 2), blocks)
 
 
 class _Part(NamedTuple):
@@ -200,10 +202,10 @@ class Factor:
 
     def dense(self) -> Float:
         """Return L, shape (n, n)."""
-        found = np.zeros((len(self), len(self)))
+        dense = np.zeros((len(self), len(self)))
         for rows, first, L in self.envelope.panels(self.lower):
-            found[rows, first : rows.stop] = L
-        return np.tril(found)
+            dense[rows, first : rows.stop] = L
+        return np.tril(dense)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return L^-1 right, where `right` is (n,) or (n, m), in the precision of `right`."""
@@ -246,11 +248,11 @@ class Factor:
 
         Computed from the last block of columns to the first (Takahashi et al. 1973).
         """
-        found = np.empty_like(self.lower)
-        lower, panels = self.envelope.panels(self.lower), self.envelope.panels(found)
+        columns_of_inverse = np.empty_like(self.lower)
+        lower, panels = self.envelope.panels(self.lower), self.envelope.panels(columns_of_inverse)
         for j, below in reversed(list(enumerate(self.envelope.below))):
             (columns, first, _), inverse = lower[j], self.inverses[j]
-            own = inverse.T @ inverse
+            block = inverse.T @ inverse
             if below:
                 # rows after this block; zero for rows without entries in these columns
                 follows = np.zeros((lower[below[-1]][0].stop - columns.stop, len(inverse)))
@@ -266,9 +268,9 @@ class Factor:
                 for i in below:
                     at, Z = _of_columns(panels[i], columns)
                     np.negative(with_it[at], out=Z)
-                own += follows.T @ with_it
-            panels[j][2][:, columns.start - first :] = own
-        return found
+                block += follows.T @ with_it
+            panels[j][2][:, columns.start - first :] = block
+        return columns_of_inverse
 
 
 def _of_columns(panel: tuple[slice, int, Float], columns: slice) -> tuple[slice, Float]:
@@ -295,10 +297,11 @@ def factor_in_envelope(entries: Float, envelope: Envelope) -> Factor:
     for j, below in enumerate(envelope.below):
         columns, first_too, others = panels[j]
         for i in (j, *below):
-            _, first, own = panels[i]
-            done, left = max(first, first_too), own[:, columns.start - first : columns.stop - first]
+            _, first, panel = panels[i]
+            done = max(first, first_too)
+            left = panel[:, columns.start - first : columns.stop - first]
             if done < columns.start:
-                before = own[:, done - first : columns.start - first]
+                before = panel[:, done - first : columns.start - first]
                 product = before @ others[:, done - first_too : columns.start - first_too].T
                 left -= product
             if i == j:

@@ -62,7 +62,7 @@ class ReducedPoses:
     def factor(self) -> Factor:
         """Return the Cholesky factor of the matrix without the first pose.
 
-        Its rows are in the order of `Sightings.pose_place`.
+        Its rows are in the order of `Sightings.pose_index`.
 
         Raises:
             LinAlgError: the matrix is not positive definite.
@@ -70,21 +70,21 @@ class ReducedPoses:
         envelope = self.obs.order.envelope
         S = envelope.zeros()
         # blocks of odometry and of each pose's own observations
-        place = self.obs.pose_place[1:] - 1
-        S[envelope.where(place, place)] = self.equations.pose_block[1:]
-        after, before, link = place[1:], place[:-1], self.equations.link[1:]
+        index = self.obs.pose_index[1:] - 1
+        S[envelope.where(index, index)] = self.equations.pose_block[1:]
+        after, before, link = index[1:], index[:-1], self.equations.link[1:]
         link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
         S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link
         obs, coupling = self.obs, self.equations.coupling
         couplings = coupling, reduced_couplings(obs, coupling, self.reduced)
-        rows, place = obs.by_landmark, obs.unknown_place
-        subtract_point_terms(rows, place, couplings, self.reduced, envelope.offset, S)
+        rows, index = obs.by_landmark, obs.unknown_index
+        subtract_point_terms(rows, index, couplings, self.reduced, envelope.offset, S)
         return factor_in_envelope(S, envelope)
 
     def solve(self, factor: Factor, right: Float) -> Float:
         """Solve for x (T, 3) with the matrix of this factor and the right side (T, 3)."""
         ordered = np.empty((len(right) - 1, 3))
-        ordered[self.obs.pose_place[1:] - 1] = right[1:]
+        ordered[self.obs.pose_index[1:] - 1] = right[1:]
         return self.by_frame(factor.solve_transposed(factor.solve(ordered.ravel())))
 
     def by_frame(self, ordered: Float) -> Float:
@@ -92,10 +92,10 @@ class ReducedPoses:
 
         The order is that of the rows of `factor`.
         """
-        place = self.obs.pose_place
-        found = np.zeros((len(place), 3))
-        found[1:] = ordered.reshape(-1, 3)[place[1:] - 1]
-        return found
+        index = self.obs.pose_index
+        by_frame = np.zeros((len(index), 3))
+        by_frame[1:] = ordered.reshape(-1, 3)[index[1:] - 1]
+        return by_frame
 
 
 @dataclass(frozen=True)
@@ -148,35 +148,35 @@ class PathErrors:
         """Return the diagonal blocks of Y' Y, shape (L, 3, 3)."""
         total = np.zeros((self.obs.n_landmarks, 3, 3))
         covariance, offset = self.factor.inverse, self.factor.envelope.offset
-        place = self.obs.unknown_place
-        _add_squares(self.obs.starts, place, self.pose_landmark, offset, covariance, total)
+        unknown_index = self.obs.unknown_index
+        _add_squares(self.obs.starts, unknown_index, self.pose_landmark, offset, covariance, total)
         return total + np.swapaxes(total, 1, 2)
 
     @cached_property
     def _landmark_pose(self) -> "scipy.sparse.csr_array":
         """A C' with one block for each observation, shape (3L, R)."""
-        place, each = self.obs.unknown_place, np.arange(3)
-        known = place >= 0
-        rows = 3 * self.obs.landmark[known, None] + each
-        columns = 3 * place[known, None] + each
+        unknown_index, each = self.obs.unknown_index, np.arange(3)
+        has_pose = unknown_index >= 0
+        rows = 3 * self.obs.landmark[has_pose, None] + each
+        columns = 3 * unknown_index[has_pose, None] + each
         rows, columns = np.broadcast_arrays(rows[:, None, :], columns[:, :, None])
         shape = 3 * self.obs.n_landmarks, len(self)
         return scipy.sparse.csr_array(
-            (self.pose_landmark[known].ravel(), (rows.ravel(), columns.ravel())), shape
+            (self.pose_landmark[has_pose].ravel(), (rows.ravel(), columns.ravel())), shape
         )
 
     @cached_property
     def _landmark_pose_single(self) -> "scipy.sparse.csr_array":
         """A C' in single precision."""
-        known = self._landmark_pose
-        entries = known.data.astype(np.float32), known.indices, known.indptr
-        return scipy.sparse.csr_array(entries, known.shape)
+        matrix = self._landmark_pose
+        entries = matrix.data.astype(np.float32), matrix.indices, matrix.indptr
+        return scipy.sparse.csr_array(entries, matrix.shape)
 
 
 @kernel
 def _add_squares(
     starts: np.ndarray,
-    place: np.ndarray,
+    unknown_index: np.ndarray,
     pose_landmark: Float,
     offset: np.ndarray,
     Z: Float,
@@ -186,17 +186,17 @@ def _add_squares(
     of_pose = np.empty((3, 3))
     for j in range(len(starts) - 1):
         for i in range(starts[j], starts[j + 1]):
-            if place[i] < 0:
+            if unknown_index[i] < 0:
                 continue
             for r in range(3):
                 for q in range(3):
                     of_pose[r, q] = 0.0
             for k in range(starts[j], i + 1):
-                if place[k] >= 0:
+                if unknown_index[k] >= 0:
                     share = 0.5 if k == i else 1.0
                     # add a share of the poses' covariance times the block of observation k
-                    row = 3 * place[i]
-                    column = 3 * place[k]
+                    row = 3 * unknown_index[i]
+                    column = 3 * unknown_index[k]
                     above = row < column  # the transpose is stored
                     down, across = (column, row) if above else (row, column)
                     at0, at1, at2 = (
@@ -248,7 +248,7 @@ class Solution(NamedTuple):
         track_m2: covariance of each track's point for a known path, shape (B, 3, 3).
         factor: Cholesky factor of the reduced system.
         landmarks_first: true if the reduced system is that of the poses, in the order of
-            `pose_place`; false if it is that of the offsets and, after them, the landmarks.
+            `pose_index`; false if it is that of the offsets and, after them, the landmarks.
     """
 
     step: Estimate
@@ -332,7 +332,7 @@ def pose_covariances(
     """Return the covariances (n, 3, 3) of the poses of some frames (n,) after the first."""
     n_unknown, n = len(equations.pose_block) - 1, len(frames)
     chosen = np.zeros((n_unknown, 3, n, 3))
-    row = obs.pose_place[frames] if solution.landmarks_first else frames
+    row = obs.pose_index[frames] if solution.landmarks_first else frames
     chosen[row - 1, :, np.arange(n)] = np.eye(3)
     right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
     if not solution.landmarks_first:
@@ -350,9 +350,12 @@ def _eliminate_landmarks_first(obs: OrderedObservations, equations: NormalEquati
     path_step = poses.solve(factor, -gradient)
     path_term = coupling_times_poses(obs, equations.coupling, path_step)
     step = Estimate(path_step, *substitute_points(obs, equations.points, reduced, path_term))
-    squared_step, known = -float(np.vdot(gradient, path_step)), point_covariances(obs, reduced)
-    own = reduced.landmark_m2, known.offset_m2, known.track_m2
-    return Solution(step, squared_step, *own, factor, landmarks_first=True)
+    squared_step, conditional = (
+        -float(np.vdot(gradient, path_step)),
+        point_covariances(obs, reduced),
+    )
+    covariances = reduced.landmark_m2, conditional.offset_m2, conditional.track_m2
+    return Solution(step, squared_step, *covariances, factor, landmarks_first=True)
 
 
 def _eliminate_poses_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
@@ -361,19 +364,19 @@ def _eliminate_poses_first(obs: OrderedObservations, equations: NormalEquations)
     chain = chain_factor(equations)
     right = np.column_stack([B, equations.pose_gradient[1:].ravel()])
     solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
-    whole = Envelope(np.zeros(len(K), dtype=np.int64))
-    factor = factor_in_envelope(whole.of(K - B.T @ solved[:, :-1]), whole)
+    envelope = Envelope(np.zeros(len(K), dtype=np.int64))
+    factor = factor_in_envelope(envelope.of(K - B.T @ solved[:, :-1]), envelope)
     points = -factor.solve_transposed(factor.solve(gradient - B.T @ solved[:, -1]))
     path_step, offsets = np.zeros((n_poses, 3)), np.zeros((len(obs.has_offset), 3))
     path_step[1:] = -(solved[:, -1] + solved[:, :-1] @ points).reshape(-1, 3)
     offsets[obs.has_offset] = points[:n_offsets].reshape(-1, 3)
     step = Estimate(path_step, points[n_offsets:].reshape(-1, 3), offsets)
     reduced = eliminate_offsets(obs, equations.points)
-    known = point_covariances(obs, reduced)
-    own = reduced.landmark_m2, known.offset_m2, known.track_m2
+    conditional = point_covariances(obs, reduced)
+    covariances = reduced.landmark_m2, conditional.offset_m2, conditional.track_m2
     last = step.point_m.ravel()
     squared_step = float(np.sum((factor.dense()[-last.size :, -last.size :].T @ last) ** 2))
-    return Solution(step, squared_step, *own, factor, landmarks_first=False)
+    return Solution(step, squared_step, *covariances, factor, landmarks_first=False)
 
 
 def pose_point_blocks(
@@ -394,9 +397,9 @@ def pose_point_blocks(
     landmark_block = obs.sum_tracks(S)
     if obs.n_dimensions == 2:  # z is not observed
         landmark_block[:, 2, 2] = 1.0
-    own = np.concatenate([S[has_offset], landmark_block])
-    own[:n] += equations.points.offset_information[has_offset, None, None] * np.eye(3)
-    K[each, each] = own
+    point_blocks = np.concatenate([S[has_offset], landmark_block])
+    point_blocks[:n] += equations.points.offset_information[has_offset, None, None] * np.eye(3)
+    K[each, each] = point_blocks
     K[landmark[has_offset], each[:n]] = S[has_offset]
     K[each[:n], landmark[has_offset]] = S[has_offset]
     gradient = [

@@ -125,9 +125,9 @@ def disturbance_variances(state: OptimizerState) -> Float:
         return _variances_from_chain(before, after, *_covariance_factors(state))
     factor = state.solution.factor
     Z, blocks = factor.inverse, factor.envelope.between
-    place = state.obs.pose_place[1:] - 1
-    own, link = blocks(Z, place, place), blocks(Z, place[:-1], place[1:])
-    return _variances_from_covariances(before, after, own, link)
+    index = state.obs.pose_index[1:] - 1
+    diagonal_blocks, link = blocks(Z, index, index), blocks(Z, index[:-1], index[1:])
+    return _variances_from_covariances(before, after, diagonal_blocks, link)
 
 
 def _covariance_factors(state: OptimizerState) -> tuple[Float, Float]:
@@ -148,9 +148,9 @@ def _variances_from_chain(before: Float, after: Float, factor: Float, low_rank: 
             if r >= q:
                 diagonal[:, r, q] = factor[r - q, q::3]
             below[:, r, q] = factor[3 + r - q, q : 3 * (n - 1) : 3]
-    own, link = np.empty((n, 3, 3)), np.empty((max(n - 1, 0), 3, 3))
-    _selected_inverse(diagonal, below, own, link)
-    variance = _variances_from_covariances(before, after, own, link)
+    diagonal_blocks, link = np.empty((n, 3, 3)), np.empty((max(n - 1, 0), 3, 3))
+    _selected_inverse(diagonal, below, diagonal_blocks, link)
+    variance = _variances_from_covariances(before, after, diagonal_blocks, link)
     blocks = low_rank.reshape(n, 3, -1)
     differences = after @ blocks
     differences[1:] += before[1:] @ blocks[:-1]
@@ -158,24 +158,26 @@ def _variances_from_chain(before: Float, after: Float, factor: Float, low_rank: 
     return variance
 
 
-def _variances_from_covariances(before: Float, after: Float, own: Float, link: Float) -> Float:
+def _variances_from_covariances(
+    before: Float, after: Float, diagonal_blocks: Float, link: Float
+) -> Float:
     """Return the variances (T - 1, 3) of D x from the covariances of poses and successive pairs."""
-    variance = np.einsum("kij,kjl,kil->ki", after, own, after)
-    variance[1:] += np.einsum("kij,kjl,kil->ki", before[1:], own[:-1], before[1:])
+    variance = np.einsum("kij,kjl,kil->ki", after, diagonal_blocks, after)
+    variance[1:] += np.einsum("kij,kjl,kil->ki", before[1:], diagonal_blocks[:-1], before[1:])
     variance[1:] += 2 * np.einsum("kij,kjl,kil->ki", before[1:], link, after[1:])
     return variance
 
 
 @kernel
-def _selected_inverse(diagonal: Float, below: Float, own: Float, link: Float) -> None:
+def _selected_inverse(diagonal: Float, below: Float, diagonal_blocks: Float, link: Float) -> None:
     """Write the blocks of a chain's inverse on and beside the diagonal (Takahashi et al. 1973)."""
     for k in range(len(diagonal) - 1, -1, -1):
         inverse = np.linalg.inv(diagonal[k])
-        own[k] = inverse.T @ inverse
+        diagonal_blocks[k] = inverse.T @ inverse
         if k < len(below):
             G = below[k] @ inverse
-            link[k] = -G.T @ own[k + 1]
-            own[k] += G.T @ own[k + 1] @ G
+            link[k] = -G.T @ diagonal_blocks[k + 1]
+            diagonal_blocks[k] += G.T @ diagonal_blocks[k + 1] @ G
 
 
 NOISE_PARAMETERS = (
@@ -243,13 +245,13 @@ def noise_statistics(
     parts = amounts * np.array([getattr(motion, name) for name in NOISE_PARAMETERS]) ** 2
     squares, determined, information_of = np.zeros(3), np.zeros(3), np.zeros((3, 3))
     in_sigmas = posterior.mean**2 * information
-    known = np.clip(1 - posterior.variance * information, 0, 1)
+    redundancy = np.clip(1 - posterior.variance * information, 0, 1)
     for parameters, axes in ((slice(0, 1), (0, 1)), (slice(1, 3), (2,))):
         for axis in axes:
             share = parts[:, parameters] * information[:, axis, None]
             squares[parameters] += share.T @ in_sigmas[:, axis]
-            determined[parameters] += share.T @ known[:, axis]
-            weighted = known[:, axis, None] * share
+            determined[parameters] += share.T @ redundancy[:, axis]
+            weighted = redundancy[:, axis, None] * share
             information_of[parameters, parameters] += 2 * weighted.T @ weighted
     return NoiseStatistics(squares, determined, information_of)
 
@@ -302,8 +304,8 @@ def initial_observation_scale(
     problem: Problem, at: Estimate, weights: Weights, tails: Tails
 ) -> float:
     """Return the noise scale q of observations before the first step from an estimate."""
-    _, known = solve_points(problem.obs, at, weights, problem.offset_prior)
-    return _estimate_observation_scale(problem.obs, at, weights, tails, known.track_m2, 1.0)
+    _, covariances = solve_points(problem.obs, at, weights, problem.offset_prior)
+    return _estimate_observation_scale(problem.obs, at, weights, tails, covariances.track_m2, 1.0)
 
 
 def _estimate_observation_scale(
@@ -319,14 +321,14 @@ def _estimate_observation_scale(
         return 1.0
     square = squared_distances(obs, at)[rows]
     of_point = expected_point_squares(obs, at.path, track_m2)[rows]
-    known = np.sum(n - np.minimum(weights.observation[rows] * of_point, n))
-    if known < LEAST_COORDINATES:
+    degrees_of_freedom = np.sum(n - np.minimum(weights.observation[rows] * of_point, n))
+    if degrees_of_freedom < LEAST_COORDINATES:
         return 1.0
     beside = min(scale, 1.0) * (square + of_point)
-    found = student_weights(beside, fit_dof(beside, n, tails.observation), n)
+    student_weight = student_weights(beside, fit_dof(beside, n, tails.observation), n)
     stated = np.median(np.trace(obs.information[rows], axis1=1, axis2=2)) * scale / n
     least = min(_LEAST_M**2 * stated, 1.0)
-    return max(float(scale * np.sum(found * square) / known), least)
+    return max(float(scale * np.sum(student_weight * square) / degrees_of_freedom), least)
 
 
 _NONE_DETERMINED = 1e-9  # disturbances; fewer are rounding errors
@@ -372,8 +374,10 @@ class PosteriorShares(NamedTuple):
             path: current path, shape (T, 3).
             scales: current noise scales, shape (3,).
         """
-        found = np.sum(disturbances(path, problem.odometry) ** 2 * problem.information, axis=0)
-        likely = found / np.maximum(self.known(scales), _NONE_DETERMINED)
+        squared_disturbances = np.sum(
+            disturbances(path, problem.odometry) ** 2 * problem.information, axis=0
+        )
+        likely = squared_disturbances / np.maximum(self.known(scales), _NONE_DETERMINED)
         likely = np.maximum(likely, smallest_scales(problem.information))
         return np.array([self._with_prior(axis, scale) for axis, scale in enumerate(likely)])
 
@@ -391,10 +395,10 @@ class PosteriorShares(NamedTuple):
 
         if excess(likely) == 0 or likely == 1:
             return likely
-        found = scipy.optimize.root_scalar(
+        root = scipy.optimize.root_scalar(
             excess, bracket=(likely, 1.0), method="brentq", rtol=_SCALE_TOLERANCE
         )
-        return float(found.root)
+        return float(root.root)
 
 
 # When the steps have converged the odometry's scales are computed again, with new covariances. The

@@ -126,9 +126,9 @@ def heading_cos_sin(path: Float) -> Float:
 
 def disturbances(path: Float, odometry: Float) -> Float:
     """Return the disturbances d of eq. 3, x_k = x_(k-1) + (u_k + d), shape (T - 1, 3)."""
-    found = between(path[:-1], path[1:]) - odometry[1:]
-    found[:, 2] = wrap(found[:, 2])
-    return found
+    disturbance = between(path[:-1], path[1:]) - odometry[1:]
+    disturbance[:, 2] = wrap(disturbance[:, 2])
+    return disturbance
 
 
 def disturbance_jacobians(path: Float) -> tuple[Float, Float]:
@@ -166,36 +166,36 @@ def normal_equations(
         shares: shares of observations and offsets in the matrix; the gradient is not scaled.
     """
     n_poses = len(at.path)
-    made = NormalEquations(
+    equations = NormalEquations(
         np.zeros((n_poses, 3, 3)),
         np.zeros((n_poses - 1, 3, 3)),
         np.zeros((n_poses, 3)),
         np.empty((len(obs), 3, 3)),
         _no_observations(at, weights, offset_prior, shares),
     )
-    poses = made.pose_block, made.pose_gradient, made.coupling
+    poses = equations.pose_block, equations.pose_gradient, equations.coupling
     _add_observations(
-        _observed_points(obs, at), weights.observation, shares.observation, made.points, *poses
+        _observed_points(obs, at), weights.observation, shares.observation, equations.points, *poses
     )
     # odometry
     d = disturbances(at.path, odometry)
     before, after = disturbance_jacobians(at.path)
     for J, poses in ((before, slice(0, n_poses - 1)), (after, slice(1, n_poses))):
         weighted = np.swapaxes(J, 1, 2) * information[:, None, :]
-        made.pose_block[poses] += weighted @ J
-        made.pose_gradient[poses] += np.einsum("nij,nj->ni", weighted, d)
-    made.link[:] = (np.swapaxes(after, 1, 2) * information[:, None, :]) @ before
-    return made
+        equations.pose_block[poses] += weighted @ J
+        equations.pose_gradient[poses] += np.einsum("nij,nj->ni", weighted, d)
+    equations.link[:] = (np.swapaxes(after, 1, 2) * information[:, None, :]) @ before
+    return equations
 
 
 def point_equations(
     obs: OrderedObservations, at: Estimate, weights: Weights, offset_prior: float
 ) -> PointEquations:
     """Return the equations of the points for a fixed path; arguments as in `normal_equations`."""
-    made = _no_observations(at, weights, offset_prior, FULL_INFORMATION)
+    equations = _no_observations(at, weights, offset_prior, FULL_INFORMATION)
     nothing = np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
-    _add_observations(_observed_points(obs, at), weights.observation, 1.0, made, *nothing)
-    return made
+    _add_observations(_observed_points(obs, at), weights.observation, 1.0, equations, *nothing)
+    return equations
 
 
 def _no_observations(
@@ -257,20 +257,20 @@ def _add_observations(
     """
     block, gradient = points.track_block, points.track_gradient
     for i in range(len(weight)):
-        k, t, w, own = seen.frame[i], seen.track[i], weight[i], seen.information[i]
+        k, t, w, information = seen.frame[i], seen.track[i], weight[i], seen.information[i]
         c, s = seen.turn[k, 0], seen.turn[k, 1]
         u, v = seen.position_m[i, 0], seen.position_m[i, 1]
         # residual, and weighted information in the map frame
         x, y = seen.point_m[t, 0] - seen.path[k, 0], seen.point_m[t, 1] - seen.path[k, 1]
         ex, ey = x - (c * u - s * v), y - (s * u + c * v)
         ez = seen.point_m[t, 2] - seen.position_m[i, 2]
-        along, across, mixed = own[0, 0], own[1, 1], own[0, 1]
+        along, across, mixed = information[0, 0], information[1, 1], information[0, 1]
         xx = w * (c * c * along - 2 * c * s * mixed + s * s * across)
         yy = w * (s * s * along + 2 * c * s * mixed + c * c * across)
         xy = w * (c * s * (along - across) + (c * c - s * s) * mixed)
-        xz = w * (c * own[0, 2] - s * own[1, 2])
-        yz = w * (s * own[0, 2] + c * own[1, 2])
-        zz = w * own[2, 2]
+        xz = w * (c * information[0, 2] - s * information[1, 2])
+        yz = w * (s * information[0, 2] + c * information[1, 2])
+        zz = w * information[2, 2]
         rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
         gx = xx * ex + xy * ey + xz * ez
         gy = xy * ex + yy * ey + yz * ez

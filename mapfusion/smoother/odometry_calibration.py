@@ -74,14 +74,14 @@ class OdometryError:
 
     @classmethod
     def of(cls, constants: Float) -> "OdometryError":
-        """Return the errors of an array (5,) in the order of the attributes."""
+        """Return the errors from a parameter vector (5,) in the order of the attributes."""
         require_shape("constants", constants, (N_CONSTANTS,))
         require_finite("constants", constants)
         return cls(*map(float, constants))
 
     @property
     def constants(self) -> Float:
-        """Array (5,) in the order of the attributes."""
+        """Parameter vector (5,) in the order of the attributes."""
         return np.array(astuple(self))
 
     def corrected(self, odometry: Float) -> Float:
@@ -95,16 +95,19 @@ N_CONSTANTS = len(fields(OdometryError))
 
 
 def increment_jacobians(odometry: Float) -> Float:
-    """Return the derivatives (T, 3, 5) of the increments (T, 3) by the constants."""
-    by = np.zeros((len(odometry), 3, N_CONSTANTS))
-    way, turn = np.hypot(odometry[:, 0], odometry[:, 1]), odometry[:, 2]
-    by[:, :2, 0] = odometry[:, :2]
-    by[:, 2, 1] = turn
-    by[1:, 2, 2] = turn[:-1]
-    by[:, 2, 3] = way
-    # s |theta| = max(0, |theta| - way / r)
-    by[:, 2, 4] = np.sign(turn) * np.maximum(0.0, np.abs(turn) - way / HALF_TRACK_M)
-    return by
+    """Return the Jacobians (T, 3, 5) of the corrected increments (T, 3) by the error parameters.
+
+    The columns have the order of the attributes of `OdometryError`.
+    """
+    jacobian = np.zeros((len(odometry), 3, N_CONSTANTS))
+    distance, turn = np.hypot(odometry[:, 0], odometry[:, 1]), odometry[:, 2]
+    jacobian[:, :2, 0] = odometry[:, :2]
+    jacobian[:, 2, 1] = turn
+    jacobian[1:, 2, 2] = turn[:-1]
+    jacobian[:, 2, 3] = distance
+    # s |theta| = max(0, |theta| - distance / r)
+    jacobian[:, 2, 4] = np.sign(turn) * np.maximum(0.0, np.abs(turn) - distance / HALF_TRACK_M)
+    return jacobian
 
 
 # Prior standard deviations of the constants. They matter only for constants without information,
@@ -204,13 +207,13 @@ class _Robot:
         self.deviance += float(np.sum(information * d**2))
         by_constants = increment_jacobians(self.log.odometry)[1:]
         posterior = motion_posterior(state, odometry, information, by_constants)
-        known = posterior.constants_information + np.diag(self.prior_sigma**-2)
-        self.covariance = np.asarray(np.linalg.inv(known), np.float64)
-        expected = (self.prior_mean - self.constants) / self.prior_sigma**2
-        step = self.covariance @ (posterior.constants_gradient + expected)
+        constants_information = posterior.constants_information + np.diag(self.prior_sigma**-2)
+        self.covariance = np.asarray(np.linalg.inv(constants_information), np.float64)
+        prior_gradient = (self.prior_mean - self.constants) / self.prior_sigma**2
+        step = self.covariance @ (posterior.constants_gradient + prior_gradient)
         self.constants = self.constants + step
         return noise_statistics(posterior, odometry, information, motion), float(
-            np.sqrt(step @ known @ step)
+            np.sqrt(step @ constants_information @ step)
         )
 
 
@@ -244,10 +247,11 @@ def calibrate(
     while True:
         n_rounds += 1
         rounds = [robot.round(motion) for robot in robots]
-        statistics = sum_statistics([each for each, _ in rounds])
-        before, motion = motion, update_noise(motion, statistics)
+        statistics = sum_statistics([statistics_of_robot for statistics_of_robot, _ in rounds])
+        previous_motion, motion = motion, update_noise(motion, statistics)
         changes = (
-            abs(getattr(motion, name) / getattr(before, name) - 1) for name in NOISE_PARAMETERS
+            abs(getattr(motion, name) / getattr(previous_motion, name) - 1)
+            for name in NOISE_PARAMETERS
         )
         largest_step = max(0.0, *(step for _, step in rounds), *changes)
         on_round(n_rounds, _MOST_ROUNDS)
@@ -280,11 +284,11 @@ def _initial_state(
         require_shape("path", path, (len(log), 3))
         obs = order_observations(log, landmark, parameters.min_count, with_offsets=with_offsets > 0)
         return _checked(_Robot.of(log, obs, with_offsets, path))
-    found = [
+    candidates = [
         _smooth_increasing_parts(log, landmark, parameters, motion, in_place)
         for in_place in _IN_PLACE_STARTS
     ]
-    best = min(found, key=lambda robot: robot.deviance)
+    best = min(candidates, key=lambda robot: robot.deviance)
     best.prior_mean, best.prior_sigma = np.zeros(N_CONSTANTS), _PRIOR
     return best
 
@@ -298,34 +302,34 @@ def _smooth_increasing_parts(
 ) -> _Robot:
     """Return the state after smoothing increasing parts of the log."""
     observed, with_offsets = np.unique(log.iteration), parameters.offset_prior
-    grown = _Robot.of(
+    state = _Robot.of(
         log, order_observations(log, landmark, 1, with_offsets=False), with_offsets, IDENTITY[None]
     )
-    grown.prior_mean = OdometryError(in_place=in_place).constants
-    grown.prior_sigma = OdometryError(*_PRIOR[:-1], in_place=_IN_PLACE_SIGMA).constants
-    grown.constants = grown.prior_mean
-    n_seen = _FIRST_FRAMES
+    state.prior_mean = OdometryError(in_place=in_place).constants
+    state.prior_sigma = OdometryError(*_PRIOR[:-1], in_place=_IN_PLACE_SIGMA).constants
+    state.constants = state.prior_mean
+    n_observed_frames = _FIRST_FRAMES
     while True:
-        whole = n_seen >= len(observed)
-        n_frames = len(log) if whole else int(observed[n_seen]) + 1
-        part = log if whole else first_frames(log, n_frames)
-        least = parameters.min_count if whole else 1
-        grown.log, grown.obs = (
+        is_whole_log = n_observed_frames >= len(observed)
+        n_frames = len(log) if is_whole_log else int(observed[n_observed_frames]) + 1
+        part = log if is_whole_log else first_frames(log, n_frames)
+        min_count = parameters.min_count if is_whole_log else 1
+        state.log, state.obs = (
             part,
             order_observations(
-                part, landmark[: len(part.observations)], least, with_offsets=with_offsets > 0
+                part, landmark[: len(part.observations)], min_count, with_offsets=with_offsets > 0
             ),
         )
-        odometry = OdometryError.of(grown.constants).corrected(part.odometry)
-        path = np.concatenate([grown.path, np.empty((len(odometry) - len(grown.path), 3))])
-        for k in range(len(grown.path), len(odometry)):
+        odometry = OdometryError.of(state.constants).corrected(part.odometry)
+        path = np.concatenate([state.path, np.empty((len(odometry) - len(state.path), 3))])
+        for k in range(len(state.path), len(odometry)):
             path[k] = compose(path[k - 1], odometry[k])
-        grown.path = path
+        state.path = path
         for _ in range(_PART_ROUNDS):
-            _checked(grown).round(motion)
-        if whole:
-            return grown
-        n_seen = int(n_seen * _GROWTH)
+            _checked(state).round(motion)
+        if is_whole_log:
+            return state
+        n_observed_frames = int(n_observed_frames * _GROWTH)
 
 
 def _checked(robot: _Robot) -> _Robot:

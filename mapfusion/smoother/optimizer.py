@@ -155,9 +155,9 @@ def update_points_and_weights(
     obs, _, _, offset_prior = problem
     weights = unit_weights(obs) if weights is None else weights
     for _ in range(_FOLLOWING):
-        step, known = solve_points(obs, at, weights, offset_prior)
+        step, covariances = solve_points(obs, at, weights, offset_prior)
         at = Estimate(at.path, at.point_m + step.point_m, at.offset_m + step.offset_m)
-        weights, tails = update_weights(obs, at, weights, tails, known, offset_prior)
+        weights, tails = update_weights(obs, at, weights, tails, covariances, offset_prior)
     return at, weights, tails
 
 

@@ -106,14 +106,14 @@ class OrderedObservations:
         return len(self.starts) - 1
 
     @property
-    def pose_place(self) -> np.ndarray:
+    def pose_index(self) -> np.ndarray:
         """Place of each pose in the elimination order, shape (T,); the first pose is first."""
         return self.order.place
 
     @cached_property
-    def unknown_place(self) -> np.ndarray:
+    def unknown_index(self) -> np.ndarray:
         """Place of each observation's pose among the unknown ones, shape (N,); -1 for the first."""
-        return self.pose_place[self.frame] - 1
+        return self.pose_index[self.frame] - 1
 
     @cached_property
     def first_track(self) -> np.ndarray:

@@ -112,15 +112,15 @@ def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -
 
     low, high = float(np.log(LEAST_DOF)), float(np.log(MOST_DOF))
     if near < MOST_DOF:
-        found = _secant_root(slope, float(np.log(near)), low, high)
-        if found is not None:
-            return float(np.exp(found))
+        root = _secant_root(slope, float(np.log(near)), low, high)
+        if root is not None:
+            return float(np.exp(root))
     if slope(high) <= 0:
         return MOST_DOF
     if slope(low) >= 0:
         return LEAST_DOF
-    found = scipy.optimize.root_scalar(slope, bracket=(low, high), method="brentq", xtol=_FOUND_TO)
-    return float(np.exp(found.root))
+    root = scipy.optimize.root_scalar(slope, bracket=(low, high), method="brentq", xtol=_FOUND_TO)
+    return float(np.exp(root.root))
 
 
 def _secant_root(
@@ -134,10 +134,10 @@ def _secant_root(
     at, off_before = before + np.copysign(_ASIDE, -slope_before), 1.0
     for _ in range(_MOST_SECANTS):
         slope_at = slope(at)
-        rise = (slope_at - slope_before) / (at - before)
-        if not rise > 0:
+        slope_change = (slope_at - slope_before) / (at - before)
+        if not slope_change > 0:
             return None
-        before, slope_before, off = at, slope_at, -slope_at / rise
+        before, slope_before, off = at, slope_at, -slope_at / slope_change
         at = at + off
         if not (low < at < high and abs(off) < 1):
             return None
@@ -172,7 +172,7 @@ def update_weights(
     at: Estimate,
     weights: Weights,
     tails: Tails,
-    known: PointCovariances,
+    covariances: PointCovariances,
     offset_prior: float,
 ) -> tuple[Weights, Tails]:
     """Compute new weights and tails from the current estimate.
@@ -187,14 +187,14 @@ def update_weights(
         at: the estimate.
         weights: the current weights.
         tails: the current tails.
-        known: covariances of the points under the current weights.
+        covariances: covariances of the points under the current weights.
         offset_prior: information of an offset along each axis, in 1/m^2.
     """
     n, new = obs.n_dimensions, unit_weights(obs)
     squares = squared_distances(obs, at)
-    squares += expected_point_squares(obs, at.path, known.track_m2)
+    squares += expected_point_squares(obs, at.path, covariances.track_m2)
     of_offset = offset_squares(obs, at, offset_prior)
-    dimensions = determined_dimensions(obs, known.offset_m2, weights.offset * offset_prior)
+    dimensions = determined_dimensions(obs, covariances.offset_m2, weights.offset * offset_prior)
     tails = Tails(
         fit_dof(squares, n, tails.observation),
         fit_dof(of_offset, dimensions, tails.offset),

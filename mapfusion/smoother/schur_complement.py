@@ -123,7 +123,7 @@ def point_covariances(obs: OrderedObservations, reduced: ReducedEquations) -> Po
 @kernel
 def subtract_point_terms(
     rows: tuple[np.ndarray, np.ndarray, np.ndarray],
-    place: np.ndarray,
+    unknown_index: np.ndarray,
     couplings: tuple[Float, Float],
     reduced: ReducedEquations,
     offset: np.ndarray,
@@ -133,7 +133,7 @@ def subtract_point_terms(
 
     Args:
         rows: `OrderedObservations.by_landmark`.
-        place: `OrderedObservations.unknown_place`.
+        unknown_index: `OrderedObservations.unknown_index`.
         couplings: those of poses and landmarks, as stated and from `reduced_couplings`.
         reduced: the equations after the offsets are eliminated.
         offset: offsets of the rows of the envelope.
@@ -143,9 +143,9 @@ def subtract_point_terms(
     by_landmark, by_track = np.empty((3, 3)), np.empty((3, 3))  # H K A, and H (K A K' + G)
     for j in range(len(starts) - 1):
         for t in range(first_track[j], first_track[j + 1]):
-            own = track_starts[t]
-            for i in range(own, track_starts[t + 1]):
-                if place[i] < 0:
+            t0 = track_starts[t]
+            for i in range(t0, track_starts[t + 1]):
+                if unknown_index[i] < 0:
                     continue
                 A, G = reduced.landmark_m2, reduced.own_m2
                 for r in range(3):
@@ -163,9 +163,11 @@ def subtract_point_terms(
                             + by_landmark[r, 1] * B[t, 1, q]
                             + by_landmark[r, 2] * B[t, 2, q]
                         )
-                _subtract_rows(by_landmark, starts[j], own, i, place, coupling_left, offset, S)
-                _subtract_rows(by_track, own, i, i, place, coupling, offset, S)
-                row = 3 * place[i]
+                _subtract_rows(
+                    by_landmark, starts[j], t0, i, unknown_index, coupling_left, offset, S
+                )
+                _subtract_rows(by_track, t0, i, i, unknown_index, coupling, offset, S)
+                row = 3 * unknown_index[i]
                 for q in range(3):
                     a, b, c = coupling[i, q, 0], coupling[i, q, 1], coupling[i, q, 2]
                     for r in range(3):
@@ -179,7 +181,7 @@ def _subtract_rows(
     begin: int,
     end: int,
     i: int,
-    place: np.ndarray,
+    unknown_index: np.ndarray,
     coupling: Float,
     offset: np.ndarray,
     S: Float,
@@ -188,10 +190,10 @@ def _subtract_rows(
     x00, x01, x02 = X[0, 0], X[0, 1], X[0, 2]  # local, because X and S may overlap for the compiler
     x10, x11, x12 = X[1, 0], X[1, 1], X[1, 2]
     x20, x21, x22 = X[2, 0], X[2, 1], X[2, 2]
-    row = 3 * place[i]
+    row = 3 * unknown_index[i]
     at0, at1, at2 = offset[row], offset[row + 1], offset[row + 2]
     for k in range(begin, end):
-        column = 3 * place[k]
+        column = 3 * unknown_index[k]
         if column < 0:
             continue
         for q in range(3):

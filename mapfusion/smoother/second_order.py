@@ -76,8 +76,8 @@ def second_order_errors(problem: Problem, state: OptimizerState) -> SecondOrder 
     if not state.solution.landmarks_first or len(state.estimate.path) < 2:
         return None
     problem = problem._replace(obs=state.obs)
-    factor, place = state.solution.factor, state.obs.pose_place[1:] - 1
-    covariance = factor.envelope.between(factor.inverse, place, place)
+    factor, index = state.solution.factor, state.obs.pose_index[1:] - 1
+    covariance = factor.envelope.between(factor.inverse, index, index)
 
     # Bound: suppose that every error of the heading shortens its part of the path, and that no
     # observation corrects it. The error b of a pose is then the sum of length * variance / 2. Its
@@ -173,13 +173,13 @@ class _Drawing(NamedTuple):
         obs, at, path_step = self.state.obs, self.at, error.path
         moved = Estimate(*(old + off for old, off in zip(at, error, strict=True)))
         before, after = disturbance_jacobians(at.path)
-        found = disturbances(at.path, self.problem.odometry)
+        disturbance = disturbances(at.path, self.problem.odometry)
         linear = np.einsum("kij,kj->ki", before, path_step[:-1])
         linear += np.einsum("kij,kj->ki", after, path_step[1:])
-        of_motion = disturbances(moved.path, self.problem.odometry) - found - linear
+        of_motion = disturbances(moved.path, self.problem.odometry) - disturbance - linear
         of_motion[:, 2] = wrap(of_motion[:, 2])
         odometry = self.problem.odometry.copy()
-        odometry[1:] += found - of_motion
+        odometry[1:] += disturbance - of_motion
 
         off = error.point_m[obs.landmark] + error.offset_m[obs.track]
         off[:, :2] -= path_step[obs.frame, :2]

@@ -77,9 +77,9 @@ def split_landmarks(
         path: path of the robot, shape (T, 3).
         stray_m: s.
     """
-    made = landmark.copy()
+    split = landmark.copy()
     if not obs.has_offset.any():
-        return made
+        return split
     # points of the tracks from their own observations, and covariances
     pose, R = path[obs.frame], np.zeros((len(obs), 3, 3))
     R[:, :2, :2], R[:, 2, 2] = rotation(pose[:, 2]), 1.0
@@ -105,8 +105,8 @@ def split_landmarks(
         for k in np.setdiff1d(track, keeps):
             mine = rows[track == k]
             free = [row for row in mine.tolist() if row not in names]
-            made[mine] = min(free, default=-1)
-    return made
+            split[mine] = min(free, default=-1)
+    return split
 
 
 def _corners(first: np.ndarray, counts: np.ndarray, pairs: np.ndarray) -> np.ndarray:
@@ -149,11 +149,11 @@ def _inconsistent_pairs(
     before = np.arange(len(point)) - begin  # tracks of the same landmark before each
     part = np.cumsum(before) // _PAIRS_AT_ONCE
     S, off = (np.ascontiguousarray(values.T) for values in (covariance, point))
-    found = []
-    for own in np.split(np.arange(len(point)), np.flatnonzero(np.diff(part)) + 1):
-        n = before[own]
-        i = np.repeat(own, n)
-        j = np.arange(len(i)) - np.repeat(np.cumsum(n) - n - begin[own], n)
+    pairs = []
+    for rows in np.split(np.arange(len(point)), np.flatnonzero(np.diff(part)) + 1):
+        n = before[rows]
+        i = np.repeat(rows, n)
+        j = np.arange(len(i)) - np.repeat(np.cumsum(n) - n - begin[rows], n)
         # squared Mahalanobis distances from S = L D L'; 0 for singular S
         sums, differences = S[..., i] + S[..., j], off[..., i] - off[..., j]
         total, regular = np.zeros(sums.shape[-1]), np.ones(sums.shape[-1], dtype=bool)
@@ -166,8 +166,8 @@ def _inconsistent_pairs(
             differences[r + 1 :] -= share * differences[r]
             sums[r + 1 :, r + 1 :] -= share[:, None] * sums[r, r + 1 :]
         apart = np.where(regular, total, 0.0) > bound
-        found.append(np.stack([i[apart], j[apart]]))
-    return np.concatenate(found, axis=1)
+        pairs.append(np.stack([i[apart], j[apart]]))
+    return np.concatenate(pairs, axis=1)
 
 
 # Factor on the observations' standard deviations in a first round (graduated non-convexity). With a
@@ -213,8 +213,8 @@ class SmootherParameters:
     @property
     def has_own_odometry(self) -> bool:
         """True if some odometry is independent, so that its noise can be estimated."""
-        known = self.odometry_covariance
-        return known is None or bool(np.isnan(known).any())
+        covariance = self.odometry_covariance
+        return covariance is None or bool(np.isnan(covariance).any())
 
     def odometry_information(self, log: RobotLog, path: Float | None = None) -> Float:
         """Return the inverse variances of the increments after the first, shape (T - 1, 3).
@@ -358,28 +358,28 @@ def smooth(
     """
     require_shape("path", path, (len(log), 3))
     information, path = parameters.odometry_information(log), between(path[0], path)
-    known = _problem(log, landmark, parameters, information)
-    require_memory(known.obs, max_memory_gb)
-    start, n_steps = _robust_start(known, path)
+    problem = _problem(log, landmark, parameters, information)
+    require_memory(problem.obs, max_memory_gb)
+    start, n_steps = _robust_start(problem, path)
     path = start[0].path
-    parts = split_landmarks(known.obs, landmark, path, parameters.stray_m)
+    parts = split_landmarks(problem.obs, landmark, path, parameters.stray_m)
     if not np.array_equal(parts, landmark):
-        known = _problem(log, parts, parameters, information)
-        start = update_points_and_weights(known, _start(known, path))
+        problem = _problem(log, parts, parameters, information)
+        start = update_points_and_weights(problem, _start(problem, path))
     if parameters.has_own_odometry:
-        state, scales = optimize_with_noise(known, *start)
+        state, scales = optimize_with_noise(problem, *start)
         if scales.odometry.max() > _LARGE_SCALE:
             used = scaled_information(information, scales.odometry)
             information = parameters.odometry_information(log, state.estimate.path)
-            known = known._replace(information=information)
+            problem = problem._replace(information=information)
             first_scales = np.mean(1 / used, axis=0) / np.mean(1 / information, axis=0)
             start, n_steps = (state.estimate, state.weights, state.tails), n_steps + state.n_steps
             del state  # frees the memory of its factors
-            state, scales = optimize_with_noise(known, *start, first_scales)
+            state, scales = optimize_with_noise(problem, *start, first_scales)
     else:  # the noise of visual odometry is not estimated
         at, weights, tails = start
-        state, scales = optimize(known, at, weights=weights, tails=tails), UNIT_SCALES
-    return Smoothed.of(known, state, parts, scales, n_steps)
+        state, scales = optimize(problem, at, weights=weights, tails=tails), UNIT_SCALES
+    return Smoothed.of(problem, state, parts, scales, n_steps)
 
 
 def _robust_start(problem: Problem, path: Float) -> tuple[tuple[Estimate, Weights, Tails], int]:
@@ -437,7 +437,7 @@ def smoothed_map(
     source = landmark[obs.row[obs.starts[:-1]]].astype(np.int64)
     source_observation = log.observations[source]
     count = np.diff(obs.starts).astype(np.int32)
-    about = (
+    attributes = (
         count,
         source,
         source_observation.descriptor,
@@ -449,7 +449,7 @@ def smoothed_map(
     viewing = viewing_of_log(*seen, landmark, smoothed.estimate.path, source)
     kind = source_observation.descriptor_kind
     more = joint, viewing, log.calibration
-    return LandmarkMap(point, joint.marginal_m2, *about, *more, descriptor_kind=kind)
+    return LandmarkMap(point, joint.marginal_m2, *attributes, *more, descriptor_kind=kind)
 
 
 def with_path_errors(
@@ -471,18 +471,18 @@ def with_path_errors(
     assert smoothed.joint is not None
     order = np.argsort(smoothed.source_observation, kind="stable")
     sources = smoothed.source_observation[order]
-    place = np.searchsorted(sources, filtered.source_observation) % max(len(sources), 1)
-    known = np.flatnonzero(sources[place] == filtered.source_observation) if len(sources) else []
-    if not len(known):
+    index = np.searchsorted(sources, filtered.source_observation) % max(len(sources), 1)
+    in_both = np.flatnonzero(sources[index] == filtered.source_observation) if len(sources) else []
+    if not len(in_both):
         return filtered
-    twin = order[place[known]]
-    difference_m = filtered.position_m[known] - smoothed.position_m[twin]
+    twin = order[index[in_both]]
+    difference_m = filtered.position_m[in_both] - smoothed.position_m[twin]
     shared = np.concatenate([smoothed.joint.common_m[twin], difference_m[:, None]], axis=1)
-    tree = scipy.spatial.KDTree(filtered.position_m[known, :2])
+    tree = scipy.spatial.KDTree(filtered.position_m[in_both, :2])
     nearest = tree.query(filtered.position_m[:, :2])[1]
-    nearest[known] = np.arange(len(known))
+    nearest[in_both] = np.arange(len(in_both))
     own_m2 = filtered.covariance_m2.copy()
-    own_m2[known] = smoothed.joint.own_m2[twin]
+    own_m2[in_both] = smoothed.joint.own_m2[twin]
     return replace(filtered, joint=JointCovariance(own_m2, shared[nearest], complete))
 
 

@@ -265,19 +265,19 @@ def fewest_false_alarms(
         k = 0
         for i in range(n):
             if distance[i] <= gate_m:
-                place, rows[k] = k, i
+                position, rows[k] = k, i
                 if k >= _CANDIDATES:
-                    place = _CANDIDATES - 1
-                    if distance[rows[place]] > distance[i]:
-                        rows[k] = rows[place]
+                    position = _CANDIDATES - 1
+                    if distance[rows[position]] > distance[i]:
+                        rows[k] = rows[position]
                     else:
-                        place = -1
+                        position = -1
                 k += 1
-                while place > 0 and distance[rows[place - 1]] > distance[i]:
-                    rows[place] = rows[place - 1]
-                    place -= 1
-                if place >= 0:
-                    rows[place] = i
+                while position > 0 and distance[rows[position - 1]] > distance[i]:
+                    rows[position] = rows[position - 1]
+                    position -= 1
+                if position >= 0:
+                    rows[position] = i
         supporters = rows[:k]
         if len(supporters) < MIN_PAIRS:
             continue
@@ -473,13 +473,13 @@ class ChanceTest:
             return Verdict(alignment.status, math.nan, alignment.reason)
         what = "independent correspondences"
         if isinstance(self.pairs, IndependentPairs):
-            found = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
+            result = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
         elif isinstance(self.pairs, tuple):
-            found = named_false_alarms(*self.pairs, alignment.T_a_b, self.gates_m)
+            result = named_false_alarms(*self.pairs, alignment.T_a_b, self.gates_m)
         else:
-            found = self.pairs.fewest_false_alarms(alignment.T_a_b, self.gates_m)
+            result = self.pairs.fewest_false_alarms(alignment.T_a_b, self.gates_m)
             what = "landmarks"
-        log10, gate_m, n, k = found
+        log10, gate_m, n, k = result
         if log10 <= math.log10(self.false_alarms):
             return Verdict(Status.ACCEPTED, log10)
         if n < MIN_PAIRS:

@@ -140,7 +140,7 @@ def mark_matched(
     _, z_own, z2_own, descriptor_own = own
     near, z_other, z2_other, descriptor_other = other
     at, row_of, distance_m = near.p, near.row, gates.distance_m
-    found = np.zeros(len(rows), np.bool_)
+    is_matched = np.zeros(len(rows), np.bool_)
     runs = np.empty((near.shape[1], 2), np.int64)
     most, floor_m2, unlike2 = gates.height_bound, gates.height_floor_m2, gates.unlike**2
     for m in range(len(rows)):
@@ -161,11 +161,11 @@ def mark_matched(
                     if square > unlike2:
                         break
                 if square <= unlike2:
-                    found[m] = True
+                    is_matched[m] = True
                     break
-            if found[m]:
+            if is_matched[m]:
                 break
-    return found
+    return is_matched
 
 
 LEAST_EXPECTED = 5  # landmarks of a region; regions with fewer are not evaluated
@@ -415,8 +415,10 @@ class ViewedMapPair:
         key = own is self.a, T.tobytes()
         if key not in self._found:
             p = own.transformed(T)
-            found = mark_matched(p, np.arange(len(p)), own.described, other.described, self._gates)
-            self._found[key] = found
+            is_matched = mark_matched(
+                p, np.arange(len(p)), own.described, other.described, self._gates
+            )
+            self._found[key] = is_matched
         return mark_repeated(self._found[key], own.n_near, own.described.near)
 
     def _expected(
@@ -436,6 +438,8 @@ class ViewedMapPair:
             self._how[key] = how
         how, known = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
-        looks = own.described, other.described
-        found = mark_matched(p, rows, *looks, self._gates) if known is None else known[rows]
-        return _Expected(rows, how[rows], found, copied[rows]), p
+        described = own.described, other.described
+        is_matched = (
+            mark_matched(p, rows, *described, self._gates) if known is None else known[rows]
+        )
+        return _Expected(rows, how[rows], is_matched, copied[rows]), p

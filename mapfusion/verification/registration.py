@@ -325,8 +325,8 @@ def _motion_of_copies(pairs: Pairs, T_a_b: Float) -> Float:
     are equal in both maps. The other pairs displace the motion of all pairs by more than that.
     """
     some = pairs[np.arange(0, len(pairs), -(-len(pairs) // _MOST_COPIES))]
-    own = residual_covariances(T_a_b, some.covariance_a, some.covariance_b)
-    variance = np.trace(own, axis1=1, axis2=2) / 2
+    residual_covariance = residual_covariances(T_a_b, some.covariance_a, some.covariance_b)
+    variance = np.trace(residual_covariance, axis1=1, axis2=2) / 2
     apart_a, apart_b = (
         np.linalg.norm(p[:, None, :2] - p[None, :, :2], axis=2) for p in (some.p_a, some.p_b)
     )
@@ -354,14 +354,14 @@ def shared_observations(pairs: Pairs, alignment: Alignment) -> str:
     # bits that do not differ may be those of another observation
     if a is not None and b is not None and kind is not None and kind.metric != "hamming":
         copied |= np.all(a[used.index_a] == b[used.index_b], axis=1)
-    n, of = int(np.count_nonzero(copied)), len(used)
+    n, n_all = int(np.count_nonzero(copied)), len(used)
     if n < MIN_PAIRS:
         return ""
     names = f"{pairs.map_a.name} and {pairs.map_b.name}"
-    if coincide.all() and of == len(pairs.map_a) == len(pairs.map_b):
+    if coincide.all() and n_all == len(pairs.map_a) == len(pairs.map_b):
         return f"{names} are the same map: a fusion adds nothing, and its covariances are too small"
     return (
-        f"{n} of {of} pairs are the same observations in {names}: the maps are not independent, "
+        f"{n} of {n_all} pairs are the same observations in {names}: the maps are not independent, "
         "and fused covariances are too small"
     )
 
@@ -378,5 +378,5 @@ def supported_by(
         started_s: `time.perf_counter()` at the start.
         refusal: reason to reject the estimate; empty for none.
     """
-    found = supported(pairs, inlier, T_a_b, refusal)
-    return alignment_of_fit(found, pairs, np.arange(len(pairs)), started_s)
+    motion = supported(pairs, inlier, T_a_b, refusal)
+    return alignment_of_fit(motion, pairs, np.arange(len(pairs)), started_s)

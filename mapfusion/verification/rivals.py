@@ -169,23 +169,23 @@ def distinct_motions(
 
     Each motion is refined on all pairs and tested against chance.
     """
-    found: list[SupportedMotion] = []
+    motions: list[SupportedMotion] = []
     chance, method = acceptance.on(pairs), Clique()
     p_a, p_b = pairs.p_a[:, :2], pairs.p_b[:, :2]
     rows, widest_m = np.arange(len(pairs)), max(acceptance.gates_m)
     tries = 2 * most  # refinement may move a motion onto an earlier one
-    while len(rows) >= _LEAST_PAIRS and len(found) < most and tries > 0:
+    while len(rows) >= _LEAST_PAIRS and len(motions) < most and tries > 0:
         tries -= 1
         fit = method.find(pairs[rows], np.random.default_rng(0))  # the method is deterministic
         if isinstance(fit, Undetermined) or np.count_nonzero(fit.inlier) < MIN_PAIRS:
             break
         refined = refinement.refine(pairs, fit.T_a_b)
         T = refined.T_a_b if np.isfinite(refined.T_a_b).all() else fit.T_a_b
-        if not any(rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M for each in found):
+        if not any(rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M for each in motions):
             log10 = chance.verify(refined).log10_false_alarms
-            found.append(SupportedMotion(T, log10, _within(T, p_a, p_b, widest_m)))
+            motions.append(SupportedMotion(T, log10, _within(T, p_a, p_b, widest_m)))
         rows = rows[~(fit.inlier | _within(fit.T_a_b, p_a[rows], p_b[rows], widest_m))]
-    return found
+    return motions
 
 
 def mirror_image_motion(
@@ -197,22 +197,24 @@ def mirror_image_motion(
     supporters are places in the plane of map b, shape (K, 2). Returns None if there is no motion.
     """
     flip = np.array([1.0, -1.0, 1.0])
-    own = pairs.map_b
+    map_b = pairs.map_b
     image = LandmarkMap(
-        own.position_m * flip,
-        own.covariance_m2 * np.outer(flip, flip),
-        own.count,
-        own.source_observation,
-        own.descriptor,
-        own.label,
-        own.planar,
-        own.name,
-        size_m=own.size_m,
-        category=own.category,
-        descriptor_kind=own.descriptor_kind,
+        map_b.position_m * flip,
+        map_b.covariance_m2 * np.outer(flip, flip),
+        map_b.count,
+        map_b.source_observation,
+        map_b.descriptor,
+        map_b.label,
+        map_b.planar,
+        map_b.name,
+        size_m=map_b.size_m,
+        category=map_b.category,
+        descriptor_kind=map_b.descriptor_kind,
     )
-    found = match(pairs.map_a, image, matching) if pairs.by_geometry else pairs.correspondences
-    of_image = Pairs(pairs.map_a, image, found)
+    correspondences = (
+        match(pairs.map_a, image, matching) if pairs.by_geometry else pairs.correspondences
+    )
+    of_image = Pairs(pairs.map_a, image, correspondences)
     motions = distinct_motions(of_image, 1, acceptance, refinement)
     if not motions:
         return None
@@ -224,8 +226,8 @@ def fits_beyond_chance(
 ) -> bool:
     """Return True if a motion has more support than chance gives in any of `n_trials`."""
     bound = math.log10(acceptance.false_alarms / n_trials)
-    found = distinct_motions(pairs, 1, acceptance, refinement)
-    return any(each.log10_false_alarms <= bound for each in found)
+    motions = distinct_motions(pairs, 1, acceptance, refinement)
+    return any(each.log10_false_alarms <= bound for each in motions)
 
 
 def is_mirrored(
@@ -236,8 +238,8 @@ def is_mirrored(
     Maps are mirror images of each other if one of them has y to the right.
     """
     bound = math.log10(acceptance.false_alarms)
-    found = mirror_image_motion(pairs, acceptance, refinement, matching)
-    if found is None or not found[0].log10_false_alarms <= bound:
+    motion = mirror_image_motion(pairs, acceptance, refinement, matching)
+    if motion is None or not motion[0].log10_false_alarms <= bound:
         return False
     return not fits_beyond_chance(pairs, acceptance, refinement)
 
@@ -293,7 +295,7 @@ def self_motions(
     """Return the similar landmarks of a map and the motions that map parts onto similar parts."""
     pairs = Pairs(landmarks, landmarks, similar_landmarks(landmarks))
     back = np.searchsorted(pairs.index_a, pairs.index_b)  # rows ascend, and each pair is both ways
-    found = []
+    motions = []
     for each in distinct_motions(pairs, most, acceptance, refinement):
         # under a motion that is its own inverse both orders of a pair agree: count one of them
         again = each.inlier & each.inlier[back] & (pairs.index_a > pairs.index_b)
@@ -302,8 +304,8 @@ def self_motions(
         if again.any():
             refined = refinement.refine(once, each.T_a_b)
             log10 = acceptance.verify(once, refined).log10_false_alarms
-        found.append(each._replace(log10_false_alarms=log10))
-    return pairs, found
+        motions.append(each._replace(log10_false_alarms=log10))
+    return pairs, motions
 
 
 def explained_landmarks(

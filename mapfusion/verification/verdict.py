@@ -293,8 +293,8 @@ class PairVerifier:
             return None
         if self._known is not None:
             return self._known
-        own = self._settings
-        parts = (own.acceptance, own.refinement, own.evidence)
+        settings = self._settings
+        parts = (settings.acceptance, settings.refinement, settings.evidence)
         return find_evidence(self._pairs, self._viewed_maps, *parts)
 
     def verify(self, alignment: Alignment) -> Verdict:
@@ -302,12 +302,12 @@ class PairVerifier:
         by_chance = self._chance.verify(alignment)
         if not by_chance.accepted:
             return by_chance
-        status, reason, told = Status.ACCEPTED, "", {}
+        status, reason, evidence_values = Status.ACCEPTED, "", {}
         evidence = self.evidence
         if evidence is not None:
             regions = self.regions(alignment, evidence, evidence.region_m)
             log10_evidence = regions.log10_evidence(evidence.shares)
-            told = {"log10_evidence": log10_evidence, "n_confirmed": regions.n_confirmed}
+            evidence_values = {"log10_evidence": log10_evidence, "n_confirmed": regions.n_confirmed}
             # The regions count as evidence for the best other motion beyond chance, since two
             # copies of a texture share the correspondences. Under a wrong motion the likelihood
             # ratio of the regions exceeds 10^r with probability at most 10^-r (Markov), which
@@ -319,7 +319,10 @@ class PairVerifier:
             ]
             rival = max(rivals, key=lambda each: each.log10_evidence, default=None)
             passed = self._log10_ratio_passed(alignment, regions, evidence, rival)
-            told |= {"n_contradicted": regions.n_contradicted, "log10_ratio_passed": passed}
+            evidence_values |= {
+                "n_contradicted": regions.n_contradicted,
+                "log10_ratio_passed": passed,
+            }
             # a contradiction counts even together with the region that led to the alignment
             settings = self._settings.evidence
             counts = f"{regions.n_confirmed} of {len(regions)} regions that both must have seen"
@@ -345,7 +348,7 @@ class PairVerifier:
             status, reason = Status.TOO_UNCERTAIN, unsure
         if status is Status.ACCEPTED and (note := self._residual_note(alignment)):
             reason = "; ".join(filter(None, (reason, note)))
-        return Verdict(status, by_chance.log10_false_alarms, reason, **told)
+        return Verdict(status, by_chance.log10_false_alarms, reason, **evidence_values)
 
     def rivals_of(self, alignment: Alignment) -> list[Alignment]:
         """Return the other motions that the maps support, refined, with the status ambiguous.
@@ -362,16 +365,18 @@ class PairVerifier:
     @cached_property
     def _motions_beyond_chance(self) -> tuple[list[Float], list[Float], list[Float]]:
         """Motions beyond chance between the maps, of a onto itself and of b onto itself."""
-        own, pairs = self._settings, self._pairs
+        settings, pairs = self._settings, self._pairs
         if pairs.by_name:
             return [], [], []
-        between = distinct_motions(pairs, N_RIVALS, own.acceptance, own.refinement)
-        found = [between]
+        between = distinct_motions(pairs, N_RIVALS, settings.acceptance, settings.refinement)
+        motions_by_kind = [between]
         for landmarks in (pairs.map_a, pairs.map_b):
-            parts = (N_SELF_MOTIONS, own.acceptance, own.refinement)
-            found.append(self_motions(landmarks, *parts)[1])
-        known = [[m.T_a_b for m in of if m.log10_false_alarms <= self._bound] for of in found]
-        return known[0], known[1], known[2]
+            parts = (N_SELF_MOTIONS, settings.acceptance, settings.refinement)
+            motions_by_kind.append(self_motions(landmarks, *parts)[1])
+        significant_motions = [
+            [m.T_a_b for m in of if m.log10_false_alarms <= self._bound] for of in motions_by_kind
+        ]
+        return significant_motions[0], significant_motions[1], significant_motions[2]
 
     def _other_motions(self, T_a_b: Float) -> list[Float]:
         """Return the motions of maps without evidence that may be right in place of a motion.
@@ -402,22 +407,24 @@ class PairVerifier:
         by_own = explained_landmarks(*maps, alignment.T_a_b, gate_m)
         for T_a_b in self._other_motions(alignment.T_a_b):
             by_rival = explained_landmarks(*maps, T_a_b, gate_m)
-            own, its = (int(np.count_nonzero(m)) for m in (by_own & ~by_rival, by_rival & ~by_own))
-            if scipy.special.bdtrc(own - 1, own + its, 0.5) > _EQUAL:  # P(X >= own)
-                of, of_rival = (int(np.count_nonzero(m)) for m in (by_own, by_rival))
+            wins, losses = (
+                int(np.count_nonzero(m)) for m in (by_own & ~by_rival, by_rival & ~by_own)
+            )
+            if scipy.special.bdtrc(wins - 1, wins + losses, 0.5) > _EQUAL:  # P(X >= wins)
+                n_own, n_rival = (int(np.count_nonzero(m)) for m in (by_own, by_rival))
                 return (
-                    f"{self._motion_text(alignment.T_a_b)} explains {of} landmarks of map "
-                    f"{maps[1].name}, {self._motion_text(T_a_b)} explains {of_rival}"
+                    f"{self._motion_text(alignment.T_a_b)} explains {n_own} landmarks of map "
+                    f"{maps[1].name}, {self._motion_text(T_a_b)} explains {n_rival}"
                 )
         return ""
 
     @cached_property
     def _mirror_image_motion(self) -> tuple[SupportedMotion, Float] | None:
         """Best motion of the mirror image of map b and its supporters, found at first use."""
-        own, tolerance = self._settings, self._pairs.correspondences.size_tolerance
+        settings, tolerance = self._settings, self._pairs.correspondences.size_tolerance
         usual = MatchParameters()
         matching = usual if tolerance is None else replace(usual, size_tolerance=tolerance)
-        return mirror_image_motion(self._pairs, own.acceptance, own.refinement, matching)
+        return mirror_image_motion(self._pairs, settings.acceptance, settings.refinement, matching)
 
     def _equal_mirror_image(self, alignment: Alignment, log10_false_alarms: float) -> str:
         """Say that the mirror image of map b fits as well as an alignment; empty if it does not.
@@ -600,14 +607,18 @@ class PairVerifier:
             # Landmarks with labels fall on each other however far the starts of both maps are off.
             # They are few and far apart, so that their drift is independent.
             T_a_b, drift_m2 = alignment.T_a_b, alignment.drift_sigma_m**2 * np.eye(2)
-            own = residual_covariances(T_a_b, used.covariance_a, used.covariance_b)
-            stated = motion_covariance(least_squares_gain(T_a_b, used.p_b), own + drift_m2)
+            residual_covariance = residual_covariances(T_a_b, used.covariance_a, used.covariance_b)
+            stated = motion_covariance(
+                least_squares_gain(T_a_b, used.p_b), residual_covariance + drift_m2
+            )
         p_b = self._pairs.map_b.position_m[:, :2]
         sigma_m, sigma_rad = landmark_sigma_m(alignment.T_a_b, stated, p_b), math.sqrt(stated[2, 2])
         if sigma_m <= settings.max_sigma_m and sigma_rad <= settings.max_sigma_rad:
             return ""
-        found = f"sigma {sigma_m:.2g} m, {sigma_rad:.2g} rad"
-        return f"{found}; {settings.max_sigma_m:g} m, {settings.max_sigma_rad:g} rad are allowed"
+        sigma_text = f"sigma {sigma_m:.2g} m, {sigma_rad:.2g} rad"
+        return (
+            f"{sigma_text}; {settings.max_sigma_m:g} m, {settings.max_sigma_rad:g} rad are allowed"
+        )
 
     def _motion_text(self, T_a_b: Float) -> str:
         (x_m, y_m, theta_rad), _ = self._pairs.given_motion(T_a_b)

@@ -58,16 +58,16 @@ class Gyroscope:
         noise = _NOISE_RAD_PER_SQRT_S**2 * seconds * np.eye(3)
         bias_walk = _BIAS_WALK_RAD_S_PER_SQRT_S**2 * seconds * np.eye(3)
         self.covariance = self.covariance + bias_walk
-        own = noise + seconds**2 * self.covariance
+        rotation_covariance = noise + seconds**2 * self.covariance
         by_gyroscope = Rotation.from_rotvec(rotation - seconds * self.bias)
         if motion is None:
             covariance = np.zeros((6, 6))
-            covariance[:3, :3], covariance[3:, 3:] = LOST_M**2 * np.eye(3), own
+            covariance[:3, :3], covariance[3:, 3:] = LOST_M**2 * np.eye(3), rotation_covariance
             return RigidMotion(se3.pose(by_gyroscope.as_matrix(), np.zeros(3)), covariance, 0)
         T, C = motion.T_before_after, motion.covariance
         visual = Rotation.from_matrix(T[:3, :3])
         innovation = (by_gyroscope * visual.inv()).as_rotvec()  # about the axes before
-        S = C[3:, 3:] + own
+        S = C[3:, 3:] + rotation_covariance
         gain = np.linalg.solve(S, C[3:]).T  # (6, 3)
         step = gain @ innovation
         R = (Rotation.from_rotvec(step[3:]) * visual).as_matrix()
@@ -248,5 +248,9 @@ class AttitudeEstimator:
     def to_level_frame(self, observed: Observations) -> Observations:
         """Transform observations of the last frame to the level frame."""
         T = self._T_robot_observed
-        own = observed if T is None else transform_observations(observed, T[:3, :3], T[:3, 3])
-        return level_observations(own, self._values[-1], np.sqrt(np.diag(self._filter.fresh)))
+        observations = (
+            observed if T is None else transform_observations(observed, T[:3, :3], T[:3, 3])
+        )
+        return level_observations(
+            observations, self._values[-1], np.sqrt(np.diag(self._filter.fresh))
+        )

@@ -85,10 +85,10 @@ def match_depth(
     rows = np.broadcast_to(pixel[inside, 1, None, None] + around[:, None], columns.shape)
     n_pixels = len(around) ** 2
     depth = depth_m[rows, columns].astype(np.float64).reshape(-1, n_pixels)
-    known = np.isfinite(depth) & (depth > 0)
+    is_measured = np.isfinite(depth) & (depth > 0)
     focal_baseline = camera.focal_px * camera.baseline_m
-    disparity = np.where(known, focal_baseline / np.where(known, depth, 1.0), 0.0)
-    place = np.stack(
+    disparity = np.where(is_measured, focal_baseline / np.where(is_measured, depth, 1.0), 0.0)
+    position = np.stack(
         [
             np.ones(columns.shape),
             columns - uv[inside, 0, None, None],
@@ -96,16 +96,16 @@ def match_depth(
         ],
         -1,
     )
-    place = place.reshape(-1, n_pixels, 3)
-    enough = np.count_nonzero(known, axis=1) >= (1 - parameters.most_missing) * n_pixels
+    position = position.reshape(-1, n_pixels, 3)
+    enough = np.count_nonzero(is_measured, axis=1) >= (1 - parameters.most_missing) * n_pixels
     status[inside[~enough]] = MatchStatus.MISSING
 
     # Least squares of a plane, and the largest deviation from it.
-    kept, known = inside[enough], known[enough]
-    place, disparity = place[enough] * known[:, :, None], disparity[enough]
-    normal = np.swapaxes(place, 1, 2) @ place
-    plane = np.linalg.solve(normal, np.swapaxes(place, 1, 2) @ disparity[:, :, None])[:, :, 0]
-    off = np.abs(np.einsum("nkj,nj->nk", place, plane) - disparity).max(axis=1, initial=0.0)
+    kept, is_measured = inside[enough], is_measured[enough]
+    position, disparity = position[enough] * is_measured[:, :, None], disparity[enough]
+    normal = np.swapaxes(position, 1, 2) @ position
+    plane = np.linalg.solve(normal, np.swapaxes(position, 1, 2) @ disparity[:, :, None])[:, :, 0]
+    off = np.abs(np.einsum("nkj,nj->nk", position, plane) - disparity).max(axis=1, initial=0.0)
     sigma_px = focal_baseline * parameters.sigma_per_m
     each = parameters.probability ** (1 / n_pixels)  # of the pixels, if independent
     one_plane = off <= np.sqrt(chi_square_bound(each, 1)) * sigma_px

@@ -86,8 +86,8 @@ class Sift:
             keypoints.append(cv2.KeyPoint(u, v, size, 0.0, 1.0, octave | layer << 8, k))
         if not keypoints:
             return np.empty((0, self._sift.descriptorSize()), np.float32)
-        kept, found = self._sift.compute(image, keypoints)
-        return _in_order(kept, found, len(keypoints))
+        kept, computed = self._sift.compute(image, keypoints)
+        return _in_order(kept, computed, len(keypoints))
 
 
 _ORB_SIDE_PX = 31  # of the patch
@@ -105,7 +105,7 @@ class Orb:
 
     def describe(self, image: np.ndarray, uv_px: Float, scale_px: Float) -> np.ndarray:
         """Compute descriptors in copies of the image in which the windows have the patch's size."""
-        found = np.zeros((len(uv_px), self._orb.descriptorSize()), np.uint8)
+        descriptors = np.zeros((len(uv_px), self._orb.descriptorSize()), np.uint8)
         zoom = np.log(surf.SAMPLES * np.asarray(scale_px) / _ORB_SIDE_PX) / math.log(_ORB_STEP)
         level = np.rint(zoom).astype(np.int64)
         for each in np.unique(level).tolist():
@@ -122,9 +122,9 @@ class Orb:
                 cv2.KeyPoint(u, v, _ORB_SIDE_PX, 0.0, 1.0, 0, k)
                 for k, (u, v) in enumerate(at.tolist())
             ]
-            kept, own = self._orb.compute(padded, keypoints)
-            found[rows] = _in_order(kept, own, len(rows))
-        return found
+            kept, computed = self._orb.compute(padded, keypoints)
+            descriptors[rows] = _in_order(kept, computed, len(rows))
+        return descriptors
 
 
 def _in_order(kept: Any, found: np.ndarray, n: int) -> np.ndarray:
@@ -194,24 +194,30 @@ class NamedDescriber:
         """
         n, name, metric = len(uv_px), self._name, self._made.metric
         try:
-            found = self._made.describe(image, uv_px, scale_px)
+            descriptors = self._made.describe(image, uv_px, scale_px)
         except Exception as error:
             if name in DESCRIBERS:  # an error of our own
                 raise
-            told = one_line(f"{type(error).__name__}: {error}")
-            raise InputError(f"descriptor {name}: raised {told}") from error
+            message = one_line(f"{type(error).__name__}: {error}")
+            raise InputError(f"descriptor {name}: raised {message}") from error
         if name == USURF.name:
-            return found, USURF
+            return descriptors, USURF
         packed, number = metric == "hamming", "uint8" if metric == "hamming" else "float32"
-        is_array = isinstance(found, np.ndarray) and found.ndim == 2 and len(found) == n
-        if not is_array or found.shape[1] < 1 or found.dtype != number:
-            got = f"{found.dtype} {found.shape}" if isinstance(found, np.ndarray) else type(found)
+        is_array = (
+            isinstance(descriptors, np.ndarray) and descriptors.ndim == 2 and len(descriptors) == n
+        )
+        if not is_array or descriptors.shape[1] < 1 or descriptors.dtype != number:
+            got = (
+                f"{descriptors.dtype} {descriptors.shape}"
+                if isinstance(descriptors, np.ndarray)
+                else type(descriptors)
+            )
             raise InputError(f"descriptor {name}: gave {got}, expected {number} ({n}, D)")
-        kind = DescriptorKind(metric, found.shape[1] * (8 if packed else 1), self._method)
-        if not np.all(np.isfinite(found)):
+        kind = DescriptorKind(metric, descriptors.shape[1] * (8 if packed else 1), self._method)
+        if not np.all(np.isfinite(descriptors)):
             raise InputError(f"descriptor {name}: gave a number that is not finite")
         try:
-            vectors, kind = as_vectors(found, kind)
+            vectors, kind = as_vectors(descriptors, kind)
         except ValueError as error:
             raise InputError(f"descriptor {name}: {error}") from error
         return vectors, kind

@@ -100,12 +100,12 @@ PLANE_MOMENTS: tuple[Moment, ...] = (
 
 
 @kernel
-def score(sums: Float, place: np.ndarray, normal: Float, right: Float) -> float:
+def score(sums: Float, offsets: np.ndarray, normal: Float, right: Float) -> float:
     """Compute the statistic of the plane test.
 
     Args:
         sums: moments of a window.
-        place: indices of `PLANE_MOMENTS` in `sums`.
+        offsets: indices of `PLANE_MOMENTS` in `sums`.
         normal: work array, shape (COLUMNS, COLUMNS).
         right: work array, shape (COLUMNS,).
 
@@ -117,11 +117,11 @@ def score(sums: Float, place: np.ndarray, normal: Float, right: Float) -> float:
     k = 0
     for i in range(COLUMNS):
         for j in range(i + 1):
-            normal[i, j] = sums[place[k]]
+            normal[i, j] = sums[offsets[k]]
             k += 1
         normal[i, i] = normal[i, i] * (1 + _RIDGE) + _RIDGE
     for i in range(COLUMNS):
-        right[i] = sums[place[k + i]]
+        right[i] = sums[offsets[k + i]]
     against = 0.0
     if cholesky(normal, 0.0):
         solve_lower(normal, right)
@@ -162,21 +162,21 @@ def fails_silhouette_test(
 
 
 @kernel
-def fill_in_halves(sums: Float, place: np.ndarray, squares: Float, n: int) -> None:
+def fill_in_halves(sums: Float, offsets: np.ndarray, squares: Float, n: int) -> None:
     """Fill in the halves of window n, see `window_statistics`; residuals without their mean.
 
-    `place` are the indices of `SILHOUETTE_MOMENTS` in `sums`.
+    `offsets` are the indices of `SILHOUETTE_MOMENTS` in `sums`.
     """
     upper, lower = 2 * _EACH, 3 * _EACH
-    count = sums[place[upper]] + sums[place[lower]]
-    total = sums[place[upper + 1]] + sums[place[lower + 1]]
+    count = sums[offsets[upper]] + sums[offsets[lower]]
+    total = sums[offsets[upper + 1]] + sums[offsets[lower + 1]]
     offset = total / count if count > 0 else 0.0  # brightness offset
     for k in range(4):
         at = k * _EACH
-        pixels, residuals, square = sums[place[at]], sums[place[at + 1]], sums[place[at + 2]]
+        pixels, residuals, square = sums[offsets[at]], sums[offsets[at + 1]], sums[offsets[at + 2]]
         squares[n, k, 0] = pixels
         squares[n, k, 1] = square + pixels * offset**2 - 2 * offset * residuals
-        squares[n, k, 2], squares[n, k, 3] = sums[place[at + 3]], sums[place[at + 4]]
+        squares[n, k, 2], squares[n, k, 3] = sums[offsets[at + 3]], sums[offsets[at + 4]]
 
 
 _MOMENTS = (PLANE_MOMENTS, SILHOUETTE_MOMENTS, (moment(ONE), moment(GG), moment(HH)))

@@ -50,8 +50,8 @@ class NoiseModel:
 
     def square(self, slopes: Float) -> Float:
         """Return the expected mean squares (N,) of residuals for squared slopes (N, 2)."""
-        own = np.array([self.misfit_px**2, self.rows_px**2])
-        return 2 * self.noise_grey**2 + slopes @ own
+        squares = np.array([self.misfit_px**2, self.rows_px**2])
+        return 2 * self.noise_grey**2 + slopes @ squares
 
 
 def estimate_noise(

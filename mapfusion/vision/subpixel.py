@@ -110,10 +110,10 @@ def fill_residuals(
         start, at = u - d - b * y, np.uintp((y + half) * side)
         for i in range(side):
             x = float(i - half)
-            place = start + x - a * x
-            column = min(max(np.int32(place) - np.int32(1), np.int32(0)), highest)
+            u_right = start + x - a * x
+            column = min(max(np.int32(u_right) - np.int32(1), np.int32(0)), highest)
             levels[_COLUMN, at + np.uintp(i)] = column
-            share[at + np.uintp(i)] = place - float(column + np.int32(1))
+            share[at + np.uintp(i)] = u_right - float(column + np.int32(1))
     # Grey levels of the four columns around each position.
     for y in range(-half, half + 1):
         row, at = np.uintp(min(max(v + y, 0), len(right) - 1)), np.uintp((y + half) * side)

@@ -100,10 +100,19 @@ def describe(image: np.ndarray, uv_px: Float, scale_px: Float) -> np.ndarray:
 
 @kernel
 def _describe(integral: np.ndarray, uv: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return the descriptors (N, 64) by the integral image (H + 1, W + 1)."""
+    """Compute the descriptors of keypoints from the integral image.
+
+    Args:
+        integral: integral image, shape (H + 1, W + 1) int32.
+        uv: keypoints in px, shape (N, 2).
+        scale: scale of each keypoint in px, shape (N,).
+
+    Returns:
+        Descriptors of unit length, shape (N, 64) float32; zero where the window is flat.
+    """
     descriptor = np.empty((len(uv), LENGTH), np.float32)
     node, sums = np.empty((NODES, NODES)), np.empty((4, SAMPLES))
-    column, fraction = np.empty(NODES, np.int64), np.empty(NODES)
+    column, fraction_u = np.empty(NODES, np.int64), np.empty(NODES)
     for n in range(len(uv)):
         # Interpolate the integral image at the wavelets' corners.
         u = uv[n, 0]
@@ -115,18 +124,18 @@ def _describe(integral: np.ndarray, uv: np.ndarray, scale: np.ndarray) -> np.nda
             # the integral image counts from the pixel's corner
             x = u + 0.5 + (j - middle) * own_scale
             column[j] = min(max(int(np.floor(x)), 0), width - 1)
-            fraction[j] = x - column[j]
+            fraction_u[j] = x - column[j]
         for i in range(NODES):
             y = v + 0.5 + (i - middle) * own_scale
             row = min(max(int(np.floor(y)), 0), height - 1)
-            below = y - row
+            fraction_v = y - row
             for j in range(NODES):
                 x = column[j]
                 top_left, top_right = integral[row, x], integral[row, x + 1]
                 low_left, low_right = integral[row + 1, x], integral[row + 1, x + 1]
-                top = top_left + fraction[j] * (top_right - top_left)
-                low = low_left + fraction[j] * (low_right - low_left)
-                node[i, j] = top + below * (low - top)
+                top = top_left + fraction_u[j] * (top_right - top_left)
+                low = low_left + fraction_u[j] * (low_right - low_left)
+                node[i, j] = top + fraction_v * (low - top)
         norm_squared = 0.0
         for cell_row in range(CELLS):
             # Column sums of weighted dx, dy, |dx|, |dy| over the sample rows of a row of cells.
@@ -137,10 +146,12 @@ def _describe(integral: np.ndarray, uv: np.ndarray, scale: np.ndarray) -> np.nda
                     left = node[i + 2, j] - node[i, j]
                     centre = node[i + 2, j + 1] - node[i, j + 1]
                     right = node[i + 2, j + 2] - node[i, j + 2]
-                    bend_left = node[i, j] - 2.0 * node[i + 1, j] + node[i + 2, j]
-                    bend_right = node[i, j + 2] - 2.0 * node[i + 1, j + 2] + node[i + 2, j + 2]
+                    second_difference_left = node[i, j] - 2.0 * node[i + 1, j] + node[i + 2, j]
+                    second_difference_right = (
+                        node[i, j + 2] - 2.0 * node[i + 1, j + 2] + node[i + 2, j + 2]
+                    )
                     dx = _WEIGHTS[i, j] * (left - 2.0 * centre + right)
-                    dy = _WEIGHTS[i, j] * (bend_right - bend_left)
+                    dy = _WEIGHTS[i, j] * (second_difference_right - second_difference_left)
                     sums[0, j] += dx
                     sums[1, j] += dy
                     sums[2, j] += abs(dx)

@@ -171,9 +171,9 @@ def follow_points(
     new.uv_px[kept], new.disparity_px[kept] = uv[fits], disparity[fits]
     new.warp[kept], new.first_px[kept] = warp[fits, :, :2], first[fits]
     new.template[kept] = template[fits]
-    found = np.zeros(len(after), dtype=bool)
-    found[kept] = True
-    return new, found
+    is_found = np.zeros(len(after), dtype=bool)
+    is_found[kept] = True
+    return new, is_found
 
 
 def projective_terms(first_px: Float, disparity_px: Float) -> Float:
@@ -325,8 +325,8 @@ class Tracker:
                 turned = self._camera.rotate_pixels(before.uv_px, R_after_before)
                 expected = replace(before, uv_px=turned)
             source = link(expected, features, self.parameters, steps)
-            points, found = follow_points(points_before, before, features, source)
-            source[~found] = _NO_MATCH
+            points, is_found = follow_points(points_before, before, features, source)
+            source[~is_found] = _NO_MATCH
 
             # Remove links that contradict the rigid motion; their features stand for the corners.
             rows = np.flatnonzero(source != _NO_MATCH)

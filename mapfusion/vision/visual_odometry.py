@@ -102,16 +102,16 @@ def estimate_rigid_motion(
     points = (p_before_m, covariance_before_m2, p_after_m, covariance_after_m2)
     agree, T, square, normal = _fit_motions(start, *points, gate)
     best = int(np.argmax(agree.sum(axis=1)))
-    own = agree[best]
-    n_links = int(own.sum())
+    best_links = agree[best]
+    n_links = int(best_links.sum())
     if n_links < MIN_LINKS:
-        return own, None
+        return best_links, None
     # The gate lowers the median of the squared Mahalanobis distances by less than one percent.
-    ranked = np.sort(square[best][own])
+    ranked = np.sort(square[best][best_links])
     median = (ranked[(n_links - 1) // 2] + ranked[n_links // 2]) / 2
     excess = max(median / chi_square_bound(0.5, 3), 1.0)
     covariance = excess * np.linalg.inv(normal[best])
-    return own, RigidMotion(T[best], (covariance + covariance.T) / 2, n_links)
+    return best_links, RigidMotion(T[best], (covariance + covariance.T) / 2, n_links)
 
 
 def initial_subsets(p_before_m: Float) -> np.ndarray:
@@ -254,9 +254,9 @@ def _information_matrices(
             before[1, 2] + dx * g + dy * h + dz * i,
             before[2, 2] + variance + gx * g + gy * h + gz * i,
         )
-        own, scale = information[j], 1 / determinant
-        own[0], own[1], own[2] = scale * axx, scale * axy, scale * axz
-        own[3], own[4], own[5] = scale * ayy, scale * ayz, scale * azz
+        entries, scale = information[j], 1 / determinant
+        entries[0], entries[1], entries[2] = scale * axx, scale * axy, scale * axz
+        entries[3], entries[4], entries[5] = scale * ayy, scale * ayz, scale * azz
 
 
 @kernel(error_model="numpy")
@@ -323,15 +323,15 @@ def visual_odometry(
     by_robot = robot_motions(motions, camera, T_robot_camera)
     speed, widest = np.zeros(3), _FIRST_STEP  # per usual frame interval
     for k in range(1, n):
-        own = by_robot[k]
-        if own is None:
+        visual_motion = by_robot[k]
+        if visual_motion is None:
             increments[k] = steps[k] * speed
             covariance[k] = np.diag((np.abs(increments[k]) + steps[k] * widest) ** 2)
         else:
             level = np.eye(3) if attitude is None else se3.tilt(*attitude.value[k - 1, :2])
-            increments[k] = se3.planar(se3.pose(level, np.zeros(3)) @ own.T_before_after)
+            increments[k] = se3.planar(se3.pose(level, np.zeros(3)) @ visual_motion.T_before_after)
             turned = np.kron(np.eye(2), level)
-            covariance[k] = (turned @ own.covariance @ turned.T)[np.ix_(_PLANE, _PLANE)]
+            covariance[k] = (turned @ visual_motion.covariance @ turned.T)[np.ix_(_PLANE, _PLANE)]
             speed = increments[k] / steps[k]
             widest = np.maximum(widest, np.abs(speed))
     return VisualOdometry(increments, covariance, guessed)

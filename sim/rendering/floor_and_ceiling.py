@@ -19,14 +19,14 @@ from sim.rendering.walls import Pinhole, at_origin
 BACKGROUND = 255.0  # grey level of the background in PyBullet
 MOST_SAMPLES = 64  # most samples along a footprint
 STEP_TEXELS = 2.0  # distance between samples; textures have a low pass of one texel
-# Fixed-point numbers, which halve the time of loops: positions in 2^-22 cells, shares of a cell in
-# 2^-8, sums in 2^-16 grey levels. Sums of 2 x MOST_SAMPLES values of 255 fit into 32 bits, and so
-# do positions along PIECE pixels of at most two cells each.
-PLACE_BITS, SHARE_BITS, PIECE = 22, 8, 128
-PLACE_UNIT, SUM_UNIT = 1 << PLACE_BITS, 1 << 2 * SHARE_BITS
-MOST_CELLS = 2 * PIECE
-TO_SHARE = np.uint32(PLACE_BITS - SHARE_BITS)
-WHOLE_SHARE, LOW_SHARE = np.uint32(1 << SHARE_BITS), np.uint32((1 << SHARE_BITS) - 1)
+# Fixed-point numbers, which halve the time of loops: positions in 2^-22 cells, fractions of a cell
+# in 2^-8, sums in 2^-16 grey levels. Sums of 2 x MOST_SAMPLES values of 255 fit into 32 bits, and
+# so do positions along a chunk of CHUNK_PX pixels of a row, of at most two cells each.
+POSITION_BITS, FRACTION_BITS, CHUNK_PX = 22, 8, 128
+POSITION_UNIT, SUM_UNIT = 1 << POSITION_BITS, 1 << 2 * FRACTION_BITS
+MOST_CELLS = 2 * CHUNK_PX
+TO_FRACTION = np.uint32(POSITION_BITS - FRACTION_BITS)
+FRACTION_ONE, FRACTION_MASK = np.uint32(1 << FRACTION_BITS), np.uint32((1 << FRACTION_BITS) - 1)
 FIRST_AND_THIRD = np.uint32(0x00FF00FF)  # mask of these bytes of a cell
 BYTE, HALF, LOW_HALF = np.uint32(8), np.uint32(16), np.uint32(0xFFFF)
 
@@ -54,18 +54,18 @@ def _footprints(camera: Pinhole, height_m: float, per_m: float, copies: int) -> 
     """Return `footprints` for a number of texels per metre and of pyramid levels."""
     edges_m = row_depth_m(camera, height_m, np.arange(camera.height_px + 1) - 0.5)
     z = row_depth_m(camera, height_m, np.arange(camera.height_px))
-    seen = np.isfinite(edges_m[:-1]) & np.isfinite(edges_m[1:])
-    along = np.abs(edges_m[1:][seen] - edges_m[:-1][seen]) * per_m
-    across = z[seen] / camera.focal_px * per_m
+    is_visible = np.isfinite(edges_m[:-1]) & np.isfinite(edges_m[1:])
+    length_texels = np.abs(edges_m[1:][is_visible] - edges_m[:-1][is_visible]) * per_m
+    width_texels = z[is_visible] / camera.focal_px * per_m
     # the pyramid level at which footprints are at most two texels wide
-    mantissa, halvings = np.frexp(across)
+    mantissa, halvings = np.frexp(width_texels)
     k = np.clip(halvings - np.where(mantissa > 0.5, 1, 2), 0, copies - 1)
-    across, along = np.ldexp(across, -k), np.ldexp(along, -k)
-    plan = np.zeros((camera.height_px, 3), dtype=np.int64)
-    plan[seen, 0] = np.clip(np.ceil(along / STEP_TEXELS), 1, MOST_SAMPLES)
-    plan[seen, 1] = np.where(across <= 1, 1, 2)
-    plan[seen, 2] = k
-    return plan
+    width_texels, length_texels = np.ldexp(width_texels, -k), np.ldexp(length_texels, -k)
+    row_sampling = np.zeros((camera.height_px, 3), dtype=np.int64)
+    row_sampling[is_visible, 0] = np.clip(np.ceil(length_texels / STEP_TEXELS), 1, MOST_SAMPLES)
+    row_sampling[is_visible, 1] = np.where(width_texels <= 1, 1, 2)
+    row_sampling[is_visible, 2] = k
+    return row_sampling
 
 
 def ray_coefficients(
@@ -76,10 +76,10 @@ def ray_coefficients(
     Both coordinates are 0 to 1 on the texture.
     """
     cos, sin = math.cos(camera.theta), math.sin(camera.theta)
-    left = camera.center_u / camera.focal_px
+    left_edge = camera.center_u / camera.focal_px
     corner_x, corner_y = level.corner_m.tolist()
     x0, y0 = camera.eye_x_m - corner_x, camera.eye_y_m - corner_y
-    dx, dy = cos - left * sin, sin + left * cos
+    dx, dy = cos - left_edge * sin, sin + left_edge * cos
 
     def along(x: float, y: float) -> RayCoefficients:
         return x * x0 + y * y0, x * dx + y * dy, (x * sin - y * cos) / camera.focal_px
@@ -103,43 +103,66 @@ def draw_plane(
         open_rows: number of open rows of each column, from the image's edge on, shape (W,).
         picture: image, shape (H, W) uint8; changed.
     """
-    plan, way = footprints(camera, level), ray_coefficients(camera, level)
-    rise = (camera.eye_z_m - level.height_m) * camera.focal_px
+    row_sampling, coefficients = footprints(camera, level), ray_coefficients(camera, level)
+    depth_factor = (camera.eye_z_m - level.height_m) * camera.focal_px
     texels = level.shape, level.first, level.cells
-    _fill(*texels, plan, way, rise, camera.center_v, is_above, open_rows, picture)
+    _draw_rows(
+        *texels,
+        row_sampling,
+        coefficients,
+        depth_factor,
+        camera.center_v,
+        is_above,
+        open_rows,
+        picture,
+    )
 
 
 @kernel
-def _fill(
-    shape: np.ndarray,
-    firsts: np.ndarray,
+def _draw_rows(
+    level_shapes: np.ndarray,
+    level_starts: np.ndarray,
     cells: np.ndarray,
-    plan: np.ndarray,
-    way: tuple[RayCoefficients, RayCoefficients],
-    rise: float,
+    row_sampling: np.ndarray,
+    coefficients: tuple[RayCoefficients, RayCoefficients],
+    depth_factor: float,
     center_v: float,
     is_above: bool,
     open_rows: np.ndarray,
     picture: np.ndarray,
 ) -> None:
-    """Draw row by row: the footprints of a row have one depth and lie on a line."""
+    """Draw a horizontal plane row by row: all footprints of a row have one depth and lie on a line.
+
+    Args:
+        level_shapes: rows and columns of each pyramid level, shape (L, 2).
+        level_starts: index of the first cell of each pyramid level, shape (L,).
+        cells: packed 2x2 texels of all levels.
+        row_sampling: sampling of each image row, as `footprints` returns it, shape (H, 3).
+        coefficients: texture coordinates of rays, as `ray_coefficients` returns them.
+        depth_factor: height of the camera over the plane times the focal length, in m px; the depth
+            of row v is depth_factor / (v - center_v).
+        center_v: row of the horizon.
+        is_above: True if the plane lies above the horizon.
+        open_rows: number of open rows of each column, from the image's edge on, shape (W,).
+        picture: image, shape (H, W) uint8; changed.
+    """
     height, width = picture.shape
-    (right_0, right_z, right_zu), (up_0, up_z, up_zu) = way
-    place, cell = np.empty((3, PIECE), dtype=np.int32), np.empty(PIECE, dtype=np.uint32)
-    sums = np.empty(PIECE, dtype=np.uint32)
-    for first in range(0, width, PIECE):
-        last = min(first + PIECE, width)
-        least = most = open_rows[first]
+    (right_0, right_z, right_zu), (up_0, up_z, up_zu) = coefficients
+    position, cell = np.empty((3, CHUNK_PX), dtype=np.int32), np.empty(CHUNK_PX, dtype=np.uint32)
+    sums = np.empty(CHUNK_PX, dtype=np.uint32)
+    for first in range(0, width, CHUNK_PX):
+        last = min(first + CHUNK_PX, width)
+        min_open = max_open = open_rows[first]
         for j in range(first, last):
-            least, most = min(least, open_rows[j]), max(most, open_rows[j])
-        for row in range(most):
+            min_open, max_open = min(min_open, open_rows[j]), max(max_open, open_rows[j])
+        for row in range(max_open):
             v = row if is_above else height - 1 - row
-            n, across, k = plan[v, 0], plan[v, 1], plan[v, 2]
-            size, corner = (shape[k, 0], shape[k, 1]), int(firsts[k])
+            n, n_across, k = row_sampling[v, 0], row_sampling[v, 1], row_sampling[v, 2]
+            size, corner = (level_shapes[k, 0], level_shapes[k, 1]), int(level_starts[k])
             end = first
             while end < last:
                 begin, end = end, last
-                if row >= least:  # the next open columns
+                if row >= min_open:  # the next open columns
                     while begin < last and row >= open_rows[begin]:
                         begin += 1
                     end = begin
@@ -149,10 +172,10 @@ def _fill(
                 value = SUM_UNIT * int(BACKGROUND) if n == 0 else 0
                 for i in range(count):
                     sums[i] = value
-                for side in range(across):
-                    u = begin + (0.0 if across == 1 else side / 2 - 0.25)
+                for side in range(n_across):
+                    u = begin + (0.0 if n_across == 1 else side / 2 - 0.25)
                     for s in range(n if count else 0):
-                        z = rise / (v - 0.5 + (s + 0.5) / n - center_v)
+                        z = depth_factor / (v - 0.5 + (s + 0.5) / n - center_v)
                         # the line of the row's footprints on the pyramid level, from `u` on
                         line = (
                             (right_0 + (right_z + right_zu * u) * z) * size[1] + 0.5,
@@ -162,39 +185,41 @@ def _fill(
                         )
                         lowest, leftmost = _lowest_cell(line, count, size)
                         if lowest < 0:
-                            _add_at_the_edge(cells, corner, line, size, count, sums)
+                            _add_border_samples(cells, corner, line, size, count, sums)
                         else:
                             wide = size[1] + 1
                             # positions relative to the lowest cell, and cell indices
                             x, y, x_step, y_step = line
                             first_x, first_y = x - leftmost, y - lowest
                             from_x, step_x = (
-                                np.int32(first_x * PLACE_UNIT),
-                                np.int32(x_step * PLACE_UNIT),
+                                np.int32(first_x * POSITION_UNIT),
+                                np.int32(x_step * POSITION_UNIT),
                             )
                             from_y, step_y = (
-                                np.int32(first_y * PLACE_UNIT),
-                                np.int32(y_step * PLACE_UNIT),
+                                np.int32(first_y * POSITION_UNIT),
+                                np.int32(y_step * POSITION_UNIT),
                             )
                             stride = np.int32(wide)
                             for i in range(count):
                                 at_x = np.int32(from_x + np.int32(step_x * np.int32(i)))
                                 at_y = np.int32(from_y + np.int32(step_y * np.int32(i)))
-                                place[0, i], place[1, i] = at_x, at_y
-                                place[2, i] = np.int32((at_y >> PLACE_BITS) * stride) + (
-                                    at_x >> PLACE_BITS
+                                position[0, i], position[1, i] = at_x, at_y
+                                position[2, i] = np.int32((at_y >> POSITION_BITS) * stride) + (
+                                    at_x >> POSITION_BITS
                                 )
-                            _look_up(cells, corner + lowest * wide + leftmost, place, count, cell)
+                            _look_up(
+                                cells, corner + lowest * wide + leftmost, position, count, cell
+                            )
                             for i in range(count):
-                                sums[i] += _between(
-                                    cell[i], np.uint32(place[0, i]), np.uint32(place[1, i])
+                                sums[i] += _interpolate(
+                                    cell[i], np.uint32(position[0, i]), np.uint32(position[1, i])
                                 )
                 # draw rounded means of samples from column `begin` on
-                samples = max(n * across, 1)
-                scale, at = np.float32(1 / (SUM_UNIT * samples)), np.uintp(begin)
+                samples = max(n * n_across, 1)
+                scale, first_pixel = np.float32(1 / (SUM_UNIT * samples)), np.uintp(begin)
                 for i in range(count):
-                    shown = np.int32(scale * np.float32(sums[i]) + np.float32(0.5))
-                    picture[v, at + np.uintp(i)] = np.uint8(shown)
+                    grey_level = np.int32(scale * np.float32(sums[i]) + np.float32(0.5))
+                    picture[v, first_pixel + np.uintp(i)] = np.uint8(grey_level)
 
 
 @kernel
@@ -218,27 +243,35 @@ def _lowest_cell(line: Line, count: int, size: Size) -> tuple[int, int]:
 
 @kernel
 def _look_up(
-    cells: np.ndarray, lowest: int, place: np.ndarray, count: int, cell: np.ndarray
+    cells: np.ndarray, lowest: int, position: np.ndarray, count: int, cell: np.ndarray
 ) -> None:
-    """Fill in the cells at positions relative to the lowest cell."""
+    """Copy the cells at given positions.
+
+    Args:
+        cells: packed 2x2 texels of all levels.
+        lowest: index of the lowest cell of the line.
+        position: x and y in 2^-22 cells and cell index, relative to the lowest cell, shape (3, N).
+        count: number of positions.
+        cell: the cells, shape (N,); changed.
+    """
     corner = np.uint64(lowest)
     for i in range(count):
-        cell[i] = cells[corner + np.uint64(place[2, i])]
+        cell[i] = cells[corner + np.uint64(position[2, i])]
 
 
 @kernel
-def _between(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
+def _interpolate(cell: np.uint32, x: np.uint32, y: np.uint32) -> np.uint32:
     """Return the bilinear interpolation between the bytes of a cell, in 2^-16 grey levels."""
-    right, up = (x >> TO_SHARE) & LOW_SHARE, (y >> TO_SHARE) & LOW_SHARE
+    right, up = (x >> TO_FRACTION) & FRACTION_MASK, (y >> TO_FRACTION) & FRACTION_MASK
     # lower and upper edge at the same time, in the halves of one number
     lefts, rights = cell & FIRST_AND_THIRD, (cell >> BYTE) & FIRST_AND_THIRD
-    edges = np.uint32(np.uint32(lefts * (WHOLE_SHARE - right)) + np.uint32(rights * right))
+    edges = np.uint32(np.uint32(lefts * (FRACTION_ONE - right)) + np.uint32(rights * right))
     lower, upper = edges & LOW_HALF, edges >> HALF
-    return np.uint32(np.uint32(lower * (WHOLE_SHARE - up)) + np.uint32(upper * up))
+    return np.uint32(np.uint32(lower * (FRACTION_ONE - up)) + np.uint32(upper * up))
 
 
 @kernel
-def _add_at_the_edge(
+def _add_border_samples(
     cells: np.ndarray, corner: int, line: Line, size: Size, count: int, sums: np.ndarray
 ) -> None:
     """Add samples at any position; the background lies beside the texture."""
@@ -248,8 +281,11 @@ def _add_at_the_edge(
         if 0.5 <= x < width + 0.5 and 0.5 <= y < height + 0.5:
             column, row = int(x), int(y)
             cell = np.uint32(cells[corner + row * (width + 1) + column])
-            part_x, part_y = np.uint32((x - column) * PLACE_UNIT), np.uint32((y - row) * PLACE_UNIT)
-            sums[i] += _between(cell, part_x, part_y)
+            part_x, part_y = (
+                np.uint32((x - column) * POSITION_UNIT),
+                np.uint32((y - row) * POSITION_UNIT),
+            )
+            sums[i] += _interpolate(cell, part_x, part_y)
         else:
             sums[i] += np.uint32(SUM_UNIT * int(BACKGROUND))
 
@@ -260,6 +296,6 @@ def lookup_texels(level: HorizontalPlane, right: Float, up: Float) -> np.ndarray
     height, width = level.shape[0]
     # a texel is the lower left corner of the cell to the upper right of its centre
     row, column = (up[inside] * height).astype(int) + 1, (right[inside] * width).astype(int) + 1
-    found = np.full(inside.shape, BACKGROUND)
-    found[inside] = level.cells[row * (width + 1) + column] & 0xFF
-    return found
+    texels = np.full(inside.shape, BACKGROUND)
+    texels[inside] = level.cells[row * (width + 1) + column] & 0xFF
+    return texels

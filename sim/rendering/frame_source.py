@@ -96,12 +96,12 @@ class _Bullet:
         self._world.close()
 
     def render(
-        self, poses: Float, own: int, noise: RadiometricNoise, rng: np.random.Generator
+        self, poses: Float, index: int, noise: RadiometricNoise, rng: np.random.Generator
     ) -> StereoFrame:
         for i, (body, pose) in enumerate(zip(self._bodies, poses, strict=True)):
-            body.place(pose, OUT_OF_SIGHT_M if i == own else 0.0)  # it does not see itself
-        self._world.show_faces(self._visibility.seen(poses[own]))
-        return render_stereo(self._world, self._camera, poses[own], noise, rng)
+            body.place(pose, OUT_OF_SIGHT_M if i == index else 0.0)  # it does not see itself
+        self._world.show_faces(self._visibility.seen(poses[index]))
+        return render_stereo(self._world, self._camera, poses[index], noise, rng)
 
 
 class FrameSource:
@@ -162,11 +162,11 @@ class FrameSource:
         require_shape("T_world_robots", poses, (len(self._robots), *shape))
         if robot not in self._robots:
             raise InputError(f"robot {robot}: unknown, there are {', '.join(self._robots)}")
-        own = self._robots.index(robot)
+        index = self._robots.index(robot)
         if isinstance(self._drawn, _Bullet):
-            return self._drawn.render(poses, own, noise, rng)
-        others = np.delete(poses, own, axis=0)
-        return self._drawn.stereo(poses[own], others, noise, rng, colour)
+            return self._drawn.render(poses, index, noise, rng)
+        others = np.delete(poses, index, axis=0)
+        return self._drawn.stereo(poses[index], others, noise, rng, colour)
 
 
 def truth_behind(

@@ -77,55 +77,59 @@ class VisibleScene(NamedTuple):
 
 def find_visible(camera: Pinhole, walls: Walls, solids: Solids, poses: Float) -> VisibleScene:
     """Return the visible geometry of a scene with robots at poses (R, 3)."""
-    plan, bodies = find_visible_walls(camera, walls), list[ProjectedRobot]()
+    visible_walls, bodies = find_visible_walls(camera, walls), list[ProjectedRobot]()
     for pose in within_view(camera, solids.reach_m, poses):
-        if not is_occluded(camera, plan, solids.reach_m, pose):
+        if not is_occluded(camera, visible_walls, solids.reach_m, pose):
             bodies.append(project_robot(camera, solids, pose))
-    return VisibleScene(camera, plan, [body for body in bodies if len(body.shown)])
+    return VisibleScene(camera, visible_walls, [body for body in bodies if len(body.shown)])
 
 
-def render_filtered(of: VisibleScene, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
+def render_filtered(visible: VisibleScene, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
     """Return grey levels (H, W) uint8, each the mean over the pixel's footprint.
 
     Args:
-        of: visible geometry.
+        visible: visible geometry.
         scene: static scene.
         solids: solids of one robot.
         grey: grey levels of the solids, shape (S,).
     """
-    camera, plan = of.camera, of.plan
+    camera, visible_walls = visible.camera, visible.plan
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
-    draw_plane(camera, scene.ceiling, True, plan.above, picture)
-    draw_plane(camera, scene.floor, False, plan.below, picture)
+    draw_plane(camera, scene.ceiling, True, visible_walls.above, picture)
+    draw_plane(camera, scene.floor, False, visible_walls.below, picture)
     # walls are drawn by columns, which are not contiguous in an image
     columns = cv2.transpose(picture)
-    draw_walls(camera, scene.walls, plan, columns)
+    draw_walls(camera, scene.walls, visible_walls, columns)
     picture = cv2.transpose(columns)
-    if of.bodies:
-        draw_robots(camera, plan, solids, of.bodies, grey, picture)
+    if visible.bodies:
+        draw_robots(camera, visible_walls, solids, visible.bodies, grey, picture)
     return picture
 
 
-def render_depth(of: VisibleScene, scene: Scene, solids: Solids) -> np.ndarray:
+def render_depth(visible: VisibleScene, scene: Scene, solids: Solids) -> np.ndarray:
     """Return depths (H, W) float32 along the optical axis at pixel centres; NaN for background."""
-    depth_m = _static_depth(of, scene)
-    cast_rays(of.camera, solids, of.bodies, np.zeros(len(solids.rgb)), depth_m)
-    if np.any(of.plan.middle == NO_WALL):
+    depth_m = _static_depth(visible, scene)
+    cast_rays(visible.camera, solids, visible.bodies, np.zeros(len(solids.rgb)), depth_m)
+    if np.any(visible.plan.middle == NO_WALL):
         depth_m[np.isinf(depth_m)] = np.nan
     return depth_m
 
 
-def _static_depth(of: VisibleScene, scene: Scene) -> np.ndarray:
+def _static_depth(visible: VisibleScene, scene: Scene) -> np.ndarray:
     """Return depths (H, W) of the static scene; infinity for the background."""
-    camera, plan = of.camera, of.plan
+    camera, visible_walls = visible.camera, visible.plan
     levels_m = _depths_of_levels(at_origin(camera), scene.floor.height_m, scene.ceiling.height_m)
     depth_m = np.empty((camera.height_px, camera.width_px), dtype=np.float32)
-    np.minimum(plan.middle_m.astype(np.float32), levels_m.astype(np.float32)[:, None], out=depth_m)
-    beside = np.flatnonzero(plan.middle == NO_WALL)
+    np.minimum(
+        visible_walls.middle_m.astype(np.float32), levels_m.astype(np.float32)[:, None], out=depth_m
+    )
+    beside = np.flatnonzero(visible_walls.middle == NO_WALL)
     if len(beside):  # only columns without a wall show the edge of floor or ceiling
         for level, rows in _sides(camera, scene):
             z = levels_m[rows, None]
-            right, up = (_along(way, beside, z) for way in ray_coefficients(camera, level))
+            right, up = (
+                _along(coefficients, beside, z) for coefficients in ray_coefficients(camera, level)
+            )
             inside = (right >= 0) & (right < 1) & (up >= 0) & (up < 1)
             depth_m[rows, beside] = np.where(inside, z, np.inf)
     return depth_m
@@ -145,37 +149,47 @@ def _sides(camera: Pinhole, scene: Scene) -> list[tuple[HorizontalPlane, slice]]
     return [(scene.ceiling, slice(horizon)), (scene.floor, slice(horizon, camera.height_px))]
 
 
-def render_sampled(of: VisibleScene, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
+def render_sampled(visible: VisibleScene, scene: Scene, solids: Solids, grey: Float) -> np.ndarray:
     """Return grey levels (H, W) uint8 at pixel centres; arguments of `render_filtered`."""
-    camera, plan, walls, u = of.camera, of.plan, scene.walls, np.arange(of.camera.width_px)
-    face, wall_m = plan.middle, plan.middle_m
-    seen, size = plan.seen[face], walls.size[face]
+    camera, visible_walls, walls, u = (
+        visible.camera,
+        visible.plan,
+        scene.walls,
+        np.arange(visible.camera.width_px),
+    )
+    face, wall_m = visible_walls.middle, visible_walls.middle_m
+    wall_rows, size = visible_walls.seen[face], walls.size[face]
     levels_m = _depths_of_levels(at_origin(camera), scene.floor.height_m, scene.ceiling.height_m)
-    along = np.where(face == NO_WALL, 0.0, (seen[:, 4] + seen[:, 5] * u) * wall_m - seen[:, 6])
-    right = np.clip(along / walls.width_m[face] * size[:, 0], 0, size[:, 0] - 1).astype(np.int64)
+    texel_column = np.where(
+        face == NO_WALL, 0.0, (wall_rows[:, 4] + wall_rows[:, 5] * u) * wall_m - wall_rows[:, 6]
+    )
+    right = np.clip(texel_column / walls.width_m[face] * size[:, 0], 0, size[:, 0] - 1).astype(
+        np.int64
+    )
     first = walls.first[face] + right * (size[:, 1] + 1)
     picture = np.empty((camera.height_px, camera.width_px), dtype=np.uint8)
     # floor and ceiling
     for level, rows in _sides(camera, scene):
         to_right, to_up = (
-            _along(way, u, levels_m[rows, None]) for way in ray_coefficients(camera, level)
+            _along(coefficients, u, levels_m[rows, None])
+            for coefficients in ray_coefficients(camera, level)
         )
         picture[rows] = lookup_texels(level, to_right, to_up)
     # walls in front of them: a texel is a difference of four sums
     v, j = np.nonzero(wall_m < levels_m[:, None])
     height_m = camera.eye_z_m - (v - camera.center_v) * wall_m[j] / camera.focal_px
-    up = (height_m / walls.height_m * size[j, 1]).astype(np.int64)
-    here = first[j] + np.minimum(up, size[j, 1] - 1)
+    texel_row = (height_m / walls.height_m * size[j, 1]).astype(np.int64)
+    here = first[j] + np.minimum(texel_row, size[j, 1] - 1)
     there, sums = here + size[j, 1] + 1, walls.sums
     picture[v, j] = sums[there + 1] - sums[there] - sums[here + 1] + sums[here]
-    cast_rays(camera, solids, of.bodies, grey, _static_depth(of, scene), picture)
+    cast_rays(camera, solids, visible.bodies, grey, _static_depth(visible, scene), picture)
     return picture
 
 
-def _along(way: RayCoefficients, u: np.ndarray, z: Float) -> Float:
+def _along(coefficients: RayCoefficients, u: np.ndarray, z: Float) -> Float:
     """Return texture coordinates of rays at depths, see `ray_coefficients`; NaN at infinity."""
     with np.errstate(invalid="ignore"):
-        return way[0] + (way[1] + way[2] * u) * z
+        return coefficients[0] + (coefficients[1] + coefficients[2] * u) * z
 
 
 _FINER = 2  # resolution of the level image, and samples of the tilted image, per pixel and axis
@@ -239,13 +253,13 @@ class TiltedView:
         first = 0.5 / _FINER - 0.5  # offset of a pixel's first sample from its centre
         pixel_of = np.array([[1 / _FINER, 0, first], [0, 1 / _FINER, first], [0, 0, 1]])
         rows = self.to_level[[1, 2, 0]]
-        made = cv2.warpPerspective(
+        warped = cv2.warpPerspective(
             level.astype(np.float32),
             rows @ pixel_of,
             (_FINER * width, _FINER * height),
             flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
         )
-        mean = cv2.resize(made, (width, height), interpolation=cv2.INTER_AREA)
+        mean = cv2.resize(warped, (width, height), interpolation=cv2.INTER_AREA)
         return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
 
     def depth_m(self, level: np.ndarray) -> np.ndarray:
@@ -268,10 +282,10 @@ def _tilted_depth(level: np.ndarray, to_level: Float, height: int, width: int) -
             near, far, smooth = np.inf, 0.0, 0.0
             for row in range(2):
                 for column in range(2):
-                    own = level[m + row, k + column]
-                    share = (b if row else 1 - b) * (a if column else 1 - a)
-                    near, far = min(near, own), max(far, own)
-                    smooth += share / own
+                    depth = level[m + row, k + column]
+                    weight = (b if row else 1 - b) * (a if column else 1 - a)
+                    near, far = min(near, depth), max(far, depth)
+                    smooth += weight / depth
             nearest = level[m + int(b > 0.5), k + int(a > 0.5)]
             # comparisons with NaN are false, so the background has edges too
             one_surface = smooth == smooth and far - near <= SAME_SURFACE * nearest
@@ -327,8 +341,11 @@ class RayCaster:
         """
         half_m, poses, body = self._camera.baseline_m / 2, _poses(others), body_pose(T_world_robot)
         view = self._view(body, half_m)
-        seen = self._sight(view, poses)
-        left, depth_m = self._draw(self._scene, view, seen, self._grey), self._depth_m(view, seen)
+        visible = self._sight(view, poses)
+        left, depth_m = (
+            self._draw(self._scene, view, visible, self._grey),
+            self._depth_m(view, visible),
+        )
         right = self.grey(body, -half_m, poses)
         rgb = self.rgb(body, half_m, poses) if colour else None
         return StereoFrame(expose(left, noise, rng), expose(right, noise, rng), depth_m, rgb)
@@ -349,9 +366,9 @@ class RayCaster:
         if not self._channels:
             self._channels = [read_scene(self._faces, channel) for channel in range(3)]
         view = self._view(T_world_robot, y_m)
-        seen, colours = self._sight(view, _poses(others)), self._solids.rgb.T
+        visible, colours = self._sight(view, _poses(others)), self._solids.rgb.T
         drawn = [
-            self._draw(scene, view, seen, colour)
+            self._draw(scene, view, visible, colour)
             for scene, colour in zip(self._channels, colours, strict=True)
         ]
         return np.stack(drawn, -1)
@@ -365,15 +382,15 @@ class RayCaster:
         camera = view if isinstance(view, Pinhole) else view.level
         return find_visible(camera, self._scene.walls, self._solids, poses)
 
-    def _depth_m(self, view: Pinhole | TiltedView, seen: VisibleScene) -> np.ndarray:
-        found = render_depth(seen, self._scene, self._solids)
-        return found if isinstance(view, Pinhole) else view.depth_m(found)
+    def _depth_m(self, view: Pinhole | TiltedView, visible: VisibleScene) -> np.ndarray:
+        depth_m = render_depth(visible, self._scene, self._solids)
+        return depth_m if isinstance(view, Pinhole) else view.depth_m(depth_m)
 
     def _draw(
-        self, scene: Scene, view: Pinhole | TiltedView, seen: VisibleScene, grey: Float
+        self, scene: Scene, view: Pinhole | TiltedView, visible: VisibleScene, grey: Float
     ) -> np.ndarray:
         kind = render_filtered if self._sampling == "footprint" else render_sampled
-        drawn = kind(seen, scene, self._solids, grey)
+        drawn = kind(visible, scene, self._solids, grey)
         return drawn if isinstance(view, Pinhole) else view.picture(drawn)
 
     def _view(self, T_world_robot: ArrayLike, y_m: float) -> Pinhole | TiltedView:
@@ -396,5 +413,5 @@ class RayCaster:
 
 def _poses(others: ArrayLike) -> Float:
     """Return poses (R, 3) of robots, which are drawn upright even if they tilt."""
-    found = np.asarray(others, dtype=np.float64)
-    return np.ascontiguousarray(planar(found) if found.ndim == 3 else found).reshape(-1, 3)
+    poses = np.asarray(others, dtype=np.float64)
+    return np.ascontiguousarray(planar(poses) if poses.ndim == 3 else poses).reshape(-1, 3)

@@ -101,9 +101,9 @@ def _numbers(element: ElementTree.Element | None, name: str) -> Float:
 
 def _named(element: ElementTree.Element, child: str, name: str = "link") -> str:
     """Return an attribute of a child element."""
-    found = element.find(child)
-    assert found is not None
-    return found.attrib[name]
+    child_element = element.find(child)
+    assert child_element is not None
+    return child_element.attrib[name]
 
 
 def _shape(visual: ElementTree.Element, place_m: Float) -> tuple[Float, _Hull]:
@@ -126,12 +126,14 @@ def _shape(visual: ElementTree.Element, place_m: Float) -> tuple[Float, _Hull]:
     for i, (corner, beside) in enumerate(zip(hull.simplices, hull.neighbors, strict=True)):
         for k in range(3):  # the edge opposite to corner k
             if i < beside[k]:
-                way = [corner[(k + 1) % 3], corner[(k + 2) % 3]]
-                edges.append(way[::-1] if turned[i] else way)
+                other_corners = [corner[(k + 1) % 3], corner[(k + 2) % 3]]
+                edges.append(other_corners[::-1] if turned[i] else other_corners)
                 sides.append([i, beside[k]])
     planes = hull.equations.round(9) * [1, 1, 1, -1]
     # roll, pitch and yaw of a URDF are about fixed axes
-    (cr, cp, cy), (sr, sp, sy) = (of(_numbers(origin, "rpy")) for of in (np.cos, np.sin))
+    (cr, cp, cy), (sr, sp, sy) = (
+        function(_numbers(origin, "rpy")) for function in (np.cos, np.sin)
+    )
     about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
@@ -327,9 +329,9 @@ def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobo
         t = (ahead[begin] - camera.near_m) / (ahead[begin] - ahead[end])
         met_left, met_up = (at[begin] + t * (at[end] - at[begin]) for at in (left, up))
         met = _project(camera, np.full(len(t), camera.near_m), met_left, met_up)
-        of = np.searchsorted(solids.first_corner, begin, side="right") - 1
-        np.minimum.at(low, of, met)
-        np.maximum.at(high, of, met)
+        solid_of_edge = np.searchsorted(solids.first_corner, begin, side="right") - 1
+        np.minimum.at(low, solid_of_edge, met)
+        np.maximum.at(high, solid_of_edge, met)
     # windows from the least and largest u and v of all points of each solid
     size = np.array([camera.width_px, camera.height_px])
     first = np.minimum(np.maximum(np.floor(low + 0.5), 0), size)
@@ -338,7 +340,7 @@ def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobo
     windows = windows.astype(np.int64)
     is_cut = np.logical_or.reduceat(behind, begins)
     top, bottom, leftmost, rightmost = windows.T
-    shown = np.flatnonzero((top <= bottom) & (leftmost <= rightmost))
+    visible_solids = np.flatnonzero((top <= bottom) & (leftmost <= rightmost))
     # silhouette edges: between a face towards the camera and one away from it, which is to the left
     sees = outside[solids.sides] > 0
     bounding = np.flatnonzero(sees[:, 0] != sees[:, 1])
@@ -348,7 +350,7 @@ def project_robot(camera: Pinhole, solids: Solids, pose: Float) -> ProjectedRobo
     outline = uv[ends].reshape(-1, 4) - corner
     farthest_m = float(ahead.max())
     return ProjectedRobot(
-        eye, axes, outside, windows, shown, is_cut, farthest_m, outline, first_edge
+        eye, axes, outside, windows, visible_solids, is_cut, farthest_m, outline, first_edge
     )
 
 
@@ -371,7 +373,7 @@ def within_view(camera: Pinhole, reach_m: float, poses: Float) -> Float:
     return poses[rows[np.argsort((x * x + y * y)[rows], kind="stable")]]
 
 
-def is_occluded(camera: Pinhole, plan: VisibleWalls, reach_m: float, pose: Float) -> bool:
+def is_occluded(camera: Pinhole, visible_walls: VisibleWalls, reach_m: float, pose: Float) -> bool:
     """Return True if walls hide the circle of radius `reach_m` around a robot's pose (3,)."""
     cos, sin = math.cos(camera.theta), math.sin(camera.theta)
     x, y = float(pose[0]) - camera.eye_x_m, float(pose[1]) - camera.eye_y_m
@@ -384,7 +386,7 @@ def is_occluded(camera: Pinhole, plan: VisibleWalls, reach_m: float, pose: Float
     u_right = camera.center_u - camera.focal_px * right / (nearest if right < 0 else farthest)
     first = max(math.floor(u_left + 0.5), 0)
     last = min(math.floor(u_right + 0.5) + 1, camera.width_px)
-    return first >= last or bool(nearest * inverse_depths(plan, first, last).min() >= 1)
+    return first >= last or bool(nearest * inverse_depths(visible_walls, first, last).min() >= 1)
 
 
 def _project(camera: Pinhole, ahead: Float, left: Float, up: Float) -> Float:
@@ -429,18 +431,18 @@ def _nearness(camera: Pinhole, solids: Solids, i: int, body: ProjectedRobot) -> 
     faces the camera, if the ray has not left the solid before (Kay and Kajiya 1986).
     """
     top, bottom, left, right = body.windows[i].tolist()
-    own, f = slice(*solids.first_plane[i : i + 2]), camera.focal_px
+    planes, f = slice(*solids.first_plane[i : i + 2]), camera.focal_px
     up = (camera.center_v - np.arange(top, bottom + 1)) / f
 
     def least(edges: Float, faces: np.ndarray, sign: float) -> Float:
-        n, outside_m = solids.planes[own, :3][faces], body.outside_m[own][faces]
+        n, outside_m = solids.planes[planes, :3][faces], body.outside_m[planes][faces]
         ahead, aside, above = -sign * (body.axes @ n.T) / outside_m
         in_row = ahead + aside * ((camera.center_u - left) / f) + above * up[:, None]
         found = np.zeros((len(up), right + 1 - left))
         fill_minimum(edges, in_row, -aside / f, found)
         return found
 
-    facing = body.outside_m[own] > 0
+    facing = body.outside_m[planes] > 0
     if not body.is_cut[i]:
         return least(body.outline(i), facing, 1.0)
     # a solid that reaches the near plane has no outline: rays through all pixels of the window
@@ -448,19 +450,19 @@ def _nearness(camera: Pinhole, solids: Solids, i: int, body: ProjectedRobot) -> 
         [[-1.0, -1, -1, len(up)], [right + 1.0 - left, len(up), right + 1 - left, -1]]
     )
     nearness = np.minimum(least(around, facing, 1.0), 1 / camera.near_m)
-    leaves = -least(around, body.outside_m[own] < 0, -1.0)
+    leaves = -least(around, body.outside_m[planes] < 0, -1.0)
     return np.where(nearness > np.maximum(leaves, 0.0), nearness, 0.0)
 
 
 def draw_robots(
-    camera: Pinhole, plan: VisibleWalls, solids: Solids, bodies: list[ProjectedRobot], grey: Float,
-    picture: np.ndarray,
+    camera: Pinhole, visible_walls: VisibleWalls, solids: Solids, bodies: list[ProjectedRobot],
+    grey: Float, picture: np.ndarray,
 ) -> None:  # fmt: skip
     """Draw robots over an image, each pixel by the covered share.
 
     Args:
         camera: level camera.
-        plan: visible walls.
+        visible_walls: visible walls.
         solids: solids of one robot.
         bodies: visible robots, from the nearest to the farthest.
         grey: grey levels of the solids, shape (S,).
@@ -471,7 +473,7 @@ def draw_robots(
     under = picture[above:below, first:last].astype(np.float32)
     seen, rest = under.copy(), np.ones_like(under)
     for body in bodies:
-        open_share = _open_shares(camera, plan, solids, body, first, last)
+        open_share = _open_shares(camera, visible_walls, solids, body, first, last)
         windows = body.windows.tolist()
         for i in front_to_back(solids, body.eye_m):
             top, bottom, left, right = windows[i]
@@ -485,17 +487,22 @@ def draw_robots(
             columns = slice(left - first, right + 1 - first)
             window = slice(top - above, bottom + 1 - above), columns
             # within a pixel, nearer solids take their share first
-            share = np.minimum(covered * open_share[i, columns], rest[window])
-            rest[window] -= share
-            seen[window] += share * (grey[i] - under[window])
+            coverage = np.minimum(covered * open_share[i, columns], rest[window])
+            rest[window] -= coverage
+            seen[window] += coverage * (grey[i] - under[window])
     picture[above:below, first:last] = (seen + 0.5).astype(np.uint8)
 
 
 def _open_shares(
-    camera: Pinhole, plan: VisibleWalls, solids: Solids, body: ProjectedRobot, first: int, last: int
+    camera: Pinhole,
+    visible_walls: VisibleWalls,
+    solids: Solids,
+    body: ProjectedRobot,
+    first: int,
+    last: int,
 ) -> Float:
     """Return shares (S, N) of columns `first` to `last` - 1 in which no wall hides a solid."""
-    w = inverse_depths(plan, first, last)
+    w = inverse_depths(visible_walls, first, last)
     if body.farthest_m * w.max() < 1:  # in front of all walls
         return np.ones((len(body.windows), last - first))
     (ahead_x, ahead_y), (left_x, left_y) = body.axes[:2, :2].tolist()
@@ -511,11 +518,11 @@ def _open_shares(
         at_low, at_high = low[:, axis, None] / ray, high[:, axis, None] / ray
         enter = np.fmax(enter, np.minimum(at_low, at_high))
         leave = np.fmin(leave, np.maximum(at_low, at_high))
-    off = np.abs(aside_m[:, :, None] - left * corner_m[:, :, None])
-    off /= np.maximum(corner_m, camera.near_m)[:, :, None]
-    nearest_m = np.take_along_axis(corner_m.T, np.argmin(off, axis=0), axis=1)
+    distance = np.abs(aside_m[:, :, None] - left * corner_m[:, :, None])
+    distance /= np.maximum(corner_m, camera.near_m)[:, :, None]
+    nearest_m = np.take_along_axis(corner_m.T, np.argmin(distance, axis=0), axis=1)
     depth_m = np.where(enter <= leave, (enter + leave) / 2, nearest_m)
-    begins = plan.first[first : last + 1]
-    width = (plan.high - plan.low)[begins[0] : begins[-1]]
-    share = np.where(np.repeat(depth_m, np.diff(begins), axis=1) * w < 1, width, 0.0)
-    return np.add.reduceat(share, begins[:-1] - begins[0], axis=1)
+    begins = visible_walls.first[first : last + 1]
+    width = (visible_walls.high - visible_walls.low)[begins[0] : begins[-1]]
+    open_width = np.where(np.repeat(depth_m, np.diff(begins), axis=1) * w < 1, width, 0.0)
+    return np.add.reduceat(open_width, begins[:-1] - begins[0], axis=1)

@@ -183,11 +183,14 @@ def _strips(
     return face[:n], low[:n], high[:n], first, middle, middle_m
 
 
-def inverse_depths(plan: VisibleWalls, first: int, last: int) -> Float:
+def inverse_depths(visible_walls: VisibleWalls, first: int, last: int) -> Float:
     """Return inverse depths (N,) at the centres of strips in columns `first` to `last` - 1."""
-    strips = slice(plan.first[first], plan.first[last])
-    face, middle = plan.face[strips], (plan.low[strips] + plan.high[strips]) / 2
-    w = plan.seen[face, 2] + plan.seen[face, 3] * middle
+    strips = slice(visible_walls.first[first], visible_walls.first[last])
+    face, middle = (
+        visible_walls.face[strips],
+        (visible_walls.low[strips] + visible_walls.high[strips]) / 2,
+    )
+    w = visible_walls.seen[face, 2] + visible_walls.seen[face, 3] * middle
     w[face == NO_WALL] = 0.0
     return w
 
@@ -202,16 +205,23 @@ LEAST_TEXELS = 1e-6  # least width of a strip at the end of a wall, to divide by
 
 
 @kernel
-def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.ndarray) -> None:
+def draw_walls(
+    camera: Pinhole, walls: Walls, visible_walls: VisibleWalls, columns: np.ndarray
+) -> None:
     """Draw walls over the background.
 
     Args:
         camera: level camera.
         walls: all faces.
-        plan: visible walls.
+        visible_walls: visible walls.
         columns: transposed image, shape (W, H) uint8; changed.
     """
-    seen, face, lows, highs = plan.seen, plan.face, plan.low, plan.high
+    seen, face, lows, highs = (
+        visible_walls.seen,
+        visible_walls.face,
+        visible_walls.low,
+        visible_walls.high,
+    )
     height, height_m, width_m, size = camera.height_px, walls.height_m, walls.width_m, walls.size
     begins, table = walls.first, walls.sums
     # per row of texels in a strip: sum of all texels up to it
@@ -220,7 +230,7 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
         most_rows = max(most_rows, size[i, 1])
     sums = np.empty(most_rows + 1, dtype=np.float32)
     # per edge between pixels: row of texels, share of the row below the edge, sum up to the edge
-    row, share = np.empty(height + 1, dtype=np.int32), np.empty(height + 1, dtype=np.float32)
+    row, row_fraction = np.empty(height + 1, dtype=np.int32), np.empty(height + 1, dtype=np.float32)
     below = np.empty(height + 1, dtype=np.float32)
     # per pixel: grey level times covered share, and covered share
     total, covered = np.empty(height, dtype=np.float32), np.empty(height, dtype=np.float32)
@@ -232,7 +242,7 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
         lowest_top, highest_bottom = 0, height - 1
         for v in range(len(total)):
             total[v], covered[v] = 0.0, 0.0
-        for s in range(plan.first[j], plan.first[j + 1]):
+        for s in range(visible_walls.first[j], visible_walls.first[j + 1]):
             i, low, high = face[s], lows[s], highs[s]
             n = 0  # parts that the strip is cut into
             if i != NO_WALL:
@@ -265,12 +275,12 @@ def draw_walls(camera: Pinhole, walls: Walls, plan: VisibleWalls, columns: np.nd
                 bottom_row, top_row = max(int(lowest_q) - 1, 0), min(int(highest_q) + 2, size[i, 1])
                 rows, edges = top_row - bottom_row, lower + 2 - upper
                 _add_columns(table, begins[i], size, i, begin, end, bottom_row, top_row, sums)
-                _find_rows(highest_q - bottom_row, step, rows, edges, row, share)
+                _find_rows(highest_q - bottom_row, step, rows, edges, row, row_fraction)
                 # sums up to the edges
                 for v in range(edges):
                     k = np.uint64(row[v])
                     at_row = sums[k]
-                    below[v] = at_row + share[v] * (sums[k + np.uint64(1)] - at_row)
+                    below[v] = at_row + row_fraction[v] * (sums[k + np.uint64(1)] - at_row)
                 # means over footprints are differences between edges
                 scale = (b - a) / ((end - begin) * step)
                 start, weight = np.uint64(upper), np.float32(scale)
@@ -345,7 +355,7 @@ def _add_columns(
 
 @kernel
 def _find_rows(
-    q: float, texels: float, n: int, edges: int, row: np.ndarray, share: np.ndarray
+    q: float, texels: float, n: int, edges: int, row: np.ndarray, row_fraction: np.ndarray
 ) -> None:
     """Fill in row and share of edges at a distance of `texels`, the first one at `q`.
 
@@ -355,4 +365,4 @@ def _find_rows(
     for v in range(edges):
         at = min(max(begin - step * np.float32(v), np.float32(0)), top)
         row[v] = min(np.int32(at), last_row)
-        share[v] = at - np.float32(row[v])
+        row_fraction[v] = at - np.float32(row[v])

@@ -242,7 +242,7 @@ def _of_the_store(folder: Path, rng: np.random.Generator) -> list[Door]:
         require_undamaged(faces)
         meshes = [file.read_bytes() for file in sorted(faces.glob("*.obj"))]
         pictures = [read_picture(file) for file in sorted(faces.glob("*.bmp"))]
-        return made.figures(), read_corners(faces / CORNERS), pictures, meshes
+        return made.quantities(), read_corners(faces / CORNERS), pictures, meshes
 
     return [
         Door(drive, partial(read_trajectory, drive)),

@@ -26,9 +26,9 @@ from mapfusion.files import (
     remove_abandoned,
     require_writable,
     schema,
+    write_atomically,
     write_json,
     write_table,
-    write_whole,
 )
 
 THINGS = schema(
@@ -117,7 +117,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_whole(path, fail)
+        write_atomically(path, fail)
     assert [p.name for p in tmp_path.iterdir()] == ["things.parquet"]
     assert path.read_text() == "old"
 
@@ -127,22 +127,22 @@ def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(OSError, match="No space left") as told:
-        write_whole(tmp_path / "things.parquet", full)
+        write_atomically(tmp_path / "things.parquet", full)
     assert told.value.filename == str(tmp_path / "things.parquet")
 
     def elsewhere(temporary):
         (tmp_path / "not there").read_bytes()
 
     with pytest.raises(FileNotFoundError) as told:
-        write_whole(tmp_path / "things.parquet", elsewhere)
+        write_atomically(tmp_path / "things.parquet", elsewhere)
     assert told.value.filename == str(tmp_path / "not there")
 
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from mapfusion.files import write_whole
-write_whole(Path(sys.argv[1]), lambda temporary: os.kill(os.getpid(), signal.SIGKILL))
+from mapfusion.files import write_atomically
+write_atomically(Path(sys.argv[1]), lambda temporary: os.kill(os.getpid(), signal.SIGKILL))
 """
 
 
@@ -160,7 +160,7 @@ def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
         assert temporary.exists()
         temporary.write_text("kept")
 
-    write_whole(path, meanwhile)
+    write_atomically(path, meanwhile)
     assert sorted(path.parent.iterdir()) == sorted(kept)
     remove_abandoned(tmp_path / "not there")
 

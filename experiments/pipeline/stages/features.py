@@ -30,8 +30,8 @@ from mapfusion.files import (
     require_kind,
     schema,
     text_attributes,
+    write_atomically,
     write_table,
-    write_whole,
 )
 from mapfusion.geometry.numerics import Float, generator, with_rows
 from mapfusion.vision.front_end import FrontEnd, FrontEndParameters
@@ -133,7 +133,7 @@ def run(settings: FeatureSettings, job: Job) -> dict[str, float]:
         if 0 <= iteration - settings.images_at < settings.images:
             encoded = cv2.imencode(".png", frame.left)[1].tobytes()
             picture = job.output / f"image_{iteration:06d}.png"
-            write_whole(picture, lambda path, encoded=encoded: path.write_bytes(encoded))
+            write_atomically(picture, lambda path, encoded=encoded: path.write_bytes(encoded))
     truth_path, features_path = (job.output / name.format(part=job.part) for name in WRITES)
     joined = {
         name: np.concatenate([getattr(found, name) for found in features])

@@ -150,24 +150,33 @@ def build_pipeline(scenario: AnyScenario) -> Pipeline:
         filtered = {"smoothed": False, "iterations": evaluated}
         # the variation between repetitions is told by the filter's maps
         smoothed = {"smoothed": True, "iterations": fused, "repetitions": 1}
-        alignments = (_alignment(scenario, a, b, own) for own in (filtered, smoothed))
+        alignments = (_alignment(scenario, a, b, values) for values in (filtered, smoothed))
         pairs.append(PairStages(a, b, *alignments))
     fusers = _fusers(scenario, robots, pairs) if pairs else {}
     return Pipeline(scenario, robots, tuple(pairs), fusers)
 
 
-def _stage(kind: StageKind, *sections: Section, own: dict[str, Any], **more: Any) -> Stage:
-    """Return a stage; its settings are taken from `own` and, by name, from the sections."""
+def _stage(kind: StageKind, *sections: Section, values: dict[str, Any], **more: Any) -> Stage:
+    """Return a stage whose settings are collected by field name.
+
+    Args:
+        kind: kind of the stage, which tells the fields of its settings.
+        sections: scenario sections, in which the fields are searched.
+        values: values of fields, which have precedence over the sections.
+        more: further arguments of `Stage`.
+    """
     settings = kind.work.__annotations__["settings"]
-    known = {name: value for section in sections for name, value in section} | own
-    own_settings = settings(**{field.name: known[field.name] for field in fields(settings)})
-    return Stage(kind.name, kind.label, own_settings, kind.work, kind.writes, **more)
+    value_by_name = {name: value for section in sections for name, value in section} | values
+    stage_settings = settings(
+        **{field.name: value_by_name[field.name] for field in fields(settings)}
+    )
+    return Stage(kind.name, kind.label, stage_settings, kind.work, kind.writes, **more)
 
 
 def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
     """Yield the stages of simulated robots."""
     require_pybullet()  # here rather than in a worker, after the first stages
-    world, render, keep = scenario.world, scenario.render, scenario.keep
+    world, render, keep_settings = scenario.world, scenario.render, scenario.keep
     lines = tuple(tuple(wall.points) for wall in world.walls)
     walls = Walls(lines, world.wall_height_m, world.wall_thickness_m)
     routes = tuple(
@@ -175,39 +184,64 @@ def _simulated(scenario: Simulation) -> Iterable[RobotStages]:
         for robot in scenario.robots
     )
     driven = _stage(
-        drive.DRIVE_STAGE, scenario, scenario.drive, own={"walls": walls, "robots": routes}
+        drive.DRIVE_STAGE, scenario, scenario.drive, values={"walls": walls, "robots": routes}
     )
-    to_paint = {"walls": walls, "looks": tuple((wall.look, wall.mirrored) for wall in world.walls)}
-    before = {"drive": driven, "faces": _stage(drive.FACES_STAGE, scenario, world, own=to_paint)}
+    face_values = {
+        "walls": walls,
+        "looks": tuple((wall.look, wall.mirrored) for wall in world.walls),
+    }
+    feature_inputs = {
+        "drive": driven,
+        "faces": _stage(drive.FACES_STAGE, scenario, world, values=face_values),
+    }
     n_frames, drawn_by = scenario.drive.frames, renderer_name(render.renderer)
-    vision, unread = scenario.vision, FrontEndParameters()
+    vision, default_parameters = scenario.vision, FrontEndParameters()
     size = n_frames, n_frames * vision.harris.max_corners, descriptor_bytes(vision.descriptor)
-    found_by = ("harris", "stereo", "descriptor", "usurf")
-    finding = replace(unread, **{name: getattr(vision, name) for name in found_by})
-    tracking = replace(vision, **{name: getattr(unread, name) for name in found_by})
-    origin = ""
+    extraction_fields = ("harris", "stereo", "descriptor", "usurf")
+    extraction_parameters = replace(
+        default_parameters, **{name: getattr(vision, name) for name in extraction_fields}
+    )
+    tracking_parameters = replace(
+        vision, **{name: getattr(default_parameters, name) for name in extraction_fields}
+    )
+    descriptor_origin = ""
     if vision.descriptor not in DESCRIBERS:
         target = descriptor_target(vision.descriptor)
         file, module = target.rpartition(":")[0], target.partition(".")[0]
-        origin = f"{target} {fingerprint(file if file.endswith('.py') else module)}"
+        descriptor_origin = f"{target} {fingerprint(file if file.endswith('.py') else module)}"
     for robot in scenario.robots:
-        own = {"robot": robot.name, "n_frames": n_frames, "drawn_by": drawn_by}
-        own["radiometry"] = robot.radiometry or scenario.radiometry
-        own["odometry"] = robot.odometry or scenario.odometry
-        chunks, to_find = features.chunks(n_frames), own | {"vision": finding, "origin": origin}
+        robot_values = {"robot": robot.name, "n_frames": n_frames, "drawn_by": drawn_by}
+        robot_values["radiometry"] = robot.radiometry or scenario.radiometry
+        robot_values["odometry"] = robot.odometry or scenario.odometry
+        chunks, feature_values = (
+            features.chunks(n_frames),
+            robot_values | {"vision": extraction_parameters, "origin": descriptor_origin},
+        )
         extracted = _stage(
             features.FEATURES_STAGE,
             scenario,
             render,
-            keep,
-            own=to_find,
-            before=before,
+            keep_settings,
+            values=feature_values,
+            before=feature_inputs,
             parts=chunks,
         )
-        to_track, images = own | {"vision": tracking}, {"drive": driven, "features": extracted}
-        tracked = _stage(log.OBSERVED_STAGE, scenario, keep, own=to_track, before=images)
+        observed_values, observed_inputs = (
+            robot_values | {"vision": tracking_parameters},
+            {"drive": driven, "features": extracted},
+        )
+        tracked = _stage(
+            log.OBSERVED_STAGE,
+            scenario,
+            keep_settings,
+            values=observed_values,
+            before=observed_inputs,
+        )
         logged = _stage(
-            log.LOG_STAGE, scenario, own=own, before={"drive": driven, "observed": tracked}
+            log.LOG_STAGE,
+            scenario,
+            values=robot_values,
+            before={"drive": driven, "observed": tracked},
         )
         mapped = _slam(scenario, logged)
         smoothed = _smooth(scenario, logged, mapped, n_frames, n_frames)
@@ -265,7 +299,7 @@ def _read_recorded(folder: Path, _: object) -> _ReadLog:
 def _slam(scenario: Scenario, logged: Stage | RecordedLog) -> Stage:
     """Return the stage of a robot's filter."""
     sections = (scenario, scenario.slam, scenario.evaluate, scenario.keep)
-    return _stage(slam.SLAM_STAGE, *sections, own={}, before={"log": logged})
+    return _stage(slam.SLAM_STAGE, *sections, values={}, before={"log": logged})
 
 
 def _smooth(
@@ -277,7 +311,7 @@ def _smooth(
     return _stage(
         smooth.SMOOTH_STAGE,
         scenario.smooth,
-        own={
+        values={
             "smoother": smoother_parameters(scenario),
             "iterations": iterations,
             "noise_floor_m": settings.noise_floor_m,
@@ -294,10 +328,10 @@ def smoother_parameters(scenario: Scenario) -> SmootherParameters:
 
 
 def _alignment(
-    scenario: Scenario, a: RobotStages, b: RobotStages, own: dict[str, Any]
+    scenario: Scenario, a: RobotStages, b: RobotStages, values: dict[str, Any]
 ) -> AlignmentStages:
     """Return the stages that align maps of two robots."""
-    parts = align.batches(own["iterations"])
+    parts = align.batches(values["iterations"])
     maps: dict[str, Stage | RecordedLog] = {}
     smooth_of: dict[str, Stage | RecordedLog] = {}
     for side, robot in (("a", a), ("b", b)):
@@ -307,8 +341,8 @@ def _alignment(
     matched = _stage(
         align.MATCH_STAGE,
         scenario.align,
-        own=own,
-        before=maps | smooth_of if own["smoothed"] else maps,
+        values=values,
+        before=maps | smooth_of if values["smoothed"] else maps,
         parts=parts,
         shares="maps",
     )
@@ -318,15 +352,17 @@ def _alignment(
         estimates[entry.name] = _stage(
             align.ALIGNER_STAGE,
             *(scenario, scenario.align, entry),
-            own=own | {"origin": method.origin()},
+            values=values | {"origin": method.origin()},
             before=maps | smooth_of | {"match": matched},
             parts=parts,
             loads=(method.own_module,),
             # fusing waits for the merging aligner only
             shares="" if entry.name == scenario.merge.aligner else f"estimates on {matched.key}",
         )
-    named = {f"aligner {i}": stage for i, stage in enumerate(estimates.values())}
-    joined = _stage(align.ALIGN_STAGE, own={"batches": parts}, before={"match": matched} | named)
+    aligner_inputs = {f"aligner {i}": stage for i, stage in enumerate(estimates.values())}
+    joined = _stage(
+        align.ALIGN_STAGE, values={"batches": parts}, before={"match": matched} | aligner_inputs
+    )
     return AlignmentStages(matched, estimates, joined)
 
 
@@ -336,29 +372,29 @@ def _fusers(
     """Return the stages of the fusers by name."""
     n_frames = max(robot.n_frames for robot in robots)
     iterations = smooth.fused_iterations(n_frames, scenario.evaluate.every, scenario.fuse.every)
-    before: dict[str, Stage | RecordedLog] = {}
+    inputs: dict[str, Stage | RecordedLog] = {}
     for robot in robots:
-        before |= {f"log {robot.name}": robot.log, f"slam {robot.name}": robot.slam}
-        before[f"smooth {robot.name}"] = robot.smooth
+        inputs |= {f"log {robot.name}": robot.log, f"slam {robot.name}": robot.slam}
+        inputs[f"smooth {robot.name}"] = robot.smooth
     aligned: dict[bool, dict[str, Stage | RecordedLog]] = {True: {}, False: {}}
     for pair in pairs:  # fused maps do not depend on the other aligners
-        both = f"{pair.a.name} {pair.b.name}"
+        pair_name = f"{pair.a.name} {pair.b.name}"
         for smoothed, stages_of in ((True, pair.smoothed), (False, pair.filtered)):
             aligned[smoothed] |= {
-                f"match {both}": stages_of.match,
-                f"aligner {both}": stages_of.aligners[scenario.merge.aligner],
+                f"match {pair_name}": stages_of.match,
+                f"aligner {pair_name}": stages_of.aligners[scenario.merge.aligner],
             }
-    own = {"robots": tuple(robot.name for robot in robots), "iterations": tuple(iterations)}
-    own |= {"smoother": smoother_parameters(scenario)}
-    own |= {"noise_floor_m": scenario.slam.filter.noise_floor_m}
+    values = {"robots": tuple(robot.name for robot in robots), "iterations": tuple(iterations)}
+    values |= {"smoother": smoother_parameters(scenario)}
+    values |= {"noise_floor_m": scenario.slam.filter.noise_floor_m}
     stages = {}
     for name in scenario.fuse.fusers:
         origin = code_of_fuser(name)
         stages[name] = _stage(
             fuse.FUSE_STAGE,
             scenario.merge,
-            own=own | {"fuser": name, "origin": origin},
-            before=before | aligned[make_fuser(name).smoothed],
+            values=values | {"fuser": name, "origin": origin},
+            before=inputs | aligned[make_fuser(name).smoothed],
             loads=("mapfusion.fusion" if origin else target_of(name).partition(":")[0],),
         )
     return stages

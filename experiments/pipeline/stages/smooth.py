@@ -56,9 +56,10 @@ from mapfusion.viewing import LogSightings
 PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
 
 # Observations whose landmark differs from that of the filter.
-PARTED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
+REASSIGNED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
 
-WRITES = ("parted_{part}.parquet", "path_{part}.parquet")
+_REASSIGNED_FILE, _PATH_FILE = "parted_{part}.parquet", "path_{part}.parquet"
+WRITES = (_REASSIGNED_FILE, _PATH_FILE)
 # Further files of a smoothed log; `PATH` tells if it was smoothed.
 _MAP_FILES = (
     "map_{part}.parquet",
@@ -106,16 +107,16 @@ def run(settings: SmoothSettings, job: Job) -> None:
     If the log cannot be smoothed, there is no map and an empty path with the reason.
     """
     log, smoother = log_to_smooth(job.inputs["log"], job.inputs["slam"], settings.smoother)
-    given = smoother_inputs(job, log, int(job.part), settings.noise_floor_m)
-    own = replace(settings, smoother=smoother)
-    made = smooth_log(own, *given, read_attitude(job.inputs["log"]))
-    landmarks, path, landmark, ended = made
+    inputs = smoother_inputs(job, log, int(job.part), settings.noise_floor_m)
+    settings_of_log = replace(settings, smoother=smoother)
+    result = smooth_log(settings_of_log, *inputs, read_attitude(job.inputs["log"]))
+    landmarks, path, landmark, ended = result
     if landmarks is not None:
         write_map(_map_path(job.output, job.part), landmarks)
-    _, filters, _ = given
+    _, filters, _ = inputs
     changed = np.flatnonzero(landmark != filters)
     rows = {"observation": changed, "source_observation": landmark[changed]}
-    write_table(_parted_path(job.output, job.part), rows, PARTED)
+    write_table(_reassigned_path(job.output, job.part), rows, REASSIGNED)
     rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
     attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
     write_table(_path_path(job.output, job.part), rows, PATH, attributes)
@@ -125,12 +126,12 @@ SMOOTH_STAGE = StageKind("smooth", "smooth the logs", run, WRITES)
 
 
 def log_to_smooth(
-    log: Path, slam: Path, stated: SmootherParameters
+    log: Path, slam: Path, parameters: SmootherParameters
 ) -> tuple[RobotLog, SmootherParameters]:
     """Return the filter's input log, and the smoother's parameters with the filter's noise."""
     filtered, covariance = log_as_filtered(log, slam)
-    motion = stated.motion.scaled(noise_factor(slam))
-    return filtered, replace(stated, motion=motion, odometry_covariance=covariance)
+    motion = parameters.motion.scaled(noise_factor(slam))
+    return filtered, replace(parameters, motion=motion, odometry_covariance=covariance)
 
 
 def log_until(log: RobotLog, iteration: int, noise_floor_m: float = 0.0) -> RobotLog:
@@ -170,10 +171,10 @@ def smooth_log(
             "slam.filter.motion states of its odometry, differ by too many orders of magnitude"
         )
     else:
-        ended = (smoothed_log.n_steps, *smoothed_log.tails, smoothed_log.observation_scale, "")
+        outcome = (smoothed_log.n_steps, *smoothed_log.tails, smoothed_log.observation_scale, "")
         try:
-            made = smoothed_map(log, smoothed_log, attitude=attitude)
-            return made, smoothed_log.estimate.path, smoothed_log.landmark, ended
+            landmarks = smoothed_map(log, smoothed_log, attitude=attitude)
+            return landmarks, smoothed_log.estimate.path, smoothed_log.landmark, outcome
         except np.linalg.LinAlgError:
             reason = "has a map whose covariance cannot be computed"
     return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, reason)
@@ -188,30 +189,30 @@ def _map_path(folder: Path, part: str) -> Path:
     return folder / _MAP_FILES[0].format(part=part)
 
 
-def _parted_path(folder: Path, part: str) -> Path:
-    return folder / WRITES[0].format(part=part)
+def _reassigned_path(folder: Path, part: str) -> Path:
+    return folder / _REASSIGNED_FILE.format(part=part)
 
 
 def _path_path(folder: Path, part: str) -> Path:
-    return folder / WRITES[1].format(part=part)
+    return folder / _PATH_FILE.format(part=part)
 
 
-def read_smoothed(folder: Path, last_whole: bool = False) -> dict[int, LandmarkMap]:
+def read_smoothed(folder: Path, only_last_joint: bool = False) -> dict[int, LandmarkMap]:
     """Read the smoothed map of a robot at each smoothed iteration.
 
-    If `last_whole`, only the last map has its joint covariance and viewing evidence, which are most
-    of the data.
+    If `only_last_joint`, only the last map has its joint covariance and viewing evidence, which are
+    most of the data.
 
     Raises:
         DamagedFileError: a file of a map is damaged or missing.
     """
-    known = list(read_smoothed_path(folder))
-    for k in known:
+    iterations = list(read_smoothed_path(folder))
+    for k in iterations:
         for file in map_files(folder, k):
             if not file.is_file():
                 raise DamagedFileError(file, "is missing")
-    alone = known[:-1] if last_whole else ()
-    return {k: read_map(_map_path(folder, str(k)), alone=k in alone) for k in known}
+    without_joint = iterations[:-1] if only_last_joint else ()
+    return {k: read_map(_map_path(folder, str(k)), alone=k in without_joint) for k in iterations}
 
 
 def read_smoothed_path(folder: Path) -> dict[int, Float]:
@@ -234,7 +235,7 @@ def smoothed_owners(smooth: Path, slam: Path, iteration: int, n_observations: in
         n_observations: number of observations of the log up to the iteration.
     """
     owner = Associations.read(slam).at(iteration, n_observations)
-    table, _ = read_table(_parted_path(smooth, str(iteration)), PARTED)
+    table, _ = read_table(_reassigned_path(smooth, str(iteration)), REASSIGNED)
     owner[column(table, "observation")] = column(table, "source_observation")
     return owner
 
@@ -252,7 +253,7 @@ def read_endings(folder: Path) -> pd.DataFrame:
 
 def _iterations(folder: Path) -> list[int]:
     """Return the iterations of the stage's files."""
-    begin, _, end = WRITES[1].partition("{part}")
+    begin, _, end = _PATH_FILE.partition("{part}")
     files = (path.name for path in folder.glob(f"{begin}[0-9]*{end}"))
     return sorted(int(name.removeprefix(begin).removesuffix(end)) for name in files)
 
@@ -336,7 +337,7 @@ class Snapshots(Mapping[int, LandmarkMap]):
                 n_seen = int(np.searchsorted(log.iteration, iteration + 1))
                 owner = self.associations.at(iteration, n_seen)
                 viewing = sightings.viewing(owner, path, origin)
-            made = replace(
+            snapshot = replace(
                 landmarks,
                 descriptor=None if seen.descriptor is None else seen.descriptor[origin],
                 descriptor_kind=seen.descriptor_kind,
@@ -349,8 +350,10 @@ class Snapshots(Mapping[int, LandmarkMap]):
             known = [k for k in self._smoothed if k <= iteration]
             if known:
                 last = max(known)
-                made = with_path_errors(made, self._smoothed[last], complete=last == iteration)
-            self._made[iteration] = made
+                snapshot = with_path_errors(
+                    snapshot, self._smoothed[last], complete=last == iteration
+                )
+            self._made[iteration] = snapshot
         return self._made[iteration]
 
     @cached_property

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from experiments.evaluation.tables import table_path
 from experiments.pipeline.stage import imported_sources, library_versions, source_hash
 from experiments.pipeline.workers import Workers, workers
-from mapfusion.files import read_json, write_json, write_whole
+from mapfusion.files import read_json, write_atomically, write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -240,9 +240,9 @@ class Drawing:
         self._record = self._record or _Record(result)
         for name in FIGURES:
             if name not in self._begun and self._written.issuperset(_REGISTRY[name].reads):
-                self._begin(name, self._record, result)
+                self._start_drawing(name, self._record, result)
 
-    def _begin(self, name: str, record: _Record, result: Path) -> None:
+    def _start_drawing(self, name: str, record: _Record, result: Path) -> None:
         self._begun.add(name)
         unchanged = record.unchanged(name)
         if unchanged and not self._again:
@@ -266,7 +266,7 @@ class Drawing:
         self._record = self._record or _Record(result)
         for name in FIGURES:
             if name not in self._begun:
-                self._begin(name, self._record, result)
+                self._start_drawing(name, self._record, result)
         outcomes = dict(self._kept)
         if outcomes and on_progress is not None:
             on_progress(len(outcomes), len(FIGURES))
@@ -360,7 +360,9 @@ def save_figure(
         figure = draw(*data)
         if caption:
             text = f"{caption} {figure.get_label()}".strip() + "\n"
-            write_whole(folder / f"{name}{_TEXT}", lambda path: path.write_bytes(text.encode()))
+            write_atomically(
+                folder / f"{name}{_TEXT}", lambda path: path.write_bytes(text.encode())
+            )
         # Lay out the figure once for all formats, at the resolution of the first one.
         engine = figure.get_layout_engine()
         if engine is not None:
@@ -373,5 +375,5 @@ def save_figure(
             figure.set_layout_engine(None)
             for file, kind in zip(files, _DPI, strict=True):
                 picture = _rendered(figure, kind)
-                write_whole(file, lambda path, picture=picture: path.write_bytes(picture))
+                write_atomically(file, lambda path, picture=picture: path.write_bytes(picture))
     return files

@@ -32,8 +32,8 @@ _HEADROOM = 0.5  # space for the legend above the spread, as a share of the spre
 _PLANE = ["x_m", "y_m"]
 
 
-class Moments(NamedTuple):
-    """Stored iterations before and after a loop closure of a robot."""
+class ClosureSnapshots(NamedTuple):
+    """Loop closure of a robot, and the stored iterations before and after it."""
 
     closure: LoopClosure
     before: int
@@ -125,24 +125,24 @@ def draw_dispersion(data: ResultTables) -> Figure:
     timeline.legend(loc="upper right")
     timeline.set_title("spread over time")
     closures = loop_closures(data.rows("sightings"), spread)
-    moments = choose_moments(closures, spread)
-    figure.set_label(_about_moments(data, moments))
-    if moments is None:
+    snapshots = choose_snapshots(closures, spread)
+    figure.set_label(_closure_caption(data, snapshots))
+    if snapshots is None:
         for axes in zooms:
             axes.set_axis_off()
     else:
-        robot = moments.closure.robot
+        robot = snapshots.closure.robot
         spread_m = spread[spread["robot"] == robot].set_index("iteration")["spread_m"]
         # mark the sets before and after the closure as A and B, on the path and the time line
         box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "linewidth": 0.5}
         look: dict[str, Any] = {"textcoords": "offset points", "fontweight": "bold"}
         boxed = {"bbox": box, "arrowprops": {"arrowstyle": "-", "linewidth": 0.8}, "zorder": 7}
-        for name, k, side in zip("AB", moments[1:], (9, -15), strict=True):
+        for name, k, side in zip("AB", snapshots[1:], (9, -15), strict=True):
             x, y = data.path_of(robot)[k]
             panels[robot].annotate(name, xy=(x, y), xytext=(side, 9), **look, **boxed)
             timeline.plot(k, spread_m[k], "o", color=BLACK, zorder=4)
             timeline.annotate(name, xy=(k, spread_m[k]), xytext=(3, 3), **look)
-        _draw_zooms(zooms, data, spread_m, moments)
+        _draw_zooms(zooms, data, spread_m, snapshots)
     upper = plan.height_of_row(list(panels.values()), PAGE_WIDTH_IN * span / _GRID_COLUMNS)
     grid.set_height_ratios([upper, _LOWER_ROW_IN])
     figure.set_figheight(upper + _LOWER_ROW_IN)
@@ -158,7 +158,9 @@ def spread_over_time(clouds: pd.DataFrame) -> pd.DataFrame:
     return variance.sum(axis="columns").pow(0.5).rename("spread_m").reset_index()
 
 
-def choose_moments(closures: Sequence[LoopClosure], spread: pd.DataFrame) -> Moments | None:
+def choose_snapshots(
+    closures: Sequence[LoopClosure], spread: pd.DataFrame
+) -> ClosureSnapshots | None:
     """Return a moment before and one after the loop closure with the largest fall of the spread.
 
     In each window the stored iteration with the median spread is chosen, because the spread of a
@@ -168,25 +170,37 @@ def choose_moments(closures: Sequence[LoopClosure], spread: pd.DataFrame) -> Mom
         closures: loop closures of the robots.
         spread: rows of `spread_over_time`.
     """
-    known = [each for each in closures if min(each.before_m, each.after_m) > 0]
-    if not known:
+    measured = [
+        closure_of_robot
+        for closure_of_robot in closures
+        if min(closure_of_robot.before_m, closure_of_robot.after_m) > 0
+    ]
+    if not measured:
         return None
-    closure = min(known, key=lambda each: each.after_m / each.before_m)
-    own = spread[spread["robot"] == closure.robot].set_index("iteration")["spread_m"]
+    closure = min(
+        measured, key=lambda closure_of_robot: closure_of_robot.after_m / closure_of_robot.before_m
+    )
+    spread_of_robot = spread[spread["robot"] == closure.robot].set_index("iteration")["spread_m"]
     k = closure.iteration
     windows = ((k - WINDOW_FRAMES, k - 1), (k, k + WINDOW_FRAMES - 1))
-    inside = (own[(own.index >= first) & (own.index <= last)] for first, last in windows)
-    before, after = (each.sort_values().index[len(each) // 2] for each in inside)
-    return Moments(closure, int(before), int(after))
+    windows_spread = (
+        spread_of_robot[(spread_of_robot.index >= first) & (spread_of_robot.index <= last)]
+        for first, last in windows
+    )
+    before, after = (
+        closure_of_robot.sort_values().index[len(closure_of_robot) // 2]
+        for closure_of_robot in windows_spread
+    )
+    return ClosureSnapshots(closure, int(before), int(after))
 
 
-def _about_moments(data: ResultTables, moments: Moments | None) -> str:
+def _closure_caption(data: ResultTables, snapshots: ClosureSnapshots | None) -> str:
     """Return the part of the caption about the loop closure."""
     if not data.has("sightings"):
         return "The result was made before loop closures were stored."
-    if moments is None:
+    if snapshots is None:
         return "No robot closes a loop: none comes back to its landmarks after new ground."
-    closure = moments.closure
+    closure = snapshots.closure
     before_mm, after_mm = (1e3 * value for value in (closure.before_m, closure.after_m))
     text = (
         f"{closure.robot} closes a loop at k = {closure.iteration}: {closure.n_returned} landmarks "
@@ -204,9 +218,10 @@ def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -
     axes.plot(*path.T, color=GRAY, linewidth=0.7, zorder=2)
     style = {"marker": ".", "markersize": 1.0, "color": data.colours[robot], "zorder": 3}
     clouds = data.of_robot("clouds", robot)  # ordered by iteration
-    ends = np.flatnonzero(np.diff(clouds["iteration"])) + 1
-    sets = np.split(clouds[_PLANE].to_numpy(), ends)
-    enlarged = [own.mean(axis=0) + magnification * (own - own.mean(axis=0)) for own in sets]
+    set_ends = np.flatnonzero(np.diff(clouds["iteration"])) + 1
+    sets = np.split(clouds[_PLANE].to_numpy(), set_ends)
+    centers = (particles.mean(axis=0) for particles in sets)
+    enlarged = [c + magnification * (p - c) for c, p in zip(centers, sets, strict=True)]
     plan.add_points(axes, np.concatenate(enlarged), **style)
     plan.add_frame(axes, length_m=1.5)
     plan.set_view(axes, path[:0], path, walls)
@@ -215,10 +230,10 @@ def _draw_path(axes: Axes, data: ResultTables, robot: str, magnification: int) -
 
 
 def _draw_zooms(
-    zooms: list[Axes], data: ResultTables, spread_m: pd.Series, moments: Moments
+    zooms: list[Axes], data: ResultTables, spread_m: pd.Series, snapshots: ClosureSnapshots
 ) -> None:
     """Draw the particle sets before and after the closure at the same scale."""
-    closure, *iterations = moments
+    closure, *iterations = snapshots
     robot = closure.robot
     clouds = data.of_robot("clouds", robot).set_index("iteration")[_PLANE]
     sightings = data.of_robot("sightings", robot).set_index("iteration")

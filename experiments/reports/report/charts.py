@@ -364,33 +364,33 @@ def success_figure(curves: Sequence[dict[str, Any]], styles: Styles) -> go.Figur
     n_rows = len(curves)  # over the whole width, so that intervals do not overlap
     figure = make_subplots(n_rows, 1, vertical_spacing=0.28 / n_rows)
     panel: Any
-    for panel, each in enumerate(curves, start=1):
-        bins = np.arange(len(each["bins"]))
+    for panel, panel_curves in enumerate(curves, start=1):
+        bins = np.arange(len(panel_curves["bins"]))
         for number, (name, style) in enumerate(styles.items()):
-            own = each["aligners"][name]
+            rates = panel_curves["aligners"][name]
             rate, low, high = (
-                100 * np.array(own[end], dtype=float) for end in ("rate", "low", "high")
+                100 * np.array(rates[end], dtype=float) for end in ("rate", "low", "high")
             )
-            shown = escaped(name)
+            label = escaped(name)
             hover = "%{y:.0f} % (%{customdata[0]:.0f} to %{customdata[1]:.0f} %), "
             interval = {"type": "data", "array": rounded(high - rate), "width": 0}
             interval |= {"arrayminus": rounded(rate - low), "thickness": 1.5}
             trace = go.Scatter(
                 x=bins + _BIN_SHARE * ((number + 0.5) / len(styles) - 0.5),
                 y=rounded(rate),
-                customdata=list(zip(rounded(low), rounded(high), own["n"], strict=True)),
-                name=shown,
+                customdata=list(zip(rounded(low), rounded(high), rates["n"], strict=True)),
+                name=label,
                 legendgroup=name,
                 showlegend=panel == 1,
                 mode="markers",
                 marker={"size": 8, "symbol": style["marker"], "color": style["hex"]},
                 error_y=interval | {"color": faint(style["hex"], 0.6)},
-                hovertemplate=f"{shown}: {hover}%{{customdata[2]}} maps<extra></extra>",
+                hovertemplate=f"{label}: {hover}%{{customdata[2]}} maps<extra></extra>",
             )
             figure.add_trace(trace, panel, 1)
-        ticks = {"tickvals": bins.tolist(), "ticktext": each["bins"], "showgrid": False}
+        ticks = {"tickvals": bins.tolist(), "ticktext": panel_curves["bins"], "showgrid": False}
         ticks |= {"range": [-0.5, len(bins) - 0.5]}
-        figure.update_xaxes(**ticks, title_text=each["label"], row=panel)
+        figure.update_xaxes(**ticks, title_text=panel_curves["label"], row=panel)
         for edge in bins[1:] - 0.5:
             figure.add_vline(edge, line_width=1, line_color=faint(NEUTRAL), row=panel)
     figure.update_yaxes(range=[-3, 103], ticksuffix=" %", title_text="correct")

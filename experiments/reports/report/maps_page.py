@@ -12,7 +12,7 @@ from experiments.reports.report.charts import NEUTRAL, Attributes, chart_style, 
 from experiments.reports.report.document import write_page
 from experiments.reports.report.map_view import SMOOTH, ellipse_polygons
 from mapfusion.errors import InputError
-from mapfusion.files import write_whole
+from mapfusion.files import write_atomically
 from mapfusion.fusion.map_merging import (
     MapAlignment,
     MergedMaps,
@@ -66,7 +66,7 @@ def write_pictures(
             figure, kind = plot_plans(plans, text), plot.suffix.lower().removeprefix(".")
             # without the date, the same maps give the same file
             dated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-            write_whole(
+            write_atomically(
                 plot, lambda file: figure.savefig(file, dpi=_DPI, format=kind, metadata=dated)
             )
         if report is not None:

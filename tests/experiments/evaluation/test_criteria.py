@@ -33,10 +33,10 @@ def test_the_end_is_that_of_each_robot_pair_of_each_run() -> None:
     ends = [("x", "R1", "R2", 40), ("x", "R1", "R3", 90), ("y", "R1", "R2", 60)]
     earlier = [(*end[:3], end[3] - 10) for end in ends]
     rows = pd.DataFrame([*earlier, *ends, ends[1]], columns=pd.Index(columns))
-    found = criteria.at_the_end(rows)
+    found = criteria.at_last_iteration(rows)
     assert [*found.itertuples(index=False, name=None)] == [*ends, ends[1]]
     alone = rows[rows["run_id"] == "x"].drop(columns="run_id")  # a result's own table
-    assert criteria.at_the_end(alone)["iteration"].tolist() == [40, 90, 90]
+    assert criteria.at_last_iteration(alone)["iteration"].tolist() == [40, 90, 90]
 
 
 @pytest.mark.parametrize("wrong", [{"translation_error_m": 0.6}, {"rotation_error_rad": -0.2}])

@@ -30,8 +30,8 @@ def test_a_stage_is_finished_once_all_its_parts_are(tmp_path: Path) -> None:
         assert folder.finished == (done == 2)
         task.run()
     assert folder.finished
-    assert folder.figures()["extra_s"] == 4.0
-    assert folder.figures()["elapsed_s"] > 0
+    assert folder.quantities()["extra_s"] == 4.0
+    assert folder.quantities()["elapsed_s"] > 0
     (folder.path / "half_a").unlink()  # what a part wrote counts, not its mark alone
     assert not folder.finished
     assert [task.finished for task in tasks.values()] == [False, True]

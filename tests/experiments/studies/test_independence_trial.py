@@ -23,8 +23,8 @@ from experiments.studies.independence_trial import (
     STRATEGIES,
     TEAMS,
     Independence,
-    at_the_end,
     cost_rows,
+    medians_at_last_iteration,
     run_independence,
     sent_rows,
     team_of,
@@ -178,7 +178,7 @@ def test_costs_are_of_what_each_way_takes(found: Independence) -> None:
 
 
 def test_summary_is_of_the_last_maps(found: Independence) -> None:
-    summary = at_the_end(found)
+    summary = medians_at_last_iteration(found)
     assert summary["n_robots"].tolist() == [3] * 4
     assert summary["strategy"].tolist() == ["filters", "once", "anew", "together"]
     row, own = summary.iloc[1], last(found.costs, "once")

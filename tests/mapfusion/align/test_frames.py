@@ -22,7 +22,7 @@ from mapfusion.align.frames import (
 )
 from mapfusion.align.refinement import Refinement
 from mapfusion.errors import InputError
-from mapfusion.files import write_whole
+from mapfusion.files import write_atomically
 from mapfusion.fusion.fusers import COMPARED, AlignedPair, make_fuser
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
@@ -314,7 +314,7 @@ def test_a_map_that_holds_the_other_is_named_without_descriptors() -> None:
 
 def test_a_map_without_covariances_needs_a_stated_sigma(tmp_path) -> None:
     path = tmp_path / "a.csv"
-    write_whole(path, lambda file: file.write_text("x_m,y_m,z_m,label\n1,2,3,0\n4,5,6,1\n"))
+    write_atomically(path, lambda file: file.write_text("x_m,y_m,z_m,label\n1,2,3,0\n4,5,6,1\n"))
     with pytest.raises(InputError, match=r"has no column cov_xx_m2.*--sigma 0.05"):
         read_map(path)
     found = read_map(path, sigma_m=0.05)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.datasets.motion_agreement import Stated, agreement, compare
+from mapfusion.datasets.motion_agreement import ReportedMotions, agreement, compare
 from mapfusion.datasets.relative_motion import (
     observed_motions,
     poses_from_increments,
@@ -19,7 +19,7 @@ def test_the_ratio_of_lengths_is_recovered(share: float) -> None:
     log = circling_log(60, 0.0)
     observed = observed_motions(log, 4)
     poses = poses_from_increments(log.odometry * [share, share, 1])
-    found = compare(observed, Stated(poses, NOISE))
+    found = compare(observed, ReportedMotions(poses, NOISE))
     assert found.shift.ratio == pytest.approx(share, rel=0.06)
     assert found.shift.median == pytest.approx(min(share, 1 / share), rel=0.1)
     assert found.turn.median > 0.9

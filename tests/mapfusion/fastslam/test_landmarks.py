@@ -112,4 +112,4 @@ def test_the_end_of_a_track_leaves_alone_what_no_particle_has_any_more() -> None
     maps.resample(np.zeros(2, dtype=np.int32))
     maps.bring_up_to_date(slots[maps.slots.generation[slots] != FREE])
     assert maps.slots.generation[slots[1]] == FREE
-    assert tracked.ended(None, maps.slots).tolist() == [slots[0]]
+    assert tracked.slots_of_ended_tracks(None, maps.slots).tolist() == [slots[0]]

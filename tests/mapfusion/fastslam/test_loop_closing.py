@@ -220,9 +220,12 @@ def log_likelihood(frame: FrameAssociation, maps: ParticleMaps, rows, motion) ->
     upper = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     for k in rows:
         r = maps.slots.row[frame.chosen[k]]
-        Z = maps.slots.own.covariance_m2[r, 1][upper] + frame.sightings.covariance_m2[k, 1][upper]
+        Z = (
+            maps.slots.by_particle.covariance_m2[r, 1][upper]
+            + frame.sightings.covariance_m2[k, 1][upper]
+        )
         point = rotation_about_z(motion[2]) @ frame.sightings.point_m[k, 1] + [*motion[:2], 0]
-        off = (point - maps.slots.own.mean_m[r, 1])[:n]
+        off = (point - maps.slots.by_particle.mean_m[r, 1])[:n]
         total -= GATE / 2 * np.log(1 + off @ np.linalg.solve(Z[:n, :n], off) / GATE)
     return total
 

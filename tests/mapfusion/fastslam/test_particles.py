@@ -136,7 +136,7 @@ def test_what_all_particles_have_from_one_ancestor_is_kept_once_and_comes_back()
 def test_a_landmark_takes_a_row_of_76_bytes_a_particle_and_less_than_500_once():
     n_slots, n_rows, n_particles = 4 * BLOCK, 10, 200
     slots = allocate(n_slots, n_rows, n_particles)
-    of_rows = [*slots.own, slots.slot_of_row]
+    of_rows = [*slots.by_particle, slots.slot_of_row]
     of_slots = [*slots.common, *slots[3:]]
     assert sum(part.nbytes for part in of_rows) == n_rows * (76 * n_particles + 8)
     assert sum(part.nbytes for part in of_slots) < 500 * n_slots

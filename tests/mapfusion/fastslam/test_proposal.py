@@ -77,10 +77,10 @@ def test_a_translation_alone_is_the_kalman_filter_s_answer() -> None:
     eta, _ = draw(slots, seen, pose, sigma, np.zeros((1, 3)))
     turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     prior = turn @ np.diag(sigma[:2] ** 2) @ turn.T
-    Z = full(slots.own.covariance_m2[0, 0]) + full(seen.covariance_m2[0, 0])
+    Z = full(slots.by_particle.covariance_m2[0, 0]) + full(seen.covariance_m2[0, 0])
     H = np.eye(3)[:, :2]
     K = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + Z)
-    shift = K @ (slots.own.mean_m[0, 0] - seen.point_m[0, 0])
+    shift = K @ (slots.by_particle.mean_m[0, 0] - seen.point_m[0, 0])
     np.testing.assert_allclose(turn @ (sigma[:2] * eta[0, :2]), shift, atol=1e-12)
     posterior = (np.eye(2) - K @ H) @ prior
     spread = np.stack(
@@ -107,13 +107,13 @@ def test_a_false_pair_does_not_take_the_pose_along() -> None:
     points = rng.uniform((1, -2, 0), (4, 2, 1), (20, 3))
     pose = np.array([0.02, -0.01, 0.03])
     slots = slots_of(transform_points(pose, points), 1e-4)
-    slots.own.mean_m[7, 0, :2] += [0.5, -0.5]
+    slots.by_particle.mean_m[7, 0, :2] += [0.5, -0.5]
     seen = observations_in_map(
         np.zeros((1, 3)), points, np.tile(1e-4 * np.eye(3), (20, 1, 1)), False
     )
     chosen = np.arange(20)[:, None]
     at, given = np.zeros((1, 3)), (0.0, np.full(3, 0.05), 21.0, False)
-    eta, _ = informed_disturbance(slots.own, slots.row, chosen, seen, at, *given, at)
+    eta, _ = informed_disturbance(slots.by_particle, slots.row, chosen, seen, at, *given, at)
     np.testing.assert_allclose(0.05 * eta[0], pose, atol=0.003)
 
 
@@ -125,7 +125,7 @@ def many_particles(n: int, n_points: int) -> tuple[Slots, MapObservations, np.nd
     covariance = np.tile(1e-3 * np.diag([4.0, 1.0, 2.0]), (n_points, 1, 1))
     seen = observations_in_map(pose, points, covariance, False)
     slots = slots_of(points, 1e-4, n)
-    slots.own.mean_m[:n_points] += rng.normal(0, 0.02, (n_points, n, 3))
+    slots.by_particle.mean_m[:n_points] += rng.normal(0, 0.02, (n_points, n, 3))
     chosen = np.where(rng.uniform(size=(n_points, n)) < 0.7, np.arange(n_points)[:, None], -1)
     return slots, seen, pose, chosen
 
@@ -137,7 +137,7 @@ def test_a_particle_is_drawn_as_if_it_were_alone(n: int) -> None:
     sigma, gate, turn = np.array([0.1, 0.05, 0.08]), 21.0, 0.1
     normal = np.random.default_rng(9).standard_normal((n, 3))
     found, ratio = informed_disturbance(
-        slots.own, slots.row, chosen, seen, pose, turn, sigma, gate, False, normal
+        slots.by_particle, slots.row, chosen, seen, pose, turn, sigma, gate, False, normal
     )
     for m in range(n):
         eta, before = np.zeros(3), pose[m, 2] - turn
@@ -147,10 +147,10 @@ def test_a_particle_is_drawn_as_if_it_were_alone(n: int) -> None:
             angle = sigma[2] * eta[2]
             R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
             for k in np.flatnonzero(chosen[:, m] >= 0):
-                W = full(slots.own.covariance_m2[k, m]) + full(seen.covariance_m2[k, m])
+                W = full(slots.by_particle.covariance_m2[k, m]) + full(seen.covariance_m2[k, m])
                 W = np.linalg.inv(W)
                 arm = seen.point_m[k, m, :2] - pose[m, :2]
-                off = seen.point_m[k, m] - slots.own.mean_m[k, m]
+                off = seen.point_m[k, m] - slots.by_particle.mean_m[k, m]
                 off[:2] += axes @ (sigma[:2] * eta[:2]) + R @ arm - arm
                 J = np.zeros((3, 3))
                 J[:2, :2] = axes * sigma[:2]
@@ -206,9 +206,9 @@ def slots_of(mean_m: np.ndarray, variance_m2: float, n_particles: int = 1) -> Sl
     """Landmarks (S, 3), the same in all particles, equally certain in all directions."""
     slots, n = ParticleMaps(n_particles, 21.0).slots, len(mean_m)
     slots.row[:n] = np.arange(n)
-    slots.own.mean_m[:n] = mean_m[:, None]
-    slots.own.covariance_m2[:n] = np.array([1, 0, 0, 1, 0, 1]) * variance_m2
-    slots.own.count[:n] = 1
+    slots.by_particle.mean_m[:n] = mean_m[:, None]
+    slots.by_particle.covariance_m2[:n] = np.array([1, 0, 0, 1, 0, 1]) * variance_m2
+    slots.by_particle.count[:n] = 1
     return slots
 
 
@@ -225,7 +225,7 @@ def draw(slots, seen, pose, sigma, standard_normal):
     """With a gate so wide that no pair is doubted."""
     chosen = np.zeros((1, 1), dtype=np.int64)
     return informed_disturbance(
-        slots.own, slots.row, chosen, seen, pose, 0.0, sigma, 1e12, False, standard_normal
+        slots.by_particle, slots.row, chosen, seen, pose, 0.0, sigma, 1e12, False, standard_normal
     )
 
 

@@ -95,7 +95,7 @@ def test_it_is_the_smoother_on_the_log_so_far(tmp_path: Path) -> None:
     np.testing.assert_allclose(maps[k].covariance_m2, expected.covariance_m2, atol=1e-9)
     np.testing.assert_array_equal(maps[k].source_observation, expected.source_observation)
     assert maps[k].joint is not None
-    last_whole = read_smoothed(tmp_path / "out", last_whole=True)
+    last_whole = read_smoothed(tmp_path / "out", only_last_joint=True)
     assert last_whole[k].joint is None
     assert last_whole[N_FRAMES - 1].joint is not None
     assert len(maps[N_FRAMES - 1]) >= len(maps[k]) > 5

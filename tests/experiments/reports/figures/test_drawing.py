@@ -23,7 +23,11 @@ from experiments.reports.figures.drawing import FIGURES, Drawing, draw_all, draw
 from experiments.reports.figures.error_figures import draw_coverage, draw_fusers
 from experiments.reports.figures.map_figures import draw_two_maps
 from experiments.reports.figures.result_tables import ResultTables
-from experiments.reports.figures.slam_figures import Moments, choose_moments, spread_over_time
+from experiments.reports.figures.slam_figures import (
+    ClosureSnapshots,
+    choose_snapshots,
+    spread_over_time,
+)
 from experiments.reports.figures.style import aligner_styles, house_style
 from mapfusion.errors import InputError
 
@@ -328,14 +332,14 @@ def test_moments_lie_before_and_after_the_closure_with_the_largest_fall() -> Non
     ]
     own = [0.9, 0.1, 0.5, 0.3, 0.2, 0.4, 0.1, 0.01, 0.2, 0.3, 0.05, 0.9]
     spread = pd.concat([spreads("R1", [0.2] * 12), spreads("R2", own)])
-    moments = choose_moments(closures, spread)
-    assert moments is not None
+    snapshots = choose_snapshots(closures, spread)
+    assert snapshots is not None
     # windows: 10 to 59 with values 0.1 0.5 0.3 0.2 0.4, and 60 to 109 with 0.1 0.01 0.2 0.3 0.05
-    assert moments == Moments(closures[1], 30, 60)
+    assert snapshots == ClosureSnapshots(closures[1], 30, 60)
 
 
 def test_without_a_loop_closure_there_are_no_moments() -> None:
-    assert choose_moments([], spreads("R1", [0, 0.1, 0.3, 0.01])) is None
+    assert choose_snapshots([], spreads("R1", [0, 0.1, 0.3, 0.01])) is None
 
 
 def test_spread_is_the_root_mean_square_distance_from_the_mean() -> None:
