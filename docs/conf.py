@@ -3,10 +3,15 @@
 The pages of the reference are written from the code before each build.
 """
 
+import ast
 import inspect
 import itertools
 import json
+import os
+import shutil
+import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +20,7 @@ import typer
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.errors import ExtensionError
 
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS.parent))
@@ -33,11 +39,13 @@ extensions = [
 ]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
-exclude_patterns = ["_build", "pictures"]
+exclude_patterns = ["_build", "examples", "pictures"]
 html_theme = "furo"
 html_math_renderer = "mathml"  # needs no script and no network
 html_title = "mapfusion"
 html_show_copyright = False
+html_show_sphinx = False
+default_role = "code"  # single backquotes in docstrings
 autodoc_typehints = "none"  # the docstrings name types and shapes
 autodoc_member_order = "bysource"
 napoleon_use_ivar = True
@@ -168,6 +176,36 @@ def write_reference(_: Sphinx) -> None:
         (REFERENCE / f"{name}.md").write_text(page(), encoding="utf-8")
 
 
+def write_examples(app: Sphinx) -> None:
+    """Run the examples that changed; write a page of each with its output and picture."""
+    source = Path(app.srcdir)
+    folder = source / "reference" / "examples"
+    folder.mkdir(parents=True, exist_ok=True)
+    for program in sorted((source / "examples").glob("*.py")):
+        page = folder / f"{program.stem}.md"
+        if page.is_file() and page.stat().st_mtime > program.stat().st_mtime:
+            continue
+        code = program.read_text(encoding="utf-8")
+        title, _, about = (ast.get_docstring(ast.parse(code)) or "").partition("\n")
+        with tempfile.TemporaryDirectory() as place:
+            ran = subprocess.run(  # noqa: S603  # our own programs
+                [sys.executable, str(program), str(source.parent)],
+                cwd=place,
+                env=os.environ | {"MPLBACKEND": "Agg", "PYTHONPATH": str(source.parent)},
+                capture_output=True,
+                text=True,
+            )
+            if ran.returncode:
+                raise ExtensionError(f"{program.name} failed: {ran.stderr.strip()}")
+            shutil.copy(Path(place) / "picture.png", folder / f"{program.stem}.png")
+        body = code.split('"""\n', 1)[-1].strip()
+        page.write_text(
+            f"# {title.rstrip('.')}\n\n{about.strip()}\n\n```python\n{body}\n```\n\n"
+            f"Output:\n\n```text\n{ran.stdout}```\n\n![{title}]({program.stem}.png)\n",
+            encoding="utf-8",
+        )
+
+
 def write_math(translator: Any, node: nodes.math) -> None:
     """Write an equation in a line as MathML."""
     translator.body.append(convert(node.astext()))
@@ -181,6 +219,7 @@ def write_math_block(translator: Any, node: nodes.math_block) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Draw equations as MathML, and write the reference before the pages are read."""
+    """Draw equations as MathML; write reference and examples before the pages are read."""
     app.add_html_math_renderer("mathml", (write_math, None), (write_math_block, None))
     app.connect("builder-inited", write_reference)
+    app.connect("builder-inited", write_examples)
