@@ -1,7 +1,8 @@
 """A new aligner beside RANSAC.
 
 The new method trusts the half of the pairs whose descriptors are nearest to each other. `estimated`
-is its own answer, before the common least-squares refinement. The true `T_a_b` is (2, 1, 0).
+is its own answer, before the least-squares refinement that all methods share. The true `T_a_b` is
+(2, 1, 0).
 """
 
 import matplotlib.pyplot as plt
@@ -38,9 +39,10 @@ def error_m(aligner, noise, seed):
         count, source = np.ones(60, np.int32), np.arange(60)
         own = {"descriptor": described.astype(np.float32), "planar": True}
         maps.append(mapfusion.LandmarkMap(position_m, covariance_m2, count, source, **own))
-    pairs = mapfusion.match(*maps)
+    map_a, map_b = maps
+    pairs = mapfusion.match(map_a, map_b)
     registration = mapfusion.Registration(aligner)
-    found = registration.register(*maps, pairs, np.random.default_rng(seed)).estimated
+    found = registration.register(map_a, map_b, pairs, np.random.default_rng(seed)).estimated
     return np.hypot(*(found.T_a_b[:2] - [2, 1]))
 
 
