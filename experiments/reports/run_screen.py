@@ -158,7 +158,8 @@ def print_plan(plan: RunPlan, results: Path, jobs: int) -> None:
         [
             f"Estimate: {plan.elapsed_s:.0f} s with {processes} ({plan.work_s:.0f} s of work), "
             f"{memory_gb:.1f} GB of memory at most.",
-            f"  It uses {basis}. Nothing was run.",
+            f"  It uses {basis}.",
+            "  A first run also compiles kernels, one to two minutes. Nothing was run.",
         ]
     )
 
