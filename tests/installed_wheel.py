@@ -30,6 +30,7 @@ PACKAGED = (
     "sim",
     "experiments",
     "scenarios",
+    "docs",
 )
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 MARKED = re.compile(r"Programming Language :: Python :: (3\.\d+)$")
@@ -170,10 +171,11 @@ def test_the_suite_is_there(installed: Installed) -> None:
 
 
 def test_the_manual_is_there(installed: Installed) -> None:
-    pages = [*(ROOT / "experiments" / "docs").glob("*.md")]
+    pages = [*(ROOT / "docs").glob("*.md")]
     (there,) = installed.environment.glob("lib/*/site-packages/experiments/docs")
     assert str(there) in installed.answer("mapfusion", "docs")
     assert all((there / page.name).read_bytes() == page.read_bytes() for page in pages)
+    assert {each.suffix for each in there.iterdir()} == {".md"}
     shown = installed.answer("mapfusion", "docs", "formats")
     assert shown.strip() == (there / "formats.md").read_text().strip()
 

@@ -296,7 +296,7 @@ def print_page(name: str) -> None:
 
 
 def _pages() -> list[Path]:
-    return sorted(MANUAL.glob("*.md"))
+    return sorted(page for page in MANUAL.glob("*.md") if page.stem != "index")  # the site's
 
 
 def print_scenarios(entries: Sequence[dict[str, Any]]) -> None:

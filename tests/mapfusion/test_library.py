@@ -16,7 +16,7 @@ from mapfusion.errors import MOVED_MODULES
 from mapfusion.geometry.se2 import between, wrap
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "experiments" / "docs" / "library.md"
+PAGE = ROOT / "docs" / "library.md"
 
 
 def test_importing_it_imports_nothing_else():

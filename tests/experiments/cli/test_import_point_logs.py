@@ -15,7 +15,7 @@ from mapfusion.landmark_map import read_map
 from tests.helpers.tiny_scenario import command
 from tests.mapfusion.datasets.test_point_logs import write_recording
 
-PAGE = Path(__file__).parents[3] / "experiments" / "docs" / "point_logs.md"
+PAGE = Path(__file__).parents[3] / "docs" / "point_logs.md"
 FROM_DEGREES, EXAMPLE = re.findall(
     r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
 )
