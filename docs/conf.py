@@ -181,6 +181,12 @@ def write_examples(app: Sphinx) -> None:
     source = Path(app.srcdir)
     folder = source / "reference" / "examples"
     folder.mkdir(parents=True, exist_ok=True)
+    programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    settings = os.environ | {
+        "MPLBACKEND": "Agg",
+        "PATH": programs,  # with the command `mapfusion` of this environment
+        "PYTHONPATH": str(source.parent),
+    }
     for program in sorted((source / "examples").glob("*.py")):
         page = folder / f"{program.stem}.md"
         if page.is_file() and page.stat().st_mtime > program.stat().st_mtime:
@@ -191,7 +197,7 @@ def write_examples(app: Sphinx) -> None:
             ran = subprocess.run(  # noqa: S603  # our own programs
                 [sys.executable, str(program), str(source.parent)],
                 cwd=place,
-                env=os.environ | {"MPLBACKEND": "Agg", "PYTHONPATH": str(source.parent)},
+                env=settings,
                 capture_output=True,
                 text=True,
             )
