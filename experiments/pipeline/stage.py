@@ -33,6 +33,7 @@ PACKAGES = ("mapfusion", "sim", "experiments")
 _FINDS_BY_NAME = frozenset({"mapfusion/align/aligners.py"})
 _DATA = ".urdf"  # suffix of files that a module reads from its own folder
 _KEPT = (".py", _DATA)
+_MANUAL = "docs"  # of `experiments`: a link in a checkout, a folder in a copy of one; no source
 _NUMERICAL_LIBRARIES = ("numba", "numpy", "opencv-python-headless", "pyarrow", "scipy")
 _SIMULATOR = "pybullet"  # optional; used by modules of `sim` only
 # Import statement as written by the formatter; Python's parser takes ten times as long.
@@ -134,7 +135,8 @@ def _files_below(root: Path, part: str) -> tuple[str, ...]:
     if not (root / part).is_dir():
         return (part,) if part.endswith(_KEPT) else ()
     found = []
-    for folder, _, names in os.walk(root / part):
+    for folder, subfolders, names in os.walk(root / part):
+        subfolders[:] = [name for name in subfolders if name != _MANUAL]
         place = Path(folder).relative_to(root).as_posix()
         found += [f"{place}/{name}" for name in names if name.endswith(_KEPT)]
     return tuple(sorted(found, key=lambda file: file.split("/")))

@@ -73,7 +73,7 @@ def test_the_filter_needs_what_its_rows_take(tiny_path: Path) -> None:
     name = "slam.filter.n_particles"
     one, two, three = (need(tiny_path, f"{name}={n}")[name] for n in (100, 200, 300))
     assert three - two == pytest.approx(two - one)
-    own = allocate(64, 256, 100).own
+    own = allocate(64, 256, 100).by_particle
     per_landmark = sum(part.nbytes for part in own) / 256
     n_observations = 44 * 110
     assert two - one > 0.02 * n_observations * per_landmark
