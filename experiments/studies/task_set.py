@@ -335,7 +335,6 @@ def _write_card(
         "start at unknown relative poses; correspondences; true motions and true points. Pictures "
         f"by the ray caster of mapfusion, smoothed maps; {drawn}.",
         "license": _LICENCE,
-        "url": "https://pypi.org/project/mapfusion-bench/",
         "isLiveDataset": False,
         "creator": {"@type": "sc:Organization", "name": "mapfusion"},
         "softwareVersions": library_versions(simulator=False),
