@@ -177,7 +177,7 @@ def write_reference(_: Sphinx) -> None:
 
 
 def write_examples(app: Sphinx) -> None:
-    """Run the examples that changed; write a page of each with its output and picture."""
+    """Run the examples; write a page of each with its output and picture."""
     source = Path(app.srcdir)
     folder = source / "reference" / "examples"
     folder.mkdir(parents=True, exist_ok=True)
@@ -189,8 +189,6 @@ def write_examples(app: Sphinx) -> None:
     }
     for program in sorted((source / "examples").glob("*.py")):
         page = folder / f"{program.stem}.md"
-        if page.is_file() and page.stat().st_mtime > program.stat().st_mtime:
-            continue
         code = program.read_text(encoding="utf-8")
         title, _, about = (ast.get_docstring(ast.parse(code)) or "").partition("\n")
         with tempfile.TemporaryDirectory() as place:

@@ -28,17 +28,17 @@ class Nearest:
 def error_m(aligner, noise, seed):
     """Return the translation error of an aligner on two maps with noisy descriptors."""
     rng = np.random.default_rng(seed)
-    points, looks = rng.uniform(0, 20, (60, 2)), rng.standard_normal((60, 16))
+    points, descriptors = rng.uniform(0, 20, (60, 2)), rng.standard_normal((60, 16))
     maps = []
     for start in ([0, 0], [2, 1]):
         seen = points - start + rng.normal(0, 0.02, (60, 2))
-        described = looks + rng.normal(0, noise, looks.shape)
-        described /= np.linalg.norm(described, axis=1, keepdims=True)
+        observed = descriptors + rng.normal(0, noise, descriptors.shape)
+        observed /= np.linalg.norm(observed, axis=1, keepdims=True)
         position_m = np.column_stack([seen, np.zeros(60)])
         covariance_m2 = np.tile(np.eye(3) * 0.02**2, (60, 1, 1))
         count, source = np.ones(60, np.int32), np.arange(60)
-        own = {"descriptor": described.astype(np.float32), "planar": True}
-        maps.append(mapfusion.LandmarkMap(position_m, covariance_m2, count, source, **own))
+        appearance = {"descriptor": observed.astype(np.float32), "planar": True}
+        maps.append(mapfusion.LandmarkMap(position_m, covariance_m2, count, source, **appearance))
     map_a, map_b = maps
     pairs = mapfusion.match(map_a, map_b)
     registration = mapfusion.Registration(aligner)

@@ -290,7 +290,7 @@ def tasks(
         list[str] | None,
         typer.Argument(
             metavar="[SCENARIO...]",
-            help="Scenarios of the tasks, in place of those of the published set.",
+            help="Scenarios of the tasks, in place of the usual twelve.",
             autocompletion=options.complete_scenario,
         ),
     ] = None,
@@ -316,8 +316,7 @@ def tasks(
     store = Store.of(results)
     with layout.progress() as show:
         made = task_set.make_task_set(output, chosen, parse_seeds(seeds), store, jobs, show)
-    kind = "the published set" if made.published else "not the published set"
-    layout.print_lines([f"{len(made.tasks)} tasks in {output}, {kind}", f"SHA-256 {made.digest}"])
+    layout.print_lines([f"{len(made.tasks)} tasks in {output}", f"SHA-256 {made.digest}"])
 
 
 @studies.command()

@@ -116,12 +116,12 @@ def with_aligners(
 
 
 def chosen_aligners(
-    names: Sequence[str], entries: Sequence[AlignerEntry] = ()
+    names: Sequence[str], entries: Sequence[AlignerEntry] = (), option: str = "--aligner"
 ) -> tuple[AlignerEntry, ...]:
     """Return aligners by name: of `entries`, else of the default list, else a method.
 
     A method has its default parameters. A class in a file, FILE.py:CLASS, is named CLASS. Raises
-    InputError if a name is unknown.
+    InputError, which names the option, if a name is unknown.
     """
     from experiments.plugins.discovery import require_usable
     from experiments.scenario.settings import DEFAULT_ALIGNERS, AlignerEntry
@@ -133,7 +133,7 @@ def chosen_aligners(
                 require_usable(name, {})
                 known[name] = AlignerEntry(name=name.rpartition(":")[2], method=name)
             except ValueError as error:
-                raise InputError(f"--aligner {name}: {' '.join(str(error).split())}") from error
+                raise InputError(f"{option} {name}: {' '.join(str(error).split())}") from error
         chosen.append(known[name])
     return tuple(chosen)
 

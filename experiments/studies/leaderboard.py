@@ -93,7 +93,7 @@ from mapfusion.fusion.fusers import (
     make_fuser,
 )
 from mapfusion.fusion.merge import connect
-from mapfusion.geometry.numerics import generator
+from mapfusion.geometry.numerics import Float, generator
 from mapfusion.verification.false_alarms import Verdict
 from mapfusion.verification.registration import PairRegistration, VerifiedRefinement
 
@@ -133,7 +133,7 @@ def run_aligner(settings: AlignerCell, job: Job) -> None:
     single_threaded()
     aligner = callable_aligner(settings.method, settings.parameters, settings.time_limit_s)
     reference = callable_aligner(REFERENCE_ALIGNER, {}, settings.time_limit_s)
-    tasks, parts = tasks_of_scenario(Path(settings.folder), settings.scenario), []
+    tasks, parts = tasks_of_scenario(Path(settings.folder), settings.digest, settings.scenario), []
     for number, task in enumerate(tasks):
         maps, offered = task.pair.maps, task.pair.offered
         evidence = evidence_of(task.pair.rivals, maps, VERIFIER.evidence)
@@ -173,7 +173,7 @@ class FuserCell:
 def run_fuser(settings: FuserCell, job: Job) -> None:
     """Fuse the last maps of each run, aligned by their true correspondences; write the errors."""
     single_threaded()
-    tasks, rows = tasks_of_scenario(Path(settings.folder), settings.scenario), []
+    tasks, rows = tasks_of_scenario(Path(settings.folder), settings.digest, settings.scenario), []
     fuser, reference = make_fuser(settings.fuser), make_fuser(REFERENCE_FUSER)
     for seed in dict.fromkeys(task.seed for task in tasks):
         of_run = [task for task in tasks if task.seed == seed]
@@ -223,19 +223,31 @@ def chosen_methods(
     Raises:
         InputError: a name is unknown.
     """
-    plug_ins = (entry.name for entry in entry_points(group=GROUP))
-    fusers = [name for name in (*FUSERS, *plug_ins) if name != REFERENCE]
     if REFERENCE in methods:
         raise InputError(f"--method {REFERENCE}: smooths the logs, which a task set does not have")
+    plug_ins = (entry.name for entry in entry_points(group=GROUP))
+    fusers = [name for name in (*FUSERS, *plug_ins) if name != REFERENCE]
     aligners = [name for name in methods if name not in fusers]
     if only:
         named = [name for name in fusers if name in methods]
         fusers = list(dict.fromkeys([REFERENCE_FUSER, *named])) if named else []
-        return chosen_aligners([REFERENCE_ALIGNER, *aligners] if aligners else []), tuple(fusers)
-    defaults = {entry.method for entry in DEFAULT_ALIGNERS}
-    others = [name for name in known_methods() if name not in defaults]
-    known = [*(entry.name for entry in DEFAULT_ALIGNERS), *others]
-    return chosen_aligners([*known, *aligners]), tuple(fusers)
+        aligners = [REFERENCE_ALIGNER, *aligners] if aligners or not named else []
+    else:
+        defaults = {entry.method for entry in DEFAULT_ALIGNERS}
+        others = (name for name in known_methods() if name not in defaults)
+        aligners = [*(entry.name for entry in DEFAULT_ALIGNERS), *others, *aligners]
+    entries = chosen_aligners(aligners, option="--method")
+    _require_different([entry.name for entry in entries])
+    return entries, tuple(fusers)
+
+
+def _require_different(names: Sequence[str]) -> None:
+    """Raise InputError if two methods have the same name, or one has that of the oracle."""
+    for name in names:
+        if name == ORACLE or names.count(name) > 1:
+            raise InputError(
+                f"{name}: is the name of another method too; rename your class or file"
+            )
 
 
 @dataclass(frozen=True)
@@ -265,6 +277,28 @@ class Leaderboard:
         return rank_fusers(self.fusions)
 
 
+def stages_of_scenario(
+    folder: str,
+    digest: str,
+    scenario: str,
+    aligners: Sequence[AlignerEntry],
+    fusers: Sequence[str],
+) -> tuple[list[Stage], list[Stage]]:
+    """Return the stages of the aligners and of the fusers on the tasks of one scenario."""
+    of_aligners = []
+    for entry in aligners:
+        method = find_method(entry.method)
+        cell = AlignerCell(folder, digest, scenario, **dict(entry), origin=method.origin())
+        loads, writes = (method.own_module,), (_ALIGNMENTS_FILE,)
+        of_aligners.append(Stage("leaderboard", _LABEL, cell, run_aligner, writes, loads=loads))
+    of_fusers = []
+    for name in fusers:
+        cell = FuserCell(folder, digest, scenario, name, code_of_fuser(name))
+        loads, writes = ("mapfusion.fusion",), (_FUSIONS_FILE,)
+        of_fusers.append(Stage("leaderboard_fusion", _LABEL, cell, run_fuser, writes, loads=loads))
+    return of_aligners, of_fusers
+
+
 def run_leaderboard(
     tasks: TaskSet,
     aligners: Sequence[AlignerEntry],
@@ -289,40 +323,25 @@ def run_leaderboard(
     Raises:
         InputError: a file of estimates cannot be used.
     """
+    _require_different([*(entry.name for entry in aligners), *(path.stem for path in estimates)])
     given = [read_estimates(path, tasks) for path in estimates]
-    of_set = {"folder": str(tasks.folder.resolve()), "digest": tasks.digest}
-    alignments, fusions, stages = list[Stage](), list[Stage](), list[Stage]()
     origins: dict[str, Any] = {path.stem: {"file": path.name} for path in estimates}
-    for scenario in tasks.scenarios:
-        first = len(alignments), len(fusions)
-        for entry in aligners:
-            method = find_method(entry.method)
-            origins[entry.name] = method.origin()
-            own = {"scenario": scenario, **dict(entry), "origin": method.origin()}
-            loads = (method.own_module,)
-            cell, file = AlignerCell(**of_set, **own), (_ALIGNMENTS_FILE,)
-            stage = Stage("leaderboard", _LABEL, cell, run_aligner, file, loads=loads)
-            alignments.append(stage)
-        for fuser in fusers:
-            cell = FuserCell(**of_set, scenario=scenario, fuser=fuser, origin=code_of_fuser(fuser))
-            file = (_FUSIONS_FILE,)
-            fusions.append(Stage("leaderboard_fusion", _LABEL, cell, run_fuser, file))
-        # by scenario, so that the maps of a scenario are read once
-        stages += [*alignments[first[0] :], *fusions[first[1] :]]
+    origins |= {entry.name: find_method(entry.method).origin() for entry in aligners}
+    alignments, fusions, ordered = list[Stage](), list[Stage](), list[Stage]()
+    for scenario in tasks.scenarios:  # so that the maps of a scenario are read once
+        of_set = str(tasks.folder.resolve()), tasks.digest
+        of_aligners, of_fusers = stages_of_scenario(*of_set, scenario, aligners, fusers)
+        alignments, fusions = alignments + of_aligners, fusions + of_fusers
+        ordered += [*of_aligners, *of_fusers]
     with workers(1) as this_process:
-        run_tasks(list(tasks_of(stages, store).values()), this_process, on_progress)
-    aligned, fused = (
-        [read_rows(store.path(stage) / file, table) for stage in stages]
-        for stages, file, table in (
-            (alignments, _ALIGNMENTS_FILE, ALIGNMENTS),
-            (fusions, _FUSIONS_FILE, FUSIONS),
-        )
-    )
-    # each aligner has its own copy of the oracle's rows
+        run_tasks(list(tasks_of(ordered, store).values()), this_process, on_progress)
+    aligned = [read_rows(store.path(each) / _ALIGNMENTS_FILE, ALIGNMENTS) for each in alignments]
+    fused = [read_rows(store.path(each) / _FUSIONS_FILE, FUSIONS) for each in fusions]
     rows, fusion_rows = (
         pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=pd.Index(names))
         for parts, names in (([*aligned, *given], ALIGNMENTS.names), (fused, FUSIONS.names))
     )
+    # each aligner has its own copy of the oracle's rows
     rows = rows.drop_duplicates(["task", "aligner"], ignore_index=True)
     return Leaderboard(tasks, rows, fusion_rows, origins)
 
@@ -357,10 +376,22 @@ def read_estimates(path: Path, tasks: TaskSet) -> pd.DataFrame:
     for name in names:
         if not pd.api.types.is_numeric_dtype(given[name]):
             raise InputError(f"{path}: {name}: is not a number in every row")
+    if "accepted" in given and not given["accepted"].isin([0, 1]).all():
+        raise InputError(f"{path}: accepted: is not 0 or 1 in every row")
+    stated = [name for name in COVARIANCE if name in given]
+    if stated and len(stated) < len(COVARIANCE):
+        absent = ", ".join(name for name in COVARIANCE if name not in given)
+        raise InputError(f"{path}: has no column {absent}; give all of the covariance, or none")
+    if stated:
+        known = given[given[stated].notna().all(axis=1)]
+        least = np.linalg.eigvalsh(covariances_of(known)).min(axis=1, initial=np.inf)
+        if len(wrong := known.loc[~(least > 0), "task"]):
+            reason = "the covariance is not positive definite"
+            raise InputError(f"{path}: task {wrong.iloc[0]}: {reason}; check units and signs")
     given_for = {row["task"]: row for row in given.to_dict("records")}
     parts = []
     for scenario in tasks.scenarios:
-        for task in tasks_of_scenario(tasks.folder, scenario):
+        for task in tasks_of_scenario(tasks.folder, tasks.digest, scenario):
             row = task.pair.keys | {"aligner": path.stem, "repetition": 0}
             row |= _given_row(len(task.pair.offered), given_for.get(task.name))
             rows = _errors_of(task, row)
@@ -376,7 +407,7 @@ def _given_row(n_pairs: int, given: Mapping[Any, Any] | None) -> dict[str, Any]:
         missing = undetermined("no motion is given", n_pairs, time.perf_counter())
         return estimate_row(n_pairs, missing, missing, Verdict(missing.status, np.nan, ""))
     covariance = np.full((3, 3), np.nan)
-    if set(COVARIANCE) <= given.keys():
+    if COVARIANCE[0] in given:
         covariance = covariances_of(pd.DataFrame([given]))[0]
     inlier = np.zeros(n_pairs, dtype=bool)
     alignment = Alignment(T_a_b, covariance, inlier, np.nan, Status.ACCEPTED, "", np.nan, False)
@@ -465,17 +496,29 @@ def _right_decisions(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _more_right(right: pd.DataFrame, aligners: Sequence[str]) -> set[tuple[str, str]]:
     """Return the pairs (better, worse) of aligners whose shares of right decisions differ."""
+    if right.empty:
+        return set()
     by_task = right.pivot_table(index=["run_id", "task"], columns="aligner", values="right")
     run_id, n_runs = by_task.index.get_level_values("run_id"), right["run_id"].nunique()
-    pairs = list(combinations(aligners, 2))
-    tests = []
-    for first, second in pairs:
-        change = (by_task[first] - by_task[second]).to_numpy()
-        tests.append(mean_change(change_of_each_run(change, run_id, n_runs, mean=True)))
+    changes = {
+        (a, b): change_of_each_run((by_task[b] - by_task[a]).to_numpy(), run_id, n_runs, mean=True)
+        for a, b in combinations(aligners, 2)
+    }
+    return _better(changes)
+
+
+def _better(changes: Mapping[tuple[str, str], Float]) -> set[tuple[str, str]]:
+    """Return the pairs (better, worse) of methods that differ significantly.
+
+    Args:
+        changes: of each pair of methods the changes of all runs, negative where the first is
+            better.
+    """
+    tests = [mean_change(change) for change in changes.values()]
     significant = holm(np.array([test.p for test in tests])) < SIGNIFICANCE
     return {
-        (a, b) if test.change > 0 else (b, a)
-        for (a, b), test, known in zip(pairs, tests, significant, strict=True)
+        (a, b) if test.change < 0 else (b, a)
+        for (a, b), test, known in zip(changes, tests, significant, strict=True)
         if known
     }
 
@@ -517,14 +560,12 @@ def rank_fusers(fusions: pd.DataFrame) -> pd.DataFrame:
     error = fusions.assign(error=fusions["landmark_rmse_m"].fillna(np.inf))
     by_run = error.pivot_table(index="run_id", columns="fuser", values="error", sort=False)
     fusers = list(dict.fromkeys(fusions["fuser"]))
-    pairs = list(combinations(fusers, 2))
-    tests = [mean_change(log_ratio(by_run[a].to_numpy(), by_run[b].to_numpy())) for a, b in pairs]
-    significant = holm(np.array([test.p for test in tests])) < SIGNIFICANCE
-    beats = {
-        (a, b) if test.change < 0 else (b, a)
-        for (a, b), test, known in zip(pairs, tests, significant, strict=True)
-        if known
-    }
+    beats = _better(
+        {
+            (a, b): log_ratio(by_run[a].to_numpy(), by_run[b].to_numpy())
+            for a, b in combinations(fusers, 2)
+        }
+    )
     ranked = []
     for fuser in fusers:
         own = error[error["fuser"] == fuser]

@@ -25,7 +25,7 @@ from tests.helpers.tiny_scenario import TINY, command
 DOCS = Path(__file__).parents[2] / "docs"
 PAGES = sorted(DOCS.glob("*.md"))
 PAGE_IDS = [page.stem for page in PAGES]
-# Pages of sites and of the suite's tables that hold placeholders in place of values.
+# Command lines with placeholders in place of values cannot be parsed.
 _PLACEHOLDER = re.compile(r"\bF\b|NAME|KEY=|\.\.\.|FILE|FOLDER|COMMAND|\[|<|\$|\bPAGE\b|\|")
 
 

@@ -24,6 +24,7 @@ from experiments.studies.leaderboard import (
     REFERENCE_FUSER,
     Leaderboard,
 )
+from mapfusion.align.alignment import Status
 
 # Headings and formats of the columns, on the screen and on the page.
 ALIGNER_COLUMNS: dict[str, Column] = {
@@ -61,6 +62,9 @@ def print_leaderboard(board: Leaderboard, folder: Path) -> None:
     print_frame(rows, ALIGNER_COLUMNS, "Aligners", note)
     note = f"medians over runs; time: over {REFERENCE_FUSER}'s on the same maps"
     print_frame(board.fusers, FUSER_COLUMNS, "Fusers", note)
+    given = board.alignments
+    absent = dict.fromkeys(given.loc[given["status"] == Status.ABSENT, "aligner"])
+    print_lines(f"  {name}: not ranked, it is not installed" for name in absent)
     failed = zip(rows["aligner"], rows["n_failed"], strict=True)
     print_lines(f"  {name}: failed on {n} tasks, see alignments.parquet" for name, n in failed if n)
     print_lines([f"Page and tables: {folder}"])
@@ -83,12 +87,10 @@ def write_leaderboard(board: Leaderboard, folder: Path) -> None:
         folder,
         {
             "task_set": {"version": tasks.card["version"], "sha256": tasks.digest},
-            "published": tasks.published,
             "made_by": tasks.card["softwareVersions"],
             "methods": dict(board.origins),
         },
     )
-    set_name = "the published set" if tasks.published else "not the published set"
     contents = {
         "title": "Leaderboard",
         "command": "study leaderboard",
@@ -104,7 +106,7 @@ def write_leaderboard(board: Leaderboard, folder: Path) -> None:
         "reference_aligner": REFERENCE_ALIGNER,
         "reference_fuser": REFERENCE_FUSER,
         "provenance": {
-            "Task set": f"version {tasks.card['version']}, {set_name}",
+            "Task set": f"version {tasks.card['version']}",
             "SHA-256": tasks.digest,
             "Tasks": str(tasks.card["description"]),
         },

@@ -1,6 +1,7 @@
 """The frozen task set, and the ranking of aligners and fusers on it."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import pytest
 
 from experiments.evaluation import tables
 from experiments.evaluation.result import run_scenario
+from experiments.pipeline.stage import imported_sources
 from experiments.pipeline.store import Store
+from experiments.pipeline.tables import read_rows, write_rows
 from experiments.pipeline.workers import single_threaded
 from experiments.scenario.loading import load_scenario
 from experiments.studies import leaderboard
@@ -21,11 +24,17 @@ from experiments.studies.leaderboard import (
     read_estimates,
     run_leaderboard,
 )
-from experiments.studies.task_set import CARD, TaskSet, make_task_set, tasks_of_scenario
+from experiments.studies.task_set import (
+    CARD,
+    OFFERED,
+    TaskSet,
+    make_task_set,
+    tasks_of_scenario,
+)
 from mapfusion.errors import InputError
 from mapfusion.geometry import se2
 from tests.helpers.shared_folder import shared_folder
-from tests.helpers.tiny_scenario import TRIO, assert_refused, command
+from tests.helpers.tiny_scenario import TINY, TRIO, assert_refused, command
 
 SEEDS = (3,)
 MOTION = ["tx_m", "ty_m", "theta_rad"]
@@ -59,7 +68,7 @@ def truth_table(task_set: TaskSet) -> pd.DataFrame:
     """True motions of all tasks, as a file of estimates."""
     rows = []
     for scenario in task_set.scenarios:
-        for task in tasks_of_scenario(task_set.folder, scenario):
+        for task in tasks_of_scenario(task_set.folder, task_set.digest, scenario):
             T = se2.between(task.pair.a.path.T_world_map, task.pair.b.path.T_world_map)
             rows.append({"task": task.name, **dict(zip(MOTION, T, strict=True))})
     return pd.DataFrame(rows)
@@ -162,6 +171,10 @@ def test_covariances_and_verdicts_from_a_file_are_judged(task_set: TaskSet, tmp_
         ({"task": "nowhere"}, "nowhere"),
         ({"twice": True}, "two rows"),
         ({"text": True}, "ty_m"),
+        ({"accepted": np.nan}, "accepted: is not 0 or 1"),
+        ({"accepted": 2}, "accepted: is not 0 or 1"),
+        ({"cov_xx": 1.0}, "has no column cov_xy, .*all of the covariance, or none"),
+        ({"cov_xx": -1.0, "rest": 0.0}, "not positive definite"),
     ],
 )
 def test_a_wrong_file_of_estimates_is_refused(
@@ -177,9 +190,39 @@ def test_a_wrong_file_of_estimates_is_refused(
     if "text" in change:
         table = table.astype({"ty_m": object})
         table.loc[0, "ty_m"] = "left"
+    for name in ("accepted", "cov_xx"):
+        if name in change:
+            table[name] = change[name]
+    if "rest" in change:
+        table = table.assign(cov_xy=0.0, cov_xt=0.0, cov_yy=1.0, cov_yt=0.0, cov_tt=1.0)
     table.to_csv(tmp_path / "mine.csv", index=False)
     with pytest.raises(InputError, match=told):
         read_estimates(tmp_path / "mine.csv", task_set)
+
+
+def test_a_task_without_correspondences_has_no_estimate(task_set: TaskSet, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(task_set.folder, tmp_path / "tasks"))
+    path, first = folder / "correspondences.parquet", task_set.tasks["task"].iloc[0]
+    rows = read_rows(path, OFFERED)
+    write_rows(path, OFFERED, rows[rows["task"] != first])
+    (scenario,) = task_set.scenarios
+    tasks = {each.name: each for each in tasks_of_scenario(folder, "another", scenario)}
+    assert len(tasks[first].pair.offered) == 0
+    assert max(len(each.pair.offered) for each in tasks.values()) > 0
+
+
+def test_two_methods_of_one_name_are_refused(task_set: TaskSet, tmp_path: Path) -> None:
+    truth_table(task_set).to_csv(tmp_path / "ransac.csv", index=False)
+    entries, store = chosen_methods(["ransac"], only=True)[0], Store.of(tmp_path)
+    with pytest.raises(InputError, match="ransac: is the name of another method"):
+        run_leaderboard(task_set, entries, (), [tmp_path / "ransac.csv"], store, quiet)
+
+
+def test_changed_fusers_are_run_again() -> None:
+    """The key of a fuser's results covers all fusers' sources, which are loaded by name."""
+    cell = leaderboard.FuserCell("folder", "digest", "tiny", "joint", "")
+    stages = leaderboard.stages_of_scenario(cell.folder, cell.digest, "tiny", (), ("joint",))
+    assert "mapfusion/fusion/joint.py" in imported_sources(*stages[1][0].loads)
 
 
 def alignments(**aligners: tuple[float, float]) -> pd.DataFrame:
@@ -301,7 +344,7 @@ def test_the_command_ranks_a_class_in_a_file(
     assert set(pd.read_csv(folder / "fusers.csv")["fuser"]) <= {"joint", "kalman-drift"}
     assert "Mine" in (folder / "leaderboard.html").read_text()
     origin = json.loads((folder / "provenance.json").read_text())
-    assert origin["published"] is False
+    assert origin["task_set"]["sha256"] == TaskSet.read(made / "tasks").digest
     assert origin["methods"]["Mine"]["files"]
 
 
@@ -322,9 +365,20 @@ def test_bad_input_is_told_in_one_line(
     assert_refused(told, str(tmp_path), "study tasks")
     arguments = ["study", "leaderboard", made / "tasks", "--results", tmp_path]
     assert_refused(command(capsys, *arguments, "--method", "batch"), "batch", "logs")
-    assert_refused(command(capsys, *arguments, "--method", "ransack"), "ransack", "ransac")
+    told = command(capsys, *arguments, "--method", "ransack")
+    assert_refused(told, "--method ransack", "did you mean ransac")
     told = command(capsys, "study", "tasks", "mrclam7", "-o", tmp_path / "t")
     assert_refused(told, "mrclam7", "recording")
+    alone = tmp_path / "alone.yaml"
+    alone.write_text(re.sub(r"  - {name: R2.*\n", "", TINY), encoding="utf-8")
+    told = command(capsys, "study", "tasks", alone, "-o", tmp_path / "t")
+    assert_refused(told, "one robot")
+    (tmp_path / "one.yaml").write_text(TINY, encoding="utf-8")
+    (tmp_path / "two.yaml").write_text(TINY, encoding="utf-8")
+    both = tmp_path / "one.yaml", tmp_path / "two.yaml"
+    assert_refused(
+        command(capsys, "study", "tasks", *both, "-o", tmp_path / "t"), "two.yaml", "tiny"
+    )
 
 
 def test_each_known_method_is_ranked_once() -> None:
