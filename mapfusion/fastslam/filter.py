@@ -18,7 +18,7 @@ from mapfusion.fastslam.association import (
     candidate_pairs,
     label_pairs,
 )
-from mapfusion.fastslam.landmarks import ActiveTracks
+from mapfusion.fastslam.landmark_arrays import ActiveTracks
 from mapfusion.fastslam.loop_closing import (
     DriftModel,
     FrameAssociation,

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import Slots
+from mapfusion.fastslam.landmark_arrays import Slots
 from mapfusion.fastslam.measurement import NEW, MapObservations, quadratic_form
 from mapfusion.geometry.numerics import (
     Float,

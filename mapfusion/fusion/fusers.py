@@ -16,7 +16,7 @@ import numpy as np
 from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.errors import did_you_mean, moved_module_note
-from mapfusion.fusion.aligned_landmarks import AssociationTest
+from mapfusion.fusion.landmark_association import AssociationTest
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap

@@ -14,12 +14,6 @@ import scipy
 
 from mapfusion.align.alignment import MIN_PAIRS
 from mapfusion.descriptors import USURF, merged_kind, relative_distance
-from mapfusion.fusion.aligned_landmarks import (
-    ABSENT,
-    AlignedLandmarks,
-    CandidatePairs,
-    cluster_landmarks,
-)
 from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint_estimate import (
     JointEstimate,
@@ -28,6 +22,12 @@ from mapfusion.fusion.joint_estimate import (
     weighted_information,
 )
 from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.landmark_association import (
+    ABSENT,
+    AlignedLandmarks,
+    CandidatePairs,
+    cluster_landmarks,
+)
 from mapfusion.geometry.joint_covariance import JointCovariance, reduce_rank
 from mapfusion.geometry.numerics import Float, inverses, one_blas_thread
 from mapfusion.geometry.se2 import IDENTITY

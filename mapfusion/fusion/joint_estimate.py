@@ -23,7 +23,7 @@ import scipy
 
 from mapfusion.align.rigid_motion import motion_jacobian
 from mapfusion.camera import EXACT, N_OF_CAMERA, CalibrationError
-from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float, inverses
 from mapfusion.geometry.se2 import inverse, rotation_about_z, transform_points, wrap

@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapfusion.fusion.aligned_landmarks import (
+from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
+from mapfusion.fusion.landmark_association import (
     ABSENT,
     AlignedLandmarks,
     FusePairs,
     one_to_one,
 )
-from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.geometry.numerics import Float
 
 
