@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import scipy.linalg  # its threads are limited only once it is there
+import scipy.linalg  # noqa: F401  # its threads are limited only once it is there
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadFileScheduling
 

@@ -56,8 +56,8 @@ def single_threaded() -> None:
     Only loaded libraries can be limited; SciPy has a separate BLAS.
     """
     import cv2
-    import numpy as np
-    import scipy.linalg
+    import numpy as np  # noqa: F401
+    import scipy.linalg  # noqa: F401
 
     cv2.setNumThreads(1)
     threadpool_limits(1)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.linalg
+import scipy.linalg  # noqa: F401  brings a BLAS of its own
 from scipy.stats import pearsonr
 from threadpoolctl import threadpool_info, threadpool_limits
 
