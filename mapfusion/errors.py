@@ -166,7 +166,10 @@ _FORMER_MODULES = {
     ),
     "verification.verdict": "evidence.precision evidence.pair_evidence evidence.judge",
     "fusion": "fuse team",
-    "fusion.aligned_landmarks": "aligned_landmarks same_point fuse.clusters",
+    "fastslam.landmark_arrays": "fastslam.landmarks",
+    "fusion.landmark_association": (
+        "fusion.aligned_landmarks aligned_landmarks same_point fuse.clusters"
+    ),
     "fusion.fusers": (
         "fuse.fuser fuse.registry fuse.parameters fuse.component fusion.fused_map fused_map "
         "name_order"

@@ -59,7 +59,7 @@ def run(
             print_plan(plan_run(loaded, results, jobs, fresh), results, jobs)
         return
     # The imports for drawing are slow: wrong scenarios are refused before.
-    from experiments.evaluation.criteria import nothing_merged
+    from experiments.evaluation.alignment_criteria import nothing_merged
     from experiments.evaluation.evaluated_run import finding_lines, has_usable_map
     from experiments.evaluation.result import add_times, run_scenario
     from experiments.pipeline.workers import workers

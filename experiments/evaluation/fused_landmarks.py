@@ -24,9 +24,9 @@ from experiments.evaluation.truth import (
 )
 from mapfusion.align.correspondences import Correspondences
 from mapfusion.files import named_columns, point_columns
-from mapfusion.fusion.aligned_landmarks import ABSENT, AlignedLandmarks
 from mapfusion.fusion.fusers import FusedMap, Fuser, Fusion, MergeParameters
 from mapfusion.fusion.kalman import Kalman, KalmanDrift, fuse_landmarks_sequentially, kalman_update
+from mapfusion.fusion.landmark_association import ABSENT, AlignedLandmarks
 from mapfusion.fusion.merge import connect, merge
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, chi_square_bound, squared_mahalanobis

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import COMMON_LANDMARKS, ORACLE
+from experiments.evaluation.alignment_criteria import COMMON_LANDMARKS, ORACLE
 from experiments.evaluation.fused_landmarks import FusedTeam, MergeSettings, fusion_rows
 from experiments.evaluation.map_consistency import (
     Consistency,
@@ -60,8 +60,8 @@ from experiments.pipeline.tables import MOTION
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Oracle
 from mapfusion.files import POSE_FIELDS, named_columns
-from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import FusedMap, Fusion
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float, chi_square_bound, squared_mahalanobis
 from mapfusion.landmark_map import LandmarkMap

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import criteria, tables
-from experiments.evaluation.criteria import (
+from experiments.evaluation import alignment_criteria, tables
+from experiments.evaluation.alignment_criteria import (
     ORACLE,
     NothingMerged,
     edge_precision,
@@ -129,8 +129,8 @@ def _smoother_column(tables: Tables, variant: str) -> float:
 )
 def _oracle_at_the_end(tables: Tables, variant: str) -> float:
     """Return an error or the true pairs of the oracle at the end, median over seeds and pairs."""
-    rows = criteria.at_last_iteration(_of(tables["errors"], ORACLE))
-    return criteria.absolute_errors(rows, [variant])[variant].median()
+    rows = alignment_criteria.at_last_iteration(_of(tables["errors"], ORACLE))
+    return alignment_criteria.absolute_errors(rows, [variant])[variant].median()
 
 
 def _truly_fused(tables: Tables) -> pd.DataFrame:
@@ -205,7 +205,9 @@ def _team_edges(tables: Tables, variant: str) -> float:
 def refined_oracle_distance_m(tables: Tables, aligner: str) -> float:
     """Return the distance of refined translations from the oracle's, median over rich pairs."""
     rows = rich(_of(tables["errors"], aligner))
-    return criteria.absolute_errors(rows, ["oracle_distance_m"])["oracle_distance_m"].median()
+    return alignment_criteria.absolute_errors(rows, ["oracle_distance_m"])[
+        "oracle_distance_m"
+    ].median()
 
 
 @metric(
@@ -221,21 +223,23 @@ def _over_oracle(tables: Tables, aligner: str, variant: str) -> float:
 @metric()
 def estimated_translation_m(tables: Tables, aligner: str) -> float:
     """Return the median translation error before refinement, for answerable pairs."""
-    maps = summarise_alignments(criteria.answerable(_of(tables["errors"], aligner)))
+    maps = summarise_alignments(alignment_criteria.answerable(_of(tables["errors"], aligner)))
     return maps["translation_error_m"].median()
 
 
 @metric()
 def largest_translation_m(tables: Tables, aligner: str) -> float:
     """Return the largest translation error before refinement, for mergeable pairs."""
-    rows = criteria.mergeable(_of(tables["errors"], aligner))
-    return criteria.absolute_errors(rows, ["translation_error_m"])["translation_error_m"].max()
+    rows = alignment_criteria.mergeable(_of(tables["errors"], aligner))
+    return alignment_criteria.absolute_errors(rows, ["translation_error_m"])[
+        "translation_error_m"
+    ].max()
 
 
 @metric(motion_nees_per_dof="nees_per_dof", motion_coverage_90="inside")
 def _alignment_consistency(tables: Tables, aligner: str, variant: str) -> float:
     """Return the consistency of T_a_b: the median NEES per degree of freedom, or the coverage."""
-    values = criteria.alignment_consistency(_of(tables["errors"], aligner))[variant]
+    values = alignment_criteria.alignment_consistency(_of(tables["errors"], aligner))[variant]
     return values.median() if variant == "nees_per_dof" else values.mean()
 
 
@@ -268,19 +272,19 @@ def _all_false_merges(tables: Tables, variant: str) -> float:
     Alignments of the filter's maps and of the smoothed maps count.
     """
     errors = pd.concat([tables["errors"], tables["smoothed_errors"]], ignore_index=True)
-    return criteria.is_false_merge(errors[errors["aligner"] != ORACLE]).mean()
+    return alignment_criteria.is_false_merge(errors[errors["aligner"] != ORACLE]).mean()
 
 
 @metric()
 def false_merges(tables: Tables, aligner: str) -> float:
     """Return the share of false merges among all alignments of an aligner."""
-    return criteria.is_false_merge(_of(tables["errors"], aligner)).mean()
+    return alignment_criteria.is_false_merge(_of(tables["errors"], aligner)).mean()
 
 
 @metric()
 def missed_merges(tables: Tables, aligner: str) -> float:
     """Return the share of refused alignments of an aligner among mergeable pairs."""
-    return (~criteria.mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
+    return (~alignment_criteria.mergeable(_of(tables["errors"], aligner))["accepted"]).mean()
 
 
 def on_smoothed(tables: Tables, aligner: str, aligner_metric: Metric) -> float:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import criteria
+from experiments.evaluation import alignment_criteria
 from experiments.evaluation.fused_landmarks import FusedTeam, team_edge_rows
 from experiments.evaluation.truth import PathTruth, motion_errors
 from mapfusion.align.rigid_motion import fit_rigid
@@ -253,7 +253,7 @@ def team_pair_rows(team: FusedTeam, errors: pd.DataFrame, aligner: str) -> pd.Da
     if edges.empty:
         return edges
     used = (errors["aligner"] == aligner) & (errors["repetition"] == 0)
-    of_judged = criteria.at_last_iteration(errors[used])[[*_PAIR, *_OWN_ALIGNMENT]]
+    of_judged = alignment_criteria.at_last_iteration(errors[used])[[*_PAIR, *_OWN_ALIGNMENT]]
     rows = edges.merge(of_judged, "inner", _PAIR)
     if rows.empty:
         return rows

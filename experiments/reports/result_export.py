@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.criteria import is_used_by_team
+from experiments.evaluation.alignment_criteria import is_used_by_team
 from experiments.evaluation.result import require_result
 from experiments.pipeline.stages.align import alignment_of
 from experiments.reports.export import write_text

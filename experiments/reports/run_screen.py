@@ -12,7 +12,7 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import (
+from experiments.evaluation.alignment_criteria import (
     ANSWERABLE_PAIRS,
     ORACLE,
     answerable,

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from rich.text import Text
 
-from experiments.evaluation.criteria import (
+from experiments.evaluation.alignment_criteria import (
     ORACLE,
     RICH_PAIRS,
     RIGHT_WITHIN_M,

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from experiments.evaluation.criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
+from experiments.evaluation.alignment_criteria import RIGHT_WITHIN_M, RIGHT_WITHIN_RAD
 from experiments.evaluation.tables import table_path
 from experiments.pipeline.stage import library_versions
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, write_rows

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 from ruamel.yaml import YAML
 
-from experiments.evaluation.criteria import (
+from experiments.evaluation.alignment_criteria import (
     ANSWERABLE_PAIRS,
     MERGEABLE_PAIRS,
     RIGHT_WITHIN_M,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.criteria import is_right
+from experiments.evaluation.alignment_criteria import is_right
 from experiments.pipeline.stage import Job, Stage
 from experiments.pipeline.store import Store
 from experiments.pipeline.tables import FLOAT, INT, TEXT, fields, read_rows, write_rows

@@ -18,8 +18,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import criteria
-from experiments.evaluation.criteria import (
+from experiments.evaluation import alignment_criteria
+from experiments.evaluation.alignment_criteria import (
     ANSWERABLE_PAIRS,
     COMMON_LANDMARKS,
     COUNTS,
@@ -75,7 +75,7 @@ class Quantity(NamedTuple):
 
 def _maps_over_oracle(errors: pd.DataFrame) -> pd.DataFrame:
     """Return alignment summaries with each map's refined error over that of the oracle."""
-    maps = criteria.summarise_alignments(errors)
+    maps = alignment_criteria.summarise_alignments(errors)
     of_oracle = maps.assign(oracle=maps[_REFINED].where(maps["aligner"] == ORACLE))
     reference = of_oracle.groupby(MAP_PAIR)["oracle"].transform("first")
     return maps.assign(over_oracle=maps[_REFINED] / reference)
@@ -100,7 +100,7 @@ _SMOOTHER = ("path_rmse_m", "landmark_rmse_m", "nees_per_dof")
 _FUSERS = ("landmark_rmse_m", "over_better_filter", "nees_per_dof", "coverage_95")
 # Columns to read of each table, columns that older runs may lack, and the reduction of the rows.
 READ: dict[str, tuple[Sequence[str] | None, Sequence[str], Callable[..., pd.DataFrame]]] = {
-    "errors": (criteria.NEEDED, criteria.OPTIONAL, _maps_over_oracle),
+    "errors": (alignment_criteria.NEEDED, alignment_criteria.OPTIONAL, _maps_over_oracle),
     "robots": (["robot", "path_error_m", "odometry_error_m"], (), partial(path_rms, by=_ROBOT)),
     "map_fits": (["map", "rmse_m"], (), pd.DataFrame),
     "smoother": (["robot", *_SMOOTHER], (), pd.DataFrame),

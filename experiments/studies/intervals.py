@@ -24,7 +24,7 @@ import pandas as pd
 import scipy
 from numpy.typing import ArrayLike
 
-from experiments.evaluation.criteria import MAP_KEYS
+from experiments.evaluation.alignment_criteria import MAP_KEYS
 from mapfusion.geometry.numerics import Float
 
 CONFIDENCE = 0.95

@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import (
+from experiments.evaluation.alignment_criteria import (
     ORACLE,
     has_common_ground,
     is_false_merge,

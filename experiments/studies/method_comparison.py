@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.criteria import (
+from experiments.evaluation.alignment_criteria import (
     ERROR_COLUMNS,
     MAP_PAIR,
     ORACLE,

@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 import scipy
 
-from experiments.evaluation.criteria import (
+from experiments.evaluation.alignment_criteria import (
     MERGEABLE_PAIRS,
     RIGHT_WITHIN_M,
     answerable,

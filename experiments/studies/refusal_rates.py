@@ -26,8 +26,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import betaincinv
 
-from experiments.evaluation import criteria
-from experiments.evaluation.criteria import (
+from experiments.evaluation import alignment_criteria
+from experiments.evaluation.alignment_criteria import (
     MERGEABLE_PAIRS,
     ORACLE,
     RUN_KEYS,
@@ -85,7 +85,7 @@ def without_common_ground(rows: pd.DataFrame) -> pd.DataFrame:
 
 def mergeable(rows: pd.DataFrame) -> pd.DataFrame:
     """Return unchanged pairs of one world with enough true correspondences for a robust method."""
-    return criteria.mergeable(rows[rows["ground"] == COMMON])
+    return alignment_criteria.mergeable(rows[rows["ground"] == COMMON])
 
 
 def summary(refusals: pd.DataFrame) -> list[dict[str, Any]]:
@@ -349,7 +349,9 @@ def read_answers(runs: Runs) -> Answers:
             n_with_any_ratio += int((accepted & rows[_PASSED].isna()).sum())
             passes = rows[_PASSED].fillna(math.inf).where(accepted, -math.inf)
             answers = rows[list(RUN_KEYS)].assign(passes=passes)
-            is_right = rows.index.isin(criteria.mergeable(rows).index) & right_refined(rows)
+            is_right = rows.index.isin(alignment_criteria.mergeable(rows).index) & right_refined(
+                rows
+            )
             right.append(answers[is_right])
             of_false = answers.assign(passes=passes.where(is_false_merge(rows), -math.inf))
             false.append(_largest_of_runs(of_false))

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation.criteria import MERGEABLE_PAIRS
+from experiments.evaluation.alignment_criteria import MERGEABLE_PAIRS
 from experiments.evaluation.evaluated_run import EvaluatedRun
 from experiments.evaluation.metrics import load_checked
 from experiments.evaluation.result import require_result

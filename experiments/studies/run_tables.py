@@ -15,7 +15,7 @@ import pandas as pd
 import pyarrow as pa
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import RUN_KEYS, setting_columns
+from experiments.evaluation.alignment_criteria import RUN_KEYS, setting_columns
 from experiments.evaluation.tables import read_provenance, read_scenario, require_tables
 from mapfusion.errors import InputError
 from mapfusion.files import read_json, require_version, row_groups, text_attributes

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import criteria
-from experiments.evaluation.criteria import (
+from experiments.evaluation import alignment_criteria
+from experiments.evaluation.alignment_criteria import (
     ANSWERABLE_PAIRS,
     ERROR_COLUMNS,
     MAP_KEYS,
@@ -87,7 +87,7 @@ def medians_of_run(errors: pd.DataFrame) -> pd.DataFrame:
     groups = errors.groupby([*keys, *MAP_KEYS, "aligner"], sort=False, dropna=False)
     medians = groups[list(ERROR_COLUMNS)].median()
     known = {name: medians[name].where(_mostly_known(groups, name)) for name in _SIGNED}
-    parts = [medians.assign(**known), groups[list(criteria.COUNTS)].first()]
+    parts = [medians.assign(**known), groups[list(alignment_criteria.COUNTS)].first()]
     return pd.concat(parts, axis=1).reset_index()
 
 
@@ -141,7 +141,11 @@ def time_bands(
     found |= {"n_maps": grouped.size(), "elapsed_low_s": elapsed.quantile(BAND[0])}
     found |= {"elapsed_s": elapsed.median(), "elapsed_high_s": elapsed.quantile(BAND[1])}
     bands = pd.DataFrame(found).reset_index().drop(columns="group")
-    return bands.set_index("aligner").loc[criteria.methods_in(timed, oracle=True)].reset_index()
+    return (
+        bands.set_index("aligner")
+        .loc[alignment_criteria.methods_in(timed, oracle=True)]
+        .reset_index()
+    )
 
 
 FUSION_COLUMNS = ("nees_with_drift", "nees_without_drift", "degrees_of_freedom", "true_pair")
@@ -221,7 +225,7 @@ def nees_of_pairs(fusion: pd.DataFrame, rng: np.random.Generator) -> pd.DataFram
 def alignment_nees(
     errors: pd.DataFrame, rng: np.random.Generator, maps: str = "FastSLAM's"
 ) -> pd.DataFrame:
-    """Summarise the consistency of accepted alignments (`criteria.alignment_consistency`).
+    """Summarise `alignment_criteria.alignment_consistency` of accepted alignments by aligner.
 
     Args:
         errors: rows of `errors` or `smoothed_errors`.
@@ -233,7 +237,7 @@ def alignment_nees(
         (share of true motions in the 90 % ellipsoid) with intervals over runs.
     """
     rows = []
-    accepted = criteria.alignment_consistency(errors)
+    accepted = alignment_criteria.alignment_consistency(errors)
     for aligner, aligner_rows in accepted.groupby("aligner", sort=False):
         runs, inside = (
             intervals.clusters_of(aligner_rows),
@@ -358,9 +362,14 @@ _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "smoother": (SMOOTHER_COLUMNS, "smoother", smoother_summary, "smoother"),
     "fusers": (FUSER_COLUMNS, "fusers", fuser_summary, "fusers"),
     "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
-    "errors": (criteria.CONSISTENCY_COLUMNS, "alignment_nees", alignment_nees, "alignment_nees"),
+    "errors": (
+        alignment_criteria.CONSISTENCY_COLUMNS,
+        "alignment_nees",
+        alignment_nees,
+        "alignment_nees",
+    ),
     "smoothed_errors": (
-        criteria.CONSISTENCY_COLUMNS,
+        alignment_criteria.CONSISTENCY_COLUMNS,
         "alignment_nees",
         partial(alignment_nees, maps="smoothed"),
         "alignment_nees smoothed",

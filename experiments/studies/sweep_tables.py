@@ -30,7 +30,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ValidationError
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import absolute_errors, answerable
+from experiments.evaluation.alignment_criteria import absolute_errors, answerable
 from experiments.evaluation.metrics import load_checked
 from experiments.pipeline.stage import library_versions, source_hash
 from experiments.pipeline.tables import FLOAT, TEXT, fields

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
 
-from experiments.evaluation.criteria import MERGEABLE_PAIRS
+from experiments.evaluation.alignment_criteria import MERGEABLE_PAIRS
 from experiments.scenario.suite import parse_seeds
 from experiments.studies import refusal_trial
 from experiments.studies.refusal_trial import Case, MappedWorld, worlds_of

@@ -53,11 +53,11 @@ def make_aligner(name: str, /, **parameters: Any) -> Method:
     Raises:
         ValueError: the name or a parameter is unknown, or a parameter is out of range.
     """
-    own = ALIGNERS | PEERS
-    if name not in own:
-        known = f"known are {', '.join(own)}{did_you_mean(name, own)}"
-        raise ValueError(f"unknown aligner {name!r}, {known}")
-    return construct(name, own[name], parameters)
+    constructors = ALIGNERS | PEERS
+    if name not in constructors:
+        known_text = f"known are {', '.join(constructors)}{did_you_mean(name, constructors)}"
+        raise ValueError(f"unknown aligner {name!r}, {known_text}")
+    return construct(name, constructors[name], parameters)
 
 
 def construct(name: str, constructor: Callable[..., Any], parameters: Mapping[str, Any]) -> Any:
@@ -66,12 +66,20 @@ def construct(name: str, constructor: Callable[..., Any], parameters: Mapping[st
     Raises:
         ValueError: a parameter is unknown or out of range.
     """
-    made: Any = constructor  # untyped, because is_dataclass would narrow the type to an instance
-    known = [own.name for own in fields(made)] if is_dataclass(made) else list(parameters)
-    wrong = next((key for key in parameters if key not in known), None)
-    if wrong is not None:
-        there = f"known: {', '.join(known) or 'none'}{did_you_mean(wrong, known)}"
-        raise ValueError(f"parameters: {name}: {wrong}: unknown; {there}")
+    dataclass_like: Any = (
+        constructor  # untyped, because is_dataclass would narrow the type to an instance
+    )
+    field_names = (
+        [each.name for each in fields(dataclass_like)]
+        if is_dataclass(dataclass_like)
+        else list(parameters)
+    )
+    unknown_field = next((key for key in parameters if key not in field_names), None)
+    if unknown_field is not None:
+        known_text = (
+            f"known: {', '.join(field_names) or 'none'}{did_you_mean(unknown_field, field_names)}"
+        )
+        raise ValueError(f"parameters: {name}: {unknown_field}: unknown; {known_text}")
     try:
         height = parameters.get("height", HeightGate())
         if isinstance(height, dict):
@@ -187,35 +195,37 @@ class _MethodInput(NamedTuple):
 
 
 def alignment_of_fit(
-    found: Fit | Undetermined, pairs: Pairs, rows: np.ndarray, started_s: float
+    fit: Fit | Undetermined, pairs: Pairs, rows: np.ndarray, started_s: float
 ) -> Alignment:
     """Return the alignment of a fit, with drift and covariance estimated from the residuals.
 
     Args:
-        found: result of the method.
+        fit: result of the method.
         pairs: all N pairs.
         rows: (n,) rows of the pairs that the method got.
         started_s: `time.perf_counter()` at the start.
     """
-    if isinstance(found, Undetermined):
-        return undetermined(found.reason, len(pairs), started_s)
+    if isinstance(fit, Undetermined):
+        return undetermined(fit.reason, len(pairs), started_s)
     inlier = np.zeros(len(pairs), dtype=bool)
-    inlier[rows[found.inlier]] = True
-    fitted = pairs[inlier] if found.fitted is None else found.fitted
-    refusal, n_inliers = found.refusal, int(np.count_nonzero(inlier))
+    inlier[rows[fit.inlier]] = True
+    fitted = pairs[inlier] if fit.fitted is None else fit.fitted
+    refusal, n_inliers = fit.refusal, int(np.count_nonzero(inlier))
     if n_inliers < MIN_PAIRS and not refusal:
         refusal = f"{n_inliers} correspondences agree, at least {MIN_PAIRS} are needed"
     covariance, drift, lower_bound = np.full((3, 3), np.nan), np.nan, True
     if len(fitted) >= 2:
-        gain = found.gain
+        gain = fit.gain
         if gain is None:
-            gain = least_squares_gain(found.T_a_b, fitted.p_b, found.weight)
-        own = residual_covariances(found.T_a_b, fitted.covariance_a, fitted.covariance_b)
-        e = residuals(found.T_a_b, fitted.p_a, fitted.p_b)
-        drift = estimate_drift_m(e, own, found.gate_m)
-        covariance, lower_bound = alignment_covariance(found.T_a_b, fitted, gain, drift)
+            gain = least_squares_gain(fit.T_a_b, fitted.p_b, fit.weight)
+        residual_covariance = residual_covariances(
+            fit.T_a_b, fitted.covariance_a, fitted.covariance_b
+        )
+        e = residuals(fit.T_a_b, fitted.p_a, fitted.p_b)
+        drift = estimate_drift_m(e, residual_covariance, fit.gate_m)
+        covariance, lower_bound = alignment_covariance(fit.T_a_b, fitted, gain, drift)
     return Alignment(
-        found.T_a_b,
+        fit.T_a_b,
         covariance,
         inlier,
         time.perf_counter() - started_s,

@@ -133,10 +133,10 @@ class Pairs:
 
         Without origins and without a covariance both are unchanged and zero.
         """
-        known = np.zeros((3, 3)) if covariance is None else covariance
+        motion_covariance = np.zeros((3, 3)) if covariance is None else covariance
         if self.origins is None or not any(origin.any() for origin in self.origins):
-            return T_a_b, known
-        return moved_motion(T_a_b, known, *self.origins)
+            return T_a_b, motion_covariance
+        return moved_motion(T_a_b, motion_covariance, *self.origins)
 
     @cached_property
     def cache(self) -> dict[Any, Any]:
@@ -220,14 +220,14 @@ class Pairs:
         if PlanarPairs in self.cache:
             return self.cache[PlanarPairs]
         n = len(self)
-        plan = PlanarPairs(*np.empty((2, n, 2)), *np.empty((2, n, 2, 2)))
-        for part, whole in zip(plan[:2], (self.p_a, self.p_b), strict=True):
-            part[:, 0], part[:, 1] = whole[:, 0], whole[:, 1]
-        for part, whole in zip(plan[2:], (self.covariance_a, self.covariance_b), strict=True):
-            part[:, 0, 0], part[:, 0, 1] = whole[:, 0, 0], whole[:, 0, 1]
-            part[:, 1, 0], part[:, 1, 1] = whole[:, 1, 0], whole[:, 1, 1]
-        self.cache[PlanarPairs] = plan
-        return plan
+        planar = PlanarPairs(*np.empty((2, n, 2)), *np.empty((2, n, 2, 2)))
+        for part, spatial in zip(planar[:2], (self.p_a, self.p_b), strict=True):
+            part[:, 0], part[:, 1] = spatial[:, 0], spatial[:, 1]
+        for part, spatial in zip(planar[2:], (self.covariance_a, self.covariance_b), strict=True):
+            part[:, 0, 0], part[:, 0, 1] = spatial[:, 0, 0], spatial[:, 0, 1]
+            part[:, 1, 0], part[:, 1, 1] = spatial[:, 1, 0], spatial[:, 1, 1]
+        self.cache[PlanarPairs] = planar
+        return planar
 
     def of_one_height(self, gate: HeightGate) -> np.ndarray:
         """Return the rows (n,) of the pairs with compatible heights; all rows of planar maps."""
@@ -255,10 +255,10 @@ def why_too_few(
     for landmarks in (map_a, map_b):
         if len(landmarks) == 0:
             return f"{landmarks.called} is empty"
-    few = f"{n_pairs} correspondences"
+    message = f"{n_pairs} correspondences"
     if n_pairs:  # else no method has enough, and all say the same
-        few += f", at least {needed} are needed"
-    return f"{few}: {shortage}" if shortage else few
+        message += f", at least {needed} are needed"
+    return f"{message}: {shortage}" if shortage else message
 
 
 def undetermined(reason: str, n_pairs: int, started_s: float) -> Alignment:
@@ -288,26 +288,27 @@ def lacks_extent(p: Float, covariance_m2: Float, drift_m2: float, dimensions: in
         dimensions: 1 or 2.
     """
     in_plan = np.ascontiguousarray(p.T[:2])
-    off = in_plan - in_plan[:, :1]  # avoids cancellation far from the origin
+    centred = in_plan - in_plan[:, :1]  # avoids cancellation far from the origin
     # rounding error, as in numpy.linalg.matrix_rank
     rounding = len(p) * np.finfo(np.float64).eps * np.abs(in_plan).max()
     floor_m2 = drift_m2 + rounding**2 + np.finfo(np.float64).tiny
     xx, xy, yy = (covariance_m2[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     weight = 1 / ((xx + yy) / 2 + floor_m2)
-    off -= (off @ weight / weight.sum())[:, None]
-    x, y = np.linalg.eigh((off * weight) @ off.T)[1][:, 2 - dimensions]  # eigenvalues ascend
+    centred -= (centred @ weight / weight.sum())[:, None]
+    # eigenvalues ascend
+    x, y = np.linalg.eigh((centred * weight) @ centred.T)[1][:, 2 - dimensions]
     weight = 1 / (x * x * xx + 2 * x * y * xy + y * y * yy + floor_m2)
-    along = x * off[0] + y * off[1]
+    along = x * centred[0] + y * centred[1]
     along -= along @ weight / weight.sum()
     freedom = max(len(p) - dimensions, 1)
     return bool(weight @ along**2 <= chi_square_bound(1 - SHAPE_FALSE_ALARM, freedom))
 
 
-def why_angle_is_open(pairs: Pairs, drift_m2: float = 0.0, which: str = " that agree") -> str:
+def why_angle_is_open(pairs: Pairs, drift_m2: float = 0.0, qualifier: str = " that agree") -> str:
     """Return why the angle between the maps is open; empty if the pairs (1 or more) determine it.
 
-    The angle is open if all pairs lie on one point of either map. `which` describes the pairs in
-    the text.
+    The angle is open if all pairs lie on one point of either map. `qualifier` describes the
+    pairs in the text.
     """
     for name, p, covariance in (
         ("a", pairs.p_a, pairs.covariance_a),
@@ -316,9 +317,14 @@ def why_angle_is_open(pairs: Pairs, drift_m2: float = 0.0, which: str = " that a
         if lacks_extent(p, covariance, drift_m2, 1):
             n = len(pairs)
             if n > 1 and drift_m2 > 0 and not lacks_extent(p, covariance, 0.0, 1):
-                off = f"under the best one they are {math.sqrt(drift_m2):.2g} m off"
-                return f"no motion fits the {n} pairs: {off}, too much for the extent of map {name}"
-            lie = f"pairs{which} lie" if n > 1 else f"pair{which.replace('agree', 'agrees')} lies"
+                drift_text = f"under the best one they are {math.sqrt(drift_m2):.2g} m off"
+                excess = f"{drift_text}, too much for the extent of map {name}"
+                return f"no motion fits the {n} pairs: {excess}"
+            lie = (
+                f"pairs{qualifier} lie"
+                if n > 1
+                else f"pair{qualifier.replace('agree', 'agrees')} lies"
+            )
             sigma_m = math.sqrt(np.median(covariance[:, [0, 1], [0, 1]]) + drift_m2)
             noise = f"noise of {sigma_m:.2g} m can tell"
             return f"the {n} {lie} on one point of map {name} in plan, as far as {noise}"
@@ -343,7 +349,7 @@ class Needs:
         if self.dimensions == 0:
             return ""
         if self.dimensions == 1:
-            return why_angle_is_open(pairs, which="")
+            return why_angle_is_open(pairs, qualifier="")
         if lacks_extent(pairs.p_b, pairs.covariance_b, 0.0, 2):
             n = len(pairs)
             return f"the {n} pairs lie on one line of map b in plan, as far as noise can tell"

@@ -85,24 +85,24 @@ def full_set(n: int) -> np.ndarray:
 
 
 @kernel
-def reduce_to_core(graph: np.ndarray, chosen: np.ndarray, least: int, rows: np.ndarray) -> int:
-    """Reduce `chosen` (W,) to its k-core with k = `least` (Seidman 1983).
+def reduce_to_core(graph: np.ndarray, chosen: np.ndarray, min_size: int, rows: np.ndarray) -> int:
+    """Reduce `chosen` (W,) to its k-core with k = `min_size` (Seidman 1983).
 
     Each vertex of the k-core has at least k neighbours in it; all cliques of more than k vertices
     lie in it. The members are written to `rows`. Returns their number, 0 for an empty core.
     """
-    n, before = list_members(chosen, rows), -1
-    while n != before:
-        before = n
-        for i in range(before):
-            if n <= least:  # too few vertices are left
+    n, n_before = list_members(chosen, rows), -1
+    while n != n_before:
+        n_before = n
+        for i in range(n_before):
+            if n <= min_size:  # too few vertices are left
                 return 0
             v = rows[i]
-            if count_common(graph[v], chosen) < least:
+            if count_common(graph[v], chosen) < min_size:
                 chosen[v // WORD] &= ~(np.uint64(1) << np.uint64(v % WORD))
                 n -= 1
         list_members(chosen, rows)
-    return n if n > least else 0
+    return n if n > min_size else 0
 
 
 def may_contain_clique(graph: np.ndarray, among: np.ndarray, size: int) -> bool:
@@ -266,25 +266,25 @@ def larger_clique(
     """
     n, words = graph.shape
     best, rows = np.zeros(0, np.int64), np.empty(n, np.int64)
-    chosen, before = among.copy(), np.zeros(words, np.uint64)
+    chosen, previous = among.copy(), np.zeros(words, np.uint64)
     degree = np.full(n, -1)
     for v in rows[: reduce_to_core(graph, chosen, at_least, rows)]:
         degree[v] = count_common(graph[v], chosen)
     for v in by_descending_degree(degree):
         if degree[v] < at_least:  # a larger clique was found meanwhile
             break
-        if count_common(before, graph[v]) >= at_least:
+        if count_common(previous, graph[v]) >= at_least:
             for w in range(words):
-                chosen[w] = before[w] & graph[v, w]
+                chosen[w] = previous[w] & graph[v, w]
             count = reduce_to_core(graph, chosen, at_least - 1, rows)
             if count:
                 # subgraph of the vertices rows[:count], numbered from 0
-                small = np.zeros((count, (count + WORD - 1) // WORD), np.uint64)
+                subgraph = np.zeros((count, (count + WORD - 1) // WORD), np.uint64)
                 for i in range(count):
                     for j in range(count):
                         if contains(graph[rows[i]], rows[j]):
-                            small[i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
-                clique, budget = _branch_and_bound(small, at_least - 1, budget)
+                            subgraph[i, j // WORD] |= np.uint64(1) << np.uint64(j % WORD)
+                clique, budget = _branch_and_bound(subgraph, at_least - 1, budget)
                 if len(clique):
                     at_least = len(clique) + 1
                     best = np.empty(at_least, np.int64)
@@ -293,7 +293,7 @@ def larger_clique(
                         best[k + 1] = rows[clique[k]]
                 if budget <= 0:
                     return best, False
-        before[v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
+        previous[v // WORD] |= np.uint64(1) << np.uint64(v % WORD)
     return best, True
 
 
@@ -381,15 +381,15 @@ class CliqueSearch:
         """Return the consistency graphs (2, n, W) of some pairs (n,), without and with s_drift."""
         return consistency_graphs(self._rows[rows], self._scales_m2, self._agreement)
 
-    def offer_greedy(self, rows: np.ndarray, least: int = 2) -> np.ndarray:
-        """Offer the greedy cliques of some pairs (n,) with at least `least` pairs.
+    def offer_greedy(self, rows: np.ndarray, min_size: int = 2) -> np.ndarray:
+        """Offer the greedy cliques of some pairs (n,) with at least `min_size` pairs.
 
         Returns the consistency graphs.
         """
         graphs = self.graphs(rows)
         for graph in graphs:
             greedy = rows[greedy_clique(graph, _GREEDY_STARTS)]
-            if len(greedy) >= least:
+            if len(greedy) >= min_size:
                 self.offer(greedy)
         return graphs
 
@@ -425,8 +425,8 @@ class CliqueSearch:
         """
         i, j = np.triu_indices(len(self.largest), 1)
         p = self._pairs.p_b[self.largest]
-        far = np.argsort(-np.linalg.norm(p[i] - p[j], axis=1), kind="stable")[:_MOST_TWOS]
-        for two in np.column_stack([i, j])[far]:
+        farthest = np.argsort(-np.linalg.norm(p[i] - p[j], axis=1), kind="stable")[:_MOST_TWOS]
+        for two in np.column_stack([i, j])[farthest]:
             self.offer(self.largest[two])
 
     def is_complete(self) -> bool:

@@ -60,15 +60,15 @@ def _coarse(
         for k in range(4):
             extent = max(extent, abs(rows[i, k] - rows[0, k]))
     ax, ay = np.empty(n, np.float32), np.empty(n, np.float32)
-    bx, by, most = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    bx, by, max_error = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     for i in range(n):
         ax[i], ay[i] = (rows[i, 0] - rows[0, 0]) / extent, (rows[i, 1] - rows[0, 1]) / extent
         bx[i], by[i] = (rows[i, 2] - rows[0, 2]) / extent, (rows[i, 3] - rows[0, 3]) / extent
         worst = _worst(rows[i, 4], rows[i, 5], rows[i, 6])
         worst += _worst(rows[i, 7], rows[i, 8], rows[i, 9])
         coarse_bound = bound * (worst + variance_m2) / (extent * extent)
-        most[i] = (1 + _SHARE) * coarse_bound + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
-    return ax, ay, bx, by, most
+        max_error[i] = (1 + _SHARE) * coarse_bound + (1 + 1 / _SHARE) * _ROUNDING * _ROUNDING / 2
+    return ax, ay, bx, by, max_error
 
 
 @kernel
@@ -77,21 +77,21 @@ def _mark_near(
     ay: np.ndarray,
     bx: np.ndarray,
     by: np.ndarray,
-    most: np.ndarray,
+    max_error: np.ndarray,
     at: tuple[float, float, float, float, float],
-    near: np.ndarray,
+    is_near: np.ndarray,
 ) -> None:
-    """Mark in `near` (n,) the pairs with (d_a - d_b)^2 <= m, where m is the sum of two `most`.
+    """Mark in `is_near` (n,) the pairs with (d_a - d_b)^2 <= m, with the sum m of two `max_error`.
 
     With p = d_a^2 and q = d_b^2 this is (p - q)^2 <= m (2 (p + q) - m) if m <= p + q, and true
     otherwise. The loop has no branch and no other index, so that it is vectorised.
     """
     ax0, ay0, bx0, by0, most0 = at
-    for j in range(len(near)):
+    for j in range(len(is_near)):
         dx, dy, ex, ey = ax[j] - ax0, ay[j] - ay0, bx[j] - bx0, by[j] - by0
         p, q = dx * dx + dy * dy, ex * ex + ey * ey
-        m = min(most[j] + most0, p + q)
-        near[j] = (p - q) * (p - q) <= m * (p + q + (p + q) - m)
+        m = min(max_error[j] + most0, p + q)
+        is_near[j] = (p - q) * (p - q) <= m * (p + q + (p + q) - m)
 
 
 @kernel(error_model="numpy")
@@ -102,13 +102,18 @@ def _variance_along(dx: float, dy: float, square: float, xx: float, xy: float, y
 
 
 @kernel(error_model="numpy")
-def _needed(one: tuple[float, ...], other: tuple[float, ...], bound: float) -> float:
+def _needed(first: tuple[float, ...], second: tuple[float, ...], bound: float) -> float:
     """Return `drift_needed` for two rows of `packed_rows`."""
-    ax, ay, bx, by = other[0] - one[0], other[1] - one[1], other[2] - one[2], other[3] - one[3]
+    ax = second[0] - first[0]
+    ay = second[1] - first[1]
+    bx = second[2] - first[2]
+    by = second[3] - first[3]
     p, q = ax * ax + ay * ay, bx * bx + by * by
     difference = math.sqrt(p) - math.sqrt(q)
-    v = _variance_along(ax, ay, p, one[4] + other[4], one[5] + other[5], one[6] + other[6])
-    v += _variance_along(bx, by, q, one[7] + other[7], one[8] + other[8], one[9] + other[9])
+    v = _variance_along(ax, ay, p, first[4] + second[4], first[5] + second[5], first[6] + second[6])
+    v += _variance_along(
+        bx, by, q, first[7] + second[7], first[8] + second[8], first[9] + second[9]
+    )
     return (difference * difference / bound - v) / 2
 
 
@@ -157,22 +162,24 @@ def consistency_graphs(rows: Float, scales_m2: tuple[float, float], bound: float
     words = (n + WORD - 1) // WORD
     graphs = np.zeros((2, n, words), np.uint64)
     eights = np.zeros(words * WORD // 8, np.uint64)
-    near = eights.view(np.uint8)
-    ax, ay, bx, by, most = _coarse(rows, scales_m2[1], bound)
+    is_near = eights.view(np.uint8)
+    ax, ay, bx, by, max_error = _coarse(rows, scales_m2[1], bound)
     for i in range(n - 1):
-        at = ax[i], ay[i], bx[i], by[i], most[i]
-        _mark_near(ax[i:], ay[i:], bx[i:], by[i:], most[i:], at, near[i:n])
-        near[i] = 0
-        one = _numbers(rows, i)
+        at = ax[i], ay[i], bx[i], by[i], max_error[i]
+        _mark_near(ax[i:], ay[i:], bx[i:], by[i:], max_error[i:], at, is_near[i:n])
+        is_near[i] = 0
+        pair_numbers = _numbers(rows, i)
         for w in range(i // WORD, words):
             word = packed(eights, w)
             low = high = np.uint64(0)
             while word:
-                needed = _needed(one, _numbers(rows, w * WORD + trailing_zeros(word)), bound)
-                rest = word & (word - np.uint64(1))
-                low |= word ^ rest if needed <= scales_m2[0] else np.uint64(0)
-                high |= word ^ rest if needed <= scales_m2[1] else np.uint64(0)
-                word = rest
+                needed = _needed(
+                    pair_numbers, _numbers(rows, w * WORD + trailing_zeros(word)), bound
+                )
+                remaining_bits = word & (word - np.uint64(1))
+                low |= word ^ remaining_bits if needed <= scales_m2[0] else np.uint64(0)
+                high |= word ^ remaining_bits if needed <= scales_m2[1] else np.uint64(0)
+                word = remaining_bits
             graphs[0, i, w], graphs[1, i, w] = low, high
     mirror(graphs[0])
     mirror(graphs[1])

@@ -74,8 +74,12 @@ def nearest_descriptors(
     if not map_a.descriptor_kind == map_b.descriptor_kind == USURF:
         # distances of vectors far from the origin would lose digits: subtract their mean
         assert map_a.descriptor is not None
-        known = map_a.descriptor[~np.isnan(map_a.descriptor).any(axis=1)]
-        mean = known.mean(axis=0, dtype=np.float64) if len(known) else np.zeros(known.shape[1])
+        descriptors_a = map_a.descriptor[~np.isnan(map_a.descriptor).any(axis=1)]
+        mean = (
+            descriptors_a.mean(axis=0, dtype=np.float64)
+            if len(descriptors_a)
+            else np.zeros(descriptors_a.shape[1])
+        )
         centre = mean.astype(np.float32)
     a, b = _Side.of(map_a, _ABSENT, 0.0, centre), _Side.of(map_b, -_ABSENT, floor_m2, centre)
     for rows in a.blocks(height_bound):
@@ -124,8 +128,8 @@ class _Side(NamedTuple):
         """Return all rows in blocks of similar height; wide gates are in blocks of their own."""
         rows = np.arange(len(self.z_m))
         if np.isfinite(bound):
-            wide = self.variance_m2 > _WIDE * np.median(self.variance_m2)
-            rows = np.lexsort((self.z_m, wide))
+            is_uncertain = self.variance_m2 > _WIDE * np.median(self.variance_m2)
+            rows = np.lexsort((self.z_m, is_uncertain))
         return [rows[k : k + _BLOCK_ROWS] for k in range(0, len(rows), _BLOCK_ROWS)]
 
     def interval(self, rows: np.ndarray, bound: float) -> tuple[float, float]:
@@ -155,18 +159,18 @@ def _coarse(
     """
     n = len(rows)
     square, best = np.empty(n, np.float32), np.empty(n, np.float32)
-    z, most = np.empty(n, np.float32), np.empty(n, np.float32)
+    z, max_dz = np.empty(n, np.float32), np.empty(n, np.float32)
     for k in range(n):
         i = rows[k]
         square[k] = (1 - _ROUNDING) * side.square[i]
         best[k] = side.distance2[i]
         z[k] = side.z_m[i]
-        lost = _ROUNDING * side.z_m[i]
-        most[k] = math.inf
+        rounding_error = _ROUNDING * side.z_m[i]
+        max_dz[k] = math.inf
         if height_bound < math.inf:
-            most[k] = (1 + _SHARE) * height_bound * side.variance_m2[i]
-            most[k] += (1 + 1 / _SHARE) * 2 * lost * lost
-    return square, best, z, most
+            max_dz[k] = (1 + _SHARE) * height_bound * side.variance_m2[i]
+            max_dz[k] += (1 + 1 / _SHARE) * 2 * rounding_error * rounding_error
+    return square, best, z, max_dz
 
 
 @kernel
@@ -175,19 +179,19 @@ def _mark_nearer(
     square: np.ndarray,
     best: np.ndarray,
     z: np.ndarray,
-    most: np.ndarray,
-    own: tuple[Any, Any, Any, Any],
-    near: np.ndarray,
+    max_dz: np.ndarray,
+    query: tuple[Any, Any, Any, Any],
+    is_nearer: np.ndarray,
 ) -> None:
     """Mark the columns that may be nearer than the nearest so far of the column or of the row.
 
     The loop has no branch and no other index, so that it is vectorised.
     """
-    square0, best0, z0, most0 = own
-    for k in range(len(near)):
+    square0, best0, z0, most0 = query
+    for k in range(len(is_nearer)):
         distance2 = square[k] + square0 - (product[k] + product[k])
         dz = z[k] - z0
-        near[k] = (distance2 <= max(best[k], best0)) & (dz * dz <= most[k] + most0)
+        is_nearer[k] = (distance2 <= max(best[k], best0)) & (dz * dz <= max_dz[k] + most0)
 
 
 @kernel
@@ -208,18 +212,24 @@ def _take_nearer(
     """
     m = len(columns)
     square_a, _, z_a, most_a = _coarse(a, rows, height_bound)
-    square, best, z, most = _coarse(b, columns, height_bound)
+    square, best, z, max_dz = _coarse(b, columns, height_bound)
     eights = np.zeros((m + WORD - 1) // WORD * 8, np.uint64)
-    near = eights.view(np.uint8)
+    is_nearer = eights.view(np.uint8)
     for k in range(len(rows)):
         i = rows[k]
         first, end = 0, WORD
         while first < m:
             end = min(end, m)
-            own = square_a[k], np.float32(a.distance2[i]), z_a[k], most_a[k]
+            query = square_a[k], np.float32(a.distance2[i]), z_a[k], most_a[k]
             part = slice(first, end)
             _mark_nearer(
-                product[k, part], square[part], best[part], z[part], most[part], own, near[part]
+                product[k, part],
+                square[part],
+                best[part],
+                z[part],
+                max_dz[part],
+                query,
+                is_nearer[part],
             )
             for w in range(first // WORD, (end + WORD - 1) // WORD):
                 word = packed(eights, w)
@@ -303,9 +313,9 @@ class Correspondences:
         return len(self.index_a)
 
     def __getitem__(self, rows: np.ndarray | slice) -> "Correspondences":
-        kept = self.index_a[rows], self.index_b[rows], self.distance[rows]
+        columns = self.index_a[rows], self.index_b[rows], self.distance[rows]
         tolerance, offset_m = self.size_tolerance, self.height_offset_m
-        return Correspondences(*kept, size_tolerance=tolerance, height_offset_m=offset_m)
+        return Correspondences(*columns, size_tolerance=tolerance, height_offset_m=offset_m)
 
     @property
     def by_geometry(self) -> bool:
@@ -391,19 +401,24 @@ def match(
     if map_a.label is not None and map_b.label is not None and len(map_a) and len(map_b):
         labels_a, rows_a = _row_of_label(map_a)
         labels_b, rows_b = _row_of_label(map_b)
-        common, at_a, at_b = np.intersect1d(labels_a, labels_b, return_indices=True)
+        shared_labels, at_a, at_b = np.intersect1d(labels_a, labels_b, return_indices=True)
         shortage = ""
-        if len(common) < FEW:
-            both = "are labels of both maps" if len(common) != 1 else "is a label of both maps"
+        if len(shared_labels) < FEW:
+            label_text = (
+                "are labels of both maps" if len(shared_labels) != 1 else "is a label of both maps"
+            )
             a, b = (
                 f"{len(labels)} from {labels[0]} to {labels[-1]}" if len(labels) else "none"
                 for labels in (labels_a, labels_b)
             )
             shortage = (
-                f"{len(common) or 'none'} {both} ({map_a.called}: {a}; {map_b.called}: {b}); "
+                f"{len(shared_labels) or 'none'} {label_text} ({map_a.called}: {a}; "
+                f"{map_b.called}: {b}); "
                 "where both maps have labels, landmarks are matched by them alone"
             )
-        by_label = Correspondences(rows_a[at_a], rows_b[at_b], np.zeros(len(common)), shortage)
+        by_label = Correspondences(
+            rows_a[at_a], rows_b[at_b], np.zeros(len(shared_labels)), shortage
+        )
         if one_floor:
             return by_label
         offset_m = _height_offset(map_a, map_b, by_label, parameters.height)
@@ -421,8 +436,8 @@ def match(
         if len(index_a) < FEW:
             shortage = "no motion lays landmarks of the maps on each other; matched by geometry"
             shortage += _size_note(map_a, map_b)
-        none = np.zeros(len(index_a))
-        laid = Correspondences(index_a, index_b, none, shortage, parameters.size_tolerance)
+        zeros = np.zeros(len(index_a))
+        laid = Correspondences(index_a, index_b, zeros, shortage, parameters.size_tolerance)
         if one_floor:
             return laid
         offset_m = _height_offset(map_a, map_b, laid, parameters.height)
@@ -437,16 +452,16 @@ def match(
     offset_m, free = 0.0, None
     if math.isfinite(height_bound) and not one_floor:
         rows, nearest_b, distance = _mutually_nearest(map_a, map_b, math.inf, 0.0)
-        kept = distance <= parameters.max_descriptor_distance
-        free = Correspondences(rows[kept], nearest_b[kept], distance[kept])
+        is_kept = distance <= parameters.max_descriptor_distance
+        free = Correspondences(rows[is_kept], nearest_b[is_kept], distance[is_kept])
         offset_m = _height_offset(map_a, map_b, free, parameters.height)
     lowered = in_local_frame(map_b, np.zeros(2), offset_m)
     rows, nearest_b, distance = _mutually_nearest(map_a, lowered, height_bound, floor_m2)
-    kept = distance <= parameters.max_descriptor_distance
+    is_kept = distance <= parameters.max_descriptor_distance
     a, b = (Site.of(each, height_bound, floor_m2) for each in (map_a, map_b))
-    kept &= attributes_of_pairs_agree(a, b, rows, nearest_b, parameters.size_tolerance)
-    shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(kept) < FEW else ""
-    parts = (rows[kept], nearest_b[kept], distance[kept])
+    is_kept &= attributes_of_pairs_agree(a, b, rows, nearest_b, parameters.size_tolerance)
+    shortage = why_few(map_a, map_b, parameters) if np.count_nonzero(is_kept) < FEW else ""
+    parts = (rows[is_kept], nearest_b[is_kept], distance[is_kept])
     heights = {"height_offset_m": offset_m, "at_any_height": free}
     by_descriptor = Correspondences(*parts, shortage, **heights)
     return by_descriptor if one_floor else _placed(map_a, map_b, by_descriptor)
@@ -469,28 +484,28 @@ _DIAMETER_OVER_MEDIAN = 2 * math.sqrt(2)
 
 def _placed(map_a: LandmarkMap, map_b: LandmarkMap, pairs: Correspondences) -> Correspondences:
     """Drop the pairs of landmarks whose standard deviation exceeds the size of their map."""
-    kept, notes = np.ones(len(pairs), dtype=bool), []
+    is_kept, notes = np.ones(len(pairs), dtype=bool), []
     for landmarks, index in ((map_a, pairs.index_a), (map_b, pairs.index_b)):
         p_planar = landmarks.position_m[:, :2]
         off_m = np.linalg.norm(p_planar - np.median(p_planar, axis=0), axis=1)
         size_m = _DIAMETER_OVER_MEDIAN * float(np.median(off_m))
         sigma_m = np.sqrt(np.trace(landmarks.covariance_m2[:, :2, :2], axis1=1, axis2=2) / 2)
-        wide = np.flatnonzero(sigma_m > size_m)
+        uncertain = np.flatnonzero(sigma_m > size_m)
         # where most landmarks are that uncertain, the covariances or their units are wrong
-        if size_m > 0 and 0 < len(wide) < len(p_planar) / 2:
-            kept &= ~np.isin(index, wide)
-            number = "landmark" if len(wide) == 1 else "landmarks"
+        if size_m > 0 and 0 < len(uncertain) < len(p_planar) / 2:
+            is_kept &= ~np.isin(index, uncertain)
+            number = "landmark" if len(uncertain) == 1 else "landmarks"
             notes.append(
-                f"{len(wide)} {number} of {landmarks.name} left aside: sigma up to "
-                f"{_short(float(sigma_m[wide].max()))} m in a map of {_short(size_m)} m"
+                f"{len(uncertain)} {number} of {landmarks.name} left aside: sigma up to "
+                f"{_short(float(sigma_m[uncertain].max()))} m in a map of {_short(size_m)} m"
             )
     if not notes:
         return pairs
     return replace(
         pairs,
-        index_a=pairs.index_a[kept],
-        index_b=pairs.index_b[kept],
-        distance=pairs.distance[kept],
+        index_a=pairs.index_a[is_kept],
+        index_b=pairs.index_b[is_kept],
+        distance=pairs.distance[is_kept],
         set_aside="; ".join(notes),
     )
 
@@ -505,8 +520,10 @@ def _size_note(map_a: LandmarkMap, map_b: LandmarkMap) -> str:
     ]
     if not max(sizes_m) >= _OTHER_SIZES * min(sizes_m):  # NaN fails
         return ""
-    told = (f"{each.called} {_short(m)} m" for each, m in zip((map_a, map_b), sizes_m, strict=True))
-    return f"; median sizes: {', '.join(told)}: are both in metres?"
+    size_texts = (
+        f"{each.called} {_short(m)} m" for each, m in zip((map_a, map_b), sizes_m, strict=True)
+    )
+    return f"; median sizes: {', '.join(size_texts)}: are both in metres?"
 
 
 def matched_by_geometry(map_a: LandmarkMap, map_b: LandmarkMap) -> bool:
@@ -515,8 +532,8 @@ def matched_by_geometry(map_a: LandmarkMap, map_b: LandmarkMap) -> bool:
 
 
 def _no_pairs(shortage: str) -> Correspondences:
-    none = np.zeros(0, np.int64)
-    return Correspondences(none, none, np.zeros(0), shortage)
+    no_rows = np.zeros(0, np.int64)
+    return Correspondences(no_rows, no_rows, np.zeros(0), shortage)
 
 
 def _row_of_label(landmarks: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
@@ -597,8 +614,8 @@ def scale_note(
         extents = []  # twice the median distance of the landmarks to their median, in plan
         for landmarks in (map_a, map_b):
             p_planar = landmarks.position_m[:, :2]
-            off = np.linalg.norm(p_planar - np.median(p_planar, axis=0), axis=1)
-            extents.append(2 * float(np.median(off)))
+            distance_m = np.linalg.norm(p_planar - np.median(p_planar, axis=0), axis=1)
+            extents.append(2 * float(np.median(distance_m)))
         if not min(extents) > 0 or max(extents) < _OTHER_WORLD * min(extents):
             return ""
         return (
@@ -607,13 +624,13 @@ def scale_note(
         )
     if 1 / _SAME_SCALE < scale < _SAME_SCALE:
         return ""
-    large, small = (map_b, map_a) if scale > 1 else (map_a, map_b)
+    large_map, small_map = (map_b, map_a) if scale > 1 else (map_a, map_b)
     factor = max(scale, 1 / scale)
     units = (name for name, size in UNITS_PER_M.items() if abs(factor / size - 1) < _RATIO_WIDTH)
     question = f"is it in {unit}?" if (unit := next(units, "")) else "are both in metres?"
     return (
-        f"distances between landmarks of {large.called} are {_short(factor)} times those of "
-        f"{small.called}: {question}"
+        f"distances between landmarks of {large_map.called} are {_short(factor)} times those of "
+        f"{small_map.called}: {question}"
     )
 
 

@@ -103,7 +103,7 @@ def _drift_fixed_point(
     """
     floor, weight = DRIFT_FLOOR_M * DRIFT_FLOOR_M, np.ones(len(residual_m))
     low, high = 0.0, math.inf
-    before, step_before = math.inf, 0.0
+    previous_m2, previous_step = math.inf, 0.0
     for _ in range(_MAX_STEPS):
         step = _scoring(residual_m, covariance_m2, weight, variance_m2, gate_m)
         if abs(step) <= _TOLERANCE * variance_m2 or (variance_m2 <= floor and step < 0):
@@ -113,8 +113,10 @@ def _drift_fixed_point(
         else:
             high = variance_m2
         # the slope is -1 for equal covariances
-        slope = (step - step_before) / (variance_m2 - before) if before < math.inf else -1.0
-        before, step_before = variance_m2, step
+        slope = (
+            (step - previous_step) / (variance_m2 - previous_m2) if previous_m2 < math.inf else -1.0
+        )
+        previous_m2, previous_step = variance_m2, step
         variance_m2 = max(variance_m2 - step / (slope if slope < 0 else -1.0), floor)
         if not low < variance_m2 < high:
             variance_m2 = math.sqrt(max(low, floor) * high)
@@ -252,8 +254,10 @@ def with_common_motion(alignment: Alignment, p_a: Float) -> Float:
     middle = p_a.mean(axis=0)
     arm_m2 = np.sum((p_a - middle) ** 2, axis=1).mean()
     turn = np.array([middle[1] - T_a_b[1], T_a_b[0] - middle[0], 1.0])  # about the centroid
-    common = np.diag([1.0, 1.0, 0.0]) + np.outer(turn, turn) / max(arm_m2, drift_sigma_m**2)
-    return alignment.covariance + drift_sigma_m**2 * common
+    unit_covariance = np.diag([1.0, 1.0, 0.0]) + np.outer(turn, turn) / max(
+        arm_m2, drift_sigma_m**2
+    )
+    return alignment.covariance + drift_sigma_m**2 * unit_covariance
 
 
 def calibration_covariance(T_a_b: Float, pairs: Pairs, gain: Float) -> Float:
@@ -266,7 +270,8 @@ def calibration_covariance(T_a_b: Float, pairs: Pairs, gain: Float) -> Float:
     if all(each.is_none for each in of_maps):
         return np.zeros((3, 3))
     by_a, by_b = (
-        own.moves_m(p)[:, :, :2] for own, p in zip(of_maps, (pairs.p_a, pairs.p_b), strict=True)
+        errors.moves_m(p)[:, :, :2]
+        for errors, p in zip(of_maps, (pairs.p_a, pairs.p_b), strict=True)
     )
     by_b = -by_b @ rotation(T_a_b[2]).T
     alike = of_maps[0].is_of_one_camera(of_maps[1])

@@ -44,8 +44,8 @@ def origin_of(landmarks: LandmarkMap) -> Float:
         return np.zeros(2)
     middle = p_planar.mean(axis=0)
     extent_m = math.sqrt(np.mean(np.sum((p_planar - middle) ** 2, axis=1)))
-    far = np.hypot(*middle) > _FAR * max(extent_m, _LEAST_EXTENT_M)
-    return np.round(middle) if far else np.zeros(2)
+    is_far = np.hypot(*middle) > _FAR * max(extent_m, _LEAST_EXTENT_M)
+    return np.round(middle) if is_far else np.zeros(2)
 
 
 def in_local_frame(landmarks: LandmarkMap, origin_m: Float, height_m: float = 0.0) -> LandmarkMap:
@@ -146,8 +146,9 @@ def height_offset_m(up_m: Float, variance_m2: Float, bound: float) -> float:
     inside = np.searchsorted(ranked, ranked + width_m, side="right") - np.arange(len(ranked))
     first = int(np.argmax(inside))
     offset_m = float(np.median(ranked[first : first + inside[first]]))
-    here, there = np.abs(up_m) <= reach, np.abs(up_m - offset_m) <= reach
-    wins, losses = np.count_nonzero(there & ~here), np.count_nonzero(here & ~there)
+    fits_zero, fits_offset = np.abs(up_m) <= reach, np.abs(up_m - offset_m) <= reach
+    wins = np.count_nonzero(fits_offset & ~fits_zero)
+    losses = np.count_nonzero(fits_zero & ~fits_offset)
     n_gates = 1 + (ranked[-1] - ranked[0]) / width_m
     # P(X >= own) for equally likely sides
     by_chance = scipy.special.bdtrc(wins - 1, wins + losses, 0.5) if wins else 1.0
@@ -238,12 +239,12 @@ def _fit_heights(by: Float, up_m: Float, variance_m2: Float) -> _PlaneFit:
         weighted = by.T * (weight / variance_m2)
         normal = weighted @ by
         value = np.asarray(np.linalg.solve(normal, weighted @ up_m), np.float64)
-        off = np.abs(up_m - by @ value) / np.sqrt(variance_m2)
-        scale2 = max(1.0, (float(np.median(off)) / _MEDIAN_OVER_SIGMA) ** 2)
+        normalised_residual = np.abs(up_m - by @ value) / np.sqrt(variance_m2)
+        scale2 = max(1.0, (float(np.median(normalised_residual)) / _MEDIAN_OVER_SIGMA) ** 2)
         if k < _ROUNDS // 2:
-            weight = 1 / np.maximum(off, math.sqrt(scale2) / 10)
+            weight = 1 / np.maximum(normalised_residual, math.sqrt(scale2) / 10)
         else:
-            weight = (_DOF + 1) / (_DOF + off**2 / scale2)
+            weight = (_DOF + 1) / (_DOF + normalised_residual**2 / scale2)
     return _PlaneFit(value, scale2 * np.asarray(np.linalg.inv(normal), np.float64))
 
 

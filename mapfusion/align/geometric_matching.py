@@ -54,13 +54,13 @@ class Site(NamedTuple):
         has the part `floor_m2` beyond the landmarks' own; infinite to ignore heights.
         """
         n = len(landmarks)
-        most = np.full(n, np.inf)
+        max_z_m2 = np.full(n, np.inf)
         if math.isfinite(height_bound):
-            most = height_bound * (landmarks.covariance_m2[:, 2, 2] + floor_m2 / 2)
+            max_z_m2 = height_bound * (landmarks.covariance_m2[:, 2, 2] + floor_m2 / 2)
         return cls(
             np.ascontiguousarray(landmarks.position_m[:, :2]),
             landmarks.position_m[:, 2].copy(),
-            most,
+            max_z_m2,
             np.full(n, np.nan) if landmarks.size_m is None else landmarks.size_m,
             np.full(n, -1) if landmarks.category is None else landmarks.category,
         )
@@ -97,8 +97,8 @@ def attributes_agree(a: Site, b: Site, i: int, j: int, size_tolerance: float) ->
     """Return True if the attributes of landmark i of a and j of b agree, or one has none."""
     if a.category[i] >= 0 and b.category[j] >= 0 and a.category[i] != b.category[j]:
         return False
-    off = abs(a.size_m[i] - b.size_m[j])  # NaN passes
-    return not off > size_tolerance * max(a.size_m[i], b.size_m[j])
+    size_difference = abs(a.size_m[i] - b.size_m[j])  # NaN passes
+    return not size_difference > size_tolerance * max(a.size_m[i], b.size_m[j])
 
 
 _TINY_M = 1e-9  # avoids a division by the distance of equal places
@@ -129,14 +129,14 @@ class Segments(NamedTuple):
     def between(cls, site: Site, ends: np.ndarray) -> "Segments":
         """Return the segments between the given rows (E, 2)."""
         i, j = ends.T
-        off = site.p[j] - site.p[i]
-        length = np.hypot(off[:, 0], off[:, 1])
+        difference = site.p[j] - site.p[i]
+        length = np.hypot(difference[:, 0], difference[:, 1])
         order = np.argsort(length, kind="stable")
-        i, j, off, length = i[order], j[order], off[order], length[order]
+        i, j, difference, length = i[order], j[order], difference[order], length[order]
         return cls(
             length,
-            off / np.maximum(length, _TINY_M)[:, None],
-            np.arctan2(off[:, 1], off[:, 0]),
+            difference / np.maximum(length, _TINY_M)[:, None],
+            np.arctan2(difference[:, 1], difference[:, 0]),
             (site.p[i] + site.p[j]) / 2,
             site.z[j] - site.z[i],
             site.most_z_m2[i] + site.most_z_m2[j],
@@ -161,8 +161,8 @@ def segment_lengths(a: Site, b: Site, tolerance_m: float) -> tuple[float, float]
     longest = math.inf
     for site in (a, b):
         n = len(site.p)
-        most = max(_SEGMENTS, _SEGMENTS_EACH * n)
-        if n * (n - 1) / 2 <= most:
+        max_segments = max(_SEGMENTS, _SEGMENTS_EACH * n)
+        if n * (n - 1) / 2 <= max_segments:
             continue
         tree = scipy.spatial.KDTree(site.p)
         high = float(np.hypot(*np.ptp(site.p, axis=0)))
@@ -170,7 +170,7 @@ def segment_lengths(a: Site, b: Site, tolerance_m: float) -> tuple[float, float]
         for _ in range(12):  # bisection; the number of segments grows with the square
             middle = (low + high) / 2
             within = (tree.count_neighbors(tree, middle) - n) // 2
-            low, high = (middle, high) if within <= most else (low, middle)
+            low, high = (middle, high) if within <= max_segments else (low, middle)
         longest = min(longest, low)
     if math.isinf(longest):
         longest = min(float(np.hypot(*np.ptp(site.p, axis=0))) for site in (a, b)) + tolerance_m
@@ -180,21 +180,21 @@ def segment_lengths(a: Site, b: Site, tolerance_m: float) -> tuple[float, float]
 def segments_of(site: Site, shortest_m: float, longest_m: float) -> Segments:
     """Return the segments of a map between two lengths, each in one direction."""
     ends = scipy.spatial.KDTree(site.p).query_pairs(longest_m, output_type="ndarray")
-    found = Segments.between(site, ends.astype(np.int64).reshape(-1, 2))
-    keep = found.length >= shortest_m
-    return Segments(*(part[keep] for part in found))
+    segments = Segments.between(site, ends.astype(np.int64).reshape(-1, 2))
+    is_long = segments.length >= shortest_m
+    return Segments(*(part[is_long] for part in segments))
 
 
 def both_directions(segments: Segments) -> Segments:
     """Return each segment in both directions, by ascending length."""
-    length, along, theta, middle, rise, most, ends = segments
+    length, along, theta, middle, height_difference, max_z_m2, ends = segments
     return Segments(
         np.repeat(length, 2),
         np.stack([along, -along], axis=1).reshape(-1, 2),
         np.stack([theta, np.where(theta > 0, theta - math.pi, theta + math.pi)], axis=1).ravel(),
         np.repeat(middle, 2, axis=0),
-        np.stack([rise, -rise], axis=1).ravel(),
-        np.repeat(most, 2),
+        np.stack([height_difference, -height_difference], axis=1).ravel(),
+        np.repeat(max_z_m2, 2),
         np.stack([ends, ends[:, ::-1]], axis=1).reshape(-1, 2),
     )
 
@@ -326,7 +326,7 @@ def cast_votes(
 
 
 @kernel
-def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, most: int) -> Float:
+def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, max_bins: int) -> Float:
     """Return the bins with most votes, each counted with its neighbours.
 
     The votes of three neighbouring angles at a time are counted in hash tables without keys. Places
@@ -336,7 +336,7 @@ def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, most: int) -
         places: votes of `cast_votes`, shape (V, 2).
         first: first vote of each angle, shape (n_theta + 1,).
         bins: widths of the bins.
-        most: largest number of bins.
+        max_bins: largest number of bins.
 
     Returns:
         Number of votes, theta, x and y of each bin, shape (n, 4).
@@ -349,7 +349,7 @@ def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, most: int) -
         slots *= 2
     mask = slots - 1
     counts = np.zeros((3, slots), np.int32)
-    best, n_best = np.zeros((most, 4)), 0
+    best, n_best = np.zeros((max_bins, 4)), 0
     for step in range(-1, n + 1):
         for k in range(first[step % n], first[step % n + 1]):
             counts[step % 3, _slot(places[k, 0], places[k, 1], mask)] += 1
@@ -361,7 +361,7 @@ def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, most: int) -
             # a bin with few votes of its own is next to a full one, or there is none
             votes_of_bin = counts[t % 3, _slot(u, v, mask)]
             if votes_of_bin < 2 or _SHARE_OF_BIN * votes_of_bin < (
-                best[most - 1, 0] if n_best == most else 0
+                best[max_bins - 1, 0] if n_best == max_bins else 0
             ):
                 continue
             votes = 0
@@ -369,13 +369,13 @@ def fullest_bins(places: np.ndarray, first: np.ndarray, bins: Bins, most: int) -
                 for dv in range(-1, 2):
                     slot = _slot(u + du, v + dv, mask)
                     votes += counts[0, slot] + counts[1, slot] + counts[2, slot]
-            if n_best == most and votes <= best[most - 1, 0]:
+            if n_best == max_bins and votes <= best[max_bins - 1, 0]:
                 continue
             middle = ((t + 0.5) * bins.theta_rad, (u + 0.5) * bins.shift_m)
             bin_values = (float(votes), *middle, (v + 0.5) * bins.shift_m)
             n_best = insert_bin(best, n_best, bin_values, bins)
-        before = (t - 1) % n
-        for k in range(first[before], first[before + 1]):
+        previous_angle = (t - 1) % n
+        for k in range(first[previous_angle], first[previous_angle + 1]):
             counts[(t - 1) % 3, _slot(places[k, 0], places[k, 1], mask)] = 0
     return best[:n_best].copy()
 
@@ -486,8 +486,8 @@ class PlacedSearch:
             agree.
         """
         a, b = self._a, self._b
-        near, distance = self._near(rows_b, transform_points(T_a_b, b.p[rows_b]), gate_m)
-        i, j, share = near[:, 0], rows_b[near[:, 1]], 1.0
+        neighbours, distance = self._near(rows_b, transform_points(T_a_b, b.p[rows_b]), gate_m)
+        i, j, share = neighbours[:, 0], rows_b[neighbours[:, 1]], 1.0
         if len(i) and self._has_heights:
             height_difference, reach2 = a.z[i] - b.z[j], a.most_z_m2[i] + b.most_z_m2[j]
             if math.isnan(up_m):  # median of the densest interval of this length
@@ -498,8 +498,8 @@ class PlacedSearch:
             agree = (height_difference - up_m) ** 2 <= reach2
             share = (np.count_nonzero(agree) + 1) / (len(i) + 1)
             i, j, distance = i[agree], j[agree], distance[agree]
-        kept = mutually_nearest(i, j, distance)
-        return i[kept], j[kept], 0.0 if math.isnan(up_m) else up_m, share
+        is_mutual = mutually_nearest(i, j, distance)
+        return i[is_mutual], j[is_mutual], 0.0 if math.isnan(up_m) else up_m, share
 
     def agreeing(self, rows_b: np.ndarray, moved: Float, gate_m: float, up_m: float) -> np.ndarray:
         """Return True, shape (S,), for landmarks of b that agree with a landmark of a if displaced.
@@ -511,11 +511,11 @@ class PlacedSearch:
             up_m: height of frame b in frame a.
         """
         a, b = self._a, self._b
-        near, _ = self._near(rows_b, moved, gate_m)
-        i, j = near[:, 0], rows_b[near[:, 1]]
+        neighbours, _ = self._near(rows_b, moved, gate_m)
+        i, j = neighbours[:, 0], rows_b[neighbours[:, 1]]
         agree = (a.z[i] - b.z[j] - up_m) ** 2 <= a.most_z_m2[i] + b.most_z_m2[j]
         agrees = np.zeros(len(rows_b), np.bool_)
-        agrees[near[agree, 1]] = True
+        agrees[neighbours[agree, 1]] = True
         return agrees
 
     def refit(self, T_a_b: Float, centre: Float, reach_m: float, tolerance_m: float) -> Float:
@@ -568,8 +568,8 @@ def attributes_of_pairs_agree(
 ) -> np.ndarray:
     """Return `attributes_agree` of pairs (K,)."""
     unlike = (a.category[i] >= 0) & (b.category[j] >= 0) & (a.category[i] != b.category[j])
-    off = np.abs(a.size_m[i] - b.size_m[j])
-    return ~unlike & ~(off > size_tolerance * np.fmax(a.size_m[i], b.size_m[j]))
+    size_difference = np.abs(a.size_m[i] - b.size_m[j])
+    return ~unlike & ~(size_difference > size_tolerance * np.fmax(a.size_m[i], b.size_m[j]))
 
 
 _CANDIDATES = 48  # bins that are refitted
@@ -623,13 +623,13 @@ def find_placements(a: Site, b: Site, tolerance_m: float, size_tolerance: float)
     bins = Bins(2 * math.pi / n_theta, _BIN_SHIFT * tolerance_m, n_theta)
     off_m = math.sqrt(2) * tolerance_m  # largest difference of two lengths
     parts, proposed = parts_of(of_b, longest), []
-    most = _CANDIDATES if len(parts) == 1 else _OF_PART
+    max_candidates = _CANDIDATES if len(parts) == 1 else _OF_PART
     sizes = size_tolerance if have_attributes(a, b) else -1.0
     for rows, centre in parts:
         segments = Segments(*(part[rows] for part in of_b))
         reach_m = float(np.hypot(*(segments.middle - centre).T).max()) + longest / 2
         places, first = cast_votes((a, b), of_a, segments, centre, bins, off_m, sizes)
-        for votes, theta, x, y in fullest_bins(places, first, bins, most):
+        for votes, theta, x, y in fullest_bins(places, first, bins, max_candidates):
             T_a_b = np.array([x, y, theta])
             T_a_b[:2] -= rotation(theta) @ centre
             proposed.append((votes, T_a_b, centre, reach_m))
@@ -676,7 +676,7 @@ def match_by_geometry(
         variances = (np.median(each.covariance_m2[:, [0, 1], [0, 1]]) for each in (map_a, map_b))
         stated_m = math.sqrt(chi_square_bound(_TRUE_WITHIN, 2) * float(sum(variances)))
         tolerances += [stated_m] if stated_m > _WIDER * tolerance_m else []
-    found = [
+    placed_pairs = [
         placement
         for each_m in tolerances
         for placement in find_placements(a, b, each_m, size_tolerance)
@@ -685,7 +685,7 @@ def match_by_geometry(
         [np.zeros((0, 2), np.int64)]
         + [
             np.column_stack([each.index_a, each.index_b])
-            for each in distinct_placements(found, b.p)
+            for each in distinct_placements(placed_pairs, b.p)
         ]
     )
     index_a, index_b = np.unique(pairs, axis=0).T

@@ -106,10 +106,10 @@ class ClosestPoints:
 
 
 @kernel
-def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: float) -> float:
+def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, max_sum: float) -> float:
     """Return the sum over all points of the squared distance to the nearest point of the tree.
 
-    The sum ends after the group with which it exceeds `most`.
+    The sum ends after the group with which it exceeds `max_sum`.
     """
     room, nobody = new_search_state(), np.full(len(groups.row), -1)
     total = 0.0
@@ -117,7 +117,7 @@ def summed_square_distance(T_a_b: Float, groups: Groups, tree: BoxTree, most: fl
         find_nearest_of_group(T_a_b, first, groups, tree, nobody, room)
         for q in range(min(GROUP, groups.n - first)):
             total += room.square[q]
-        if total > most:
+        if total > max_sum:
             break
     return total
 
@@ -134,14 +134,14 @@ def pair_and_solve(
     """
     p, n = tree.p, len(p_b)
     T_a_b, everyone, room = T_start.copy(), np.arange(n), new_search_state()
-    row_of, found = groups.row, room.nearest
+    row_of, nearest_index = groups.row, room.nearest
     nearest, in_group, matched = np.full(n, -1), np.full(len(row_of), -1), np.empty((n, 3))
     for rounds in range(max_rounds + 1):
         changed = False
         for first in range(0, len(in_group), GROUP):
             find_nearest_of_group(T_a_b, first, groups, tree, in_group, room)
             for q in range(GROUP):
-                i, k = first + q, int(found[q])
+                i, k = first + q, int(nearest_index[q])
                 if k != in_group[i]:
                     changed, in_group[i], nearest[row_of[i]] = True, k, k
                     for axis in range(3):

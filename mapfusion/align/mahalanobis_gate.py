@@ -287,7 +287,7 @@ def highest_leverage_pair(
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     cxx, cxy, cyy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     cxt, cyt, ctt = covariance[0, 2], covariance[1, 2], covariance[2, 2]
-    most, best_pair = -1.0, 0
+    max_leverage, best_pair = -1.0, 0
     for i in range(len(p_b)):
         xx, xy, yy = residual_covariance(cos, sin, S_a, S_b, i, variance_m2)
         jx, jy = lever(cos, sin, p_b, i)
@@ -297,6 +297,6 @@ def highest_leverage_pair(
         txy = cxy + jx * cyt + jy * cxt
         txy += jx * jy * ctt
         leverage = truth[i] * (txx * yy - 2 * txy * xy + tyy * xx) / (xx * yy - xy * xy)
-        if leverage > most:
-            most, best_pair = leverage, i
+        if leverage > max_leverage:
+            max_leverage, best_pair = leverage, i
     return best_pair

@@ -72,21 +72,24 @@ def split_into_leaves(p: Float, size: int) -> tuple[np.ndarray, Float, np.ndarra
     """
     n_leaves = n_leaves_of(len(p), max(size, 1))
     # NaN pads the array; padding sorts behind all points
-    held = np.full((4, 1, n_leaves * max(size, 1)), np.nan)
-    held[:3, 0, : len(p)], held[3, 0, : len(p)] = p.T, np.arange(len(p))
+    leaf_columns = np.full((4, 1, n_leaves * max(size, 1)), np.nan)
+    leaf_columns[:3, 0, : len(p)], leaf_columns[3, 0, : len(p)] = p.T, np.arange(len(p))
     boxes, ranges = list[Float](), list[np.ndarray]()
     while True:
-        lower, upper = np.fmin.reduce(held[:3], axis=2), np.fmax.reduce(held[:3], axis=2)
+        lower = np.fmin.reduce(leaf_columns[:3], axis=2)
+        upper = np.fmax.reduce(leaf_columns[:3], axis=2)
         boxes.append(np.concatenate([lower, upper]).T)
-        n_nodes, n_held = held.shape[1:]
+        n_nodes, n_held = leaf_columns.shape[1:]
         first = n_held * np.arange(n_nodes)
         ranges.append(np.minimum([first, first + n_held], len(p)))
         if n_nodes == n_leaves:
             break
-        along = held[np.argmax(upper - lower, axis=0), np.arange(n_nodes)]
+        along = leaf_columns[np.argmax(upper - lower, axis=0), np.arange(n_nodes)]
         order = np.argpartition(along, n_held // 2, axis=1) + first[:, None]
-        held = held.reshape(4, -1).take(order, axis=1).reshape(4, 2 * n_nodes, n_held // 2)
-    box, rows = np.ascontiguousarray(np.concatenate(boxes)), held[3].ravel()
+        leaf_columns = (
+            leaf_columns.reshape(4, -1).take(order, axis=1).reshape(4, 2 * n_nodes, n_held // 2)
+        )
+    box, rows = np.ascontiguousarray(np.concatenate(boxes)), leaf_columns[3].ravel()
     empty = np.isnan(box[:, 0])
     box[empty, :3], box[empty, 3:] = np.inf, -np.inf
     return rows[~np.isnan(rows)].astype(np.int64), box, np.concatenate(ranges, axis=1)
@@ -149,8 +152,11 @@ def new_search_state() -> SearchState:
     """Return a work space, which any number of groups may use in turn."""
     x, y, z, nearest = np.empty(GROUP), np.empty(GROUP), np.empty(GROUP), np.empty(GROUP)
     node, away = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)
-    near, far = np.empty(POINTS_PER_LEAF, np.int64), np.empty(POINTS_PER_LEAF)
-    return SearchState(x, y, z, nearest, np.empty(GROUP), node, away, near, far)
+    candidate_index = np.empty(POINTS_PER_LEAF, np.int64)
+    candidate_distance = np.empty(POINTS_PER_LEAF)
+    return SearchState(
+        x, y, z, nearest, np.empty(GROUP), node, away, candidate_index, candidate_distance
+    )
 
 
 @kernel
@@ -181,19 +187,19 @@ def find_nearest_of_group(
         nearest: initial tree point of each point of all groups, shape (M GROUP,); -1 for none.
         room: work space; its `nearest` and `square` hold the result.
     """
-    x, y, z, found, square, nodes, aways, near, far = room
+    x, y, z, nearest_index, square, nodes, aways, candidate_index, candidate_distance = room
     _, _, own_x, own_y, own_z = groups
     _, px, py, pz, _, box, starts, ends = tree
     cos, sin = math.cos(T_a_b[2]), math.sin(T_a_b[2])
     # unsigned indices allow vector instructions
-    begin = np.uint64(first)
+    start = np.uint64(first)
     for q in range(GROUP):
-        i = begin + np.uint64(q)
+        i = start + np.uint64(q)
         x[q], y[q] = moved_point(T_a_b, cos, sin, own_x[i], own_y[i])
         z[q] = own_z[i]
     for q in range(GROUP):
         k = nearest[first + q]
-        found[q], square[q] = k, math.inf
+        nearest_index[q], square[q] = k, math.inf
         if k >= 0:
             dx, dy, dz = px[k] - x[q], py[k] - y[q], pz[k] - z[q]
             square[q] = dx * dx + dy * dy + dz * dz
@@ -203,7 +209,7 @@ def find_nearest_of_group(
         low_x, high_x = min(low_x, x[q]), max(high_x, x[q])
         low_y, high_y = min(low_y, y[q]), max(high_y, y[q])
         low_z, high_z = min(low_z, z[q]), max(high_z, z[q])
-    node, n_todo, inner, most = 0, 0, len(starts) // 2, _largest(square)
+    node, n_todo, inner, max_square = 0, 0, len(starts) // 2, _largest(square)
     while True:
         if node < inner:
             closer, other = 2 * node + 1, 2 * node + 2
@@ -217,35 +223,35 @@ def find_nearest_of_group(
             other_away = dx * dx + dy * dy + dz * dz
             if other_away < away:
                 closer, other, away, other_away = other, closer, other_away, away
-            if other_away < most:
+            if other_away < max_square:
                 nodes[n_todo], aways[n_todo] = other, other_away
                 n_todo += 1
-            if away < most:
+            if away < max_square:
                 node = closer
                 continue
         else:
-            begin, n, n_near = np.uint64(starts[node]), ends[node] - starts[node], 0
+            start, n, n_near = np.uint64(starts[node]), ends[node] - starts[node], 0
             for c in range(n):
-                k = begin + np.uint64(c)
+                k = start + np.uint64(c)
                 dx = _between(low_x, high_x, px[k], px[k])
                 dy = _between(low_y, high_y, py[k], py[k])
                 dz = _between(low_z, high_z, pz[k], pz[k])
-                far[c] = dx * dx + dy * dy + dz * dz
+                candidate_distance[c] = dx * dx + dy * dy + dz * dz
             for c in range(n):  # without a branch: candidates that are too far are overwritten
-                near[n_near] = c
-                n_near += far[c] < most
+                candidate_index[n_near] = c
+                n_near += candidate_distance[c] < max_square
             for c in range(n_near):
                 # update the nearest points of the group with point k
-                k = starts[node] + near[c]
+                k = starts[node] + candidate_index[c]
                 at_x, at_y, at_z = px[k], py[k], pz[k]
                 for q in range(GROUP):
                     dx, dy, dz = at_x - x[q], at_y - y[q], at_z - z[q]
                     away = dx * dx + dy * dy + dz * dz
                     nearer = away < square[q]
                     square[q] = away if nearer else square[q]
-                    found[q] = k if nearer else found[q]
-            most = _largest(square)
-        while n_todo > 0 and aways[n_todo - 1] >= most:
+                    nearest_index[q] = k if nearer else nearest_index[q]
+            max_square = _largest(square)
+        while n_todo > 0 and aways[n_todo - 1] >= max_square:
             n_todo -= 1
         if n_todo == 0:
             return

@@ -132,16 +132,16 @@ def refit(
     and can gain false supporters near the gate.
     """
     cost, none_to_beat = 0.0, np.int64(0)  # a literal 0 would compile a second specialisation
-    before = np.empty(len(rows), np.int64)
+    previous_rows = np.empty(len(rows), np.int64)
     for _ in range(_LOCAL_ROUNDS):
         T_a_b[0], T_a_b[1], T_a_b[2] = fit_rigid(p_a, p_b, rows[:count])
         before_count = count
         for i in range(count):
-            before[i] = rows[i]
+            previous_rows[i] = rows[i]
         count, cost = list_supporters(T_a_b, p_a, p_b, gate_m, none_to_beat, rows)
         same = count == before_count
         for i in range(count):
-            same = same and rows[i] == before[i]
+            same = same and rows[i] == previous_rows[i]
         if count < 2 or same:
             break
     return count, cost

@@ -97,8 +97,8 @@ class Refinement:
             # residual; no residual of n exceeds sqrt(n) times the RMS, so that up to 81 labels all
             # take part. Covariances in the frame of the start can be larger than the gate; uniform
             # false pairs would then be more probable than true ones.
-            off = pairs.p_a[:, :2] - transform_points(T_a_b, pairs.p_b[:, :2])
-            rms_m = math.sqrt(np.mean(np.sum(off**2, axis=1)))
+            residual_xy = pairs.p_a[:, :2] - transform_points(T_a_b, pairs.p_b[:, :2])
+            rms_m = math.sqrt(np.mean(np.sum(residual_xy**2, axis=1)))
             stated = residual_covariances(T_a_b, pairs.covariance_a, pairs.covariance_b)
             sigma_m = math.sqrt(np.linalg.eigvalsh(stated).max())
             gate_m = max(self.gate_m, _GATE_SIGMAS**2 * rms_m, _GATE_SIGMAS * sigma_m)
@@ -115,8 +115,8 @@ class Refinement:
         inlier[rows] = truth > 0.5
         if pairs.by_geometry:  # several motions offered pairs, which may share a landmark
             used = pairs[inlier]
-            off = used.p_a[:, :2] - transform_points(T_a_b, used.p_b[:, :2])
-            apart_m = np.hypot(off[:, 0], off[:, 1])
+            residual_xy = used.p_a[:, :2] - transform_points(T_a_b, used.p_b[:, :2])
+            apart_m = np.hypot(residual_xy[:, 0], residual_xy[:, 1])
             inlier[inlier] = mutually_nearest(used.index_a, used.index_b, apart_m)
         reason = why_angle_is_open(pairs[inlier], variance) if np.any(inlier) else ""
         if reason:
@@ -133,8 +133,8 @@ class Refinement:
             may_move_m = gate_m
             # a labelled pair of high leverage is false only if it is an outlier to the others
             if pairs.by_name and solved:
-                rest = (T_without, without_outliers, drift_m2)
-                if is_outlier_to_others(*rest, planar, left_out):
+                without_best_pair = (T_without, without_outliers, drift_m2)
+                if is_outlier_to_others(*without_best_pair, planar, left_out):
                     may_move_m = self.gate_m
             reason = why_rests_on_one_pair(
                 T_a_b, T_without if solved else None, planar, truth, may_move_m
@@ -285,8 +285,8 @@ def maximise_likelihood(
             for column in range(3):
                 normal[row, column] -= missing[row, column]
         determined = invert(normal, covariance)
-    most = highest_leverage_pair(T_a_b, pairs, variance, truth, covariance)
-    return determined, moved, T_a_b, covariance, variance, truth, most
+    leverage_row = highest_leverage_pair(T_a_b, pairs, variance, truth, covariance)
+    return determined, moved, T_a_b, covariance, variance, truth, leverage_row
 
 
 @dataclass(frozen=True)

@@ -38,8 +38,8 @@ class Svd:
     def __post_init__(self) -> None:
         for name, options in (("translation", Translation), ("points", Points)):
             if (value := getattr(self, name)) not in get_args(options):
-                known = ", ".join(get_args(options))
-                raise ValueError(f"{name}: is {value!r}, expected one of {known}")
+                known_text = ", ".join(get_args(options))
+                raise ValueError(f"{name}: is {value!r}, expected one of {known_text}")
 
     def find(self, pairs: Pairs, rng: np.random.Generator) -> Fit | Undetermined:
         """Fit T_a_b to all pairs; `rng` is not used."""

@@ -156,8 +156,8 @@ def parse_lens(where: str, camera: Mapping[str, Any]) -> Lens:
         raise InputError(f"{where}: camera_model: is {model!r}, only pinhole is read")
     named = str(camera.get("distortion_model", "none"))
     if named not in _DISTORTIONS:
-        known = ", ".join(_DISTORTIONS)
-        raise InputError(f"{where}: distortion_model: {named!r} is unknown; known: {known}")
+        known_names = ", ".join(_DISTORTIONS)
+        raise InputError(f"{where}: distortion_model: {named!r} is unknown; known: {known_names}")
     key = next((key for key in _COEFFICIENT_KEYS if key in camera), _COEFFICIENT_KEYS[0])
     coefficients = _numbers(where, camera, key, None, ()) if key in camera else []
     distortion = _DISTORTIONS[named]
@@ -185,15 +185,15 @@ def parse_transform(where: str, key: str, holder: Mapping[str, Any]) -> Float:
     Raises:
         InputError: the value is missing or no rigid motion; the message begins with `where`.
     """
-    value, wanted = holder.get(key), "4 rows of 4 numbers"
+    value, expected = holder.get(key), "4 rows of 4 numbers"
     if isinstance(value, Mapping):
         key, value = f"{key}.data", value.get("data")
     if value is None:
-        raise InputError(f"{where}: {key}: is missing, expected {wanted}")
+        raise InputError(f"{where}: {key}: is missing, expected {expected}")
     try:
         T = np.array(value, dtype=np.float64).reshape(4, 4)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: {key}: is {_short(value)}, expected {wanted}") from None
+        raise InputError(f"{where}: {key}: is {_short(value)}, expected {expected}") from None
     try:
         require_rigid(key, T)
     except InputError as error:
@@ -267,9 +267,11 @@ def _opencv_calibration(
         while len(D) > _LONGEST_RATIONAL and not D[-1]:
             D = D[:-1]
         distortion: Distortion = "radial-tangential" if D.any() else "none"
-        own = tuple(D.tolist()) if D.any() else ()
+        coefficients = tuple(D.tolist()) if D.any() else ()
         try:
-            lenses.append(Lens(size_px, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own))
+            lenses.append(
+                Lens(size_px, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, coefficients)
+            )
         except InputError as error:
             raise InputError(f"{path}: {name} and D{n}: {error}") from error
     R = _opencv_matrix(path, document, "R", 9).reshape(3, 3)
@@ -286,14 +288,14 @@ def _opencv_matrix(path: Path, document: Mapping[str, Any], key: str, n: int | N
     value = document.get(key)
     value = value.get("data") if isinstance(value, Mapping) else value
     try:
-        found = np.array(value, dtype=np.float64).ravel()
+        numbers = np.array(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        found = np.full(1, np.nan)
-    if not np.isfinite(found).all() or n not in (None, len(found)):
-        wanted = "numbers" if n is None else f"{n} numbers"
-        what = "is missing" if value is None else f"is {_short(value)}"
-        raise InputError(f"{path}: {key}: {what}, expected a matrix of {wanted}")
-    return found
+        numbers = np.full(1, np.nan)
+    if not np.isfinite(numbers).all() or n not in (None, len(numbers)):
+        expected = "numbers" if n is None else f"{n} numbers"
+        problem = "is missing" if value is None else f"is {_short(value)}"
+        raise InputError(f"{path}: {key}: {problem}, expected a matrix of {expected}")
+    return numbers
 
 
 def _short(value: Any) -> str:
@@ -307,11 +309,11 @@ def _short(value: Any) -> str:
 
 def parse_section(where: Path, document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     """Return a mapping within a document; raise InputError if it is missing."""
-    found = document.get(key)
-    if not isinstance(found, Mapping):
-        what = "is missing" if found is None else f"is {_short(found)}"
-        raise InputError(f"{where}: {key}: {what}, expected a mapping")
-    return found
+    section = document.get(key)
+    if not isinstance(section, Mapping):
+        problem = "is missing" if section is None else f"is {_short(section)}"
+        raise InputError(f"{where}: {key}: {problem}, expected a mapping")
+    return section
 
 
 def _numbers(
@@ -323,9 +325,9 @@ def _numbers(
         isinstance(each, int | float) and not isinstance(each, bool) for each in value
     )
     if not is_list or (n is not None and len(value) != n):
-        wanted = f"a list [{', '.join(names)}]" if names else "a list of numbers"
-        what = "is missing" if value is None else f"is {reprlib.repr(value)}"
-        raise InputError(f"{where}: {key}: {what}, expected {wanted}")
+        expected = f"a list [{', '.join(names)}]" if names else "a list of numbers"
+        problem = "is missing" if value is None else f"is {reprlib.repr(value)}"
+        raise InputError(f"{where}: {key}: {problem}, expected {expected}")
     return [float(each) for each in value]
 
 
@@ -449,9 +451,9 @@ def _centred_span(left: Lens, right: Lens, axis: int) -> tuple[int, int, float]:
     first, last = max(0, -shift), min(left.size_px[axis], right.size_px[axis] - shift) - 1
     side = int(np.floor(2 * min(center - first, last - center) + 0.5)) + 1
     side = min(side, last - first + 1)
-    begin = round(center - (side - 1) / 2)
-    begin = min(max(begin, first), last - side + 1)
-    return side, begin, center - begin - (side - 1) / 2
+    start = round(center - (side - 1) / 2)
+    start = min(max(start, first), last - side + 1)
+    return side, start, center - start - (side - 1) / 2
 
 
 def _reach(lens: Lens, R: Float) -> Float:
@@ -462,21 +464,21 @@ def _reach(lens: Lens, R: Float) -> Float:
     edges = [(0 * v, v), (0 * v + width - 1, v), (u, 0 * u), (u, 0 * u + height - 1)]
     if R[2, 2] < _MIN_COS_ROTATION:
         return np.zeros(2)
-    least = np.full(2, _MAX_TANGENT)
+    min_tangent = np.full(2, _MAX_TANGENT)
     for k, edge in enumerate(edges):
         rays = lens.rays(np.column_stack(edge)) @ R.T
         axis, sign = divmod(k, 2)  # sign 0 for the low edge, 1 for the high edge
         met = (2 * sign - 1) * rays[:, axis] / rays[:, 2]
         met = met[np.isfinite(met) & (rays[:, 2] > 0)]
-        least[axis] = min(least[axis], met.min(initial=_MAX_TANGENT))
-    return np.maximum(least, 0.0)
+        min_tangent[axis] = min(min_tangent[axis], met.min(initial=_MAX_TANGENT))
+    return np.maximum(min_tangent, 0.0)
 
 
 def _camera(width: int, height: int, focal_px: float, baseline_m: float) -> StereoCamera:
     """Return the rectified camera; raise InputError if its images are too small."""
     if min(width, height) < _MIN_SIDE_PX:
-        small = f"what both cameras see has {width}x{height} px once rectified"
-        raise InputError(f"{small}, at least {_MIN_SIDE_PX} each way are needed")
+        size_text = f"what both cameras see has {width}x{height} px once rectified"
+        raise InputError(f"{size_text}, at least {_MIN_SIDE_PX} each way are needed")
     try:
         return StereoCamera(width, height, focal_px, baseline_m)
     except OutOfRangeError as error:

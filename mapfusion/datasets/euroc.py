@@ -140,12 +140,14 @@ def _read_pictures(camera: Path) -> tuple[list[Shot], list[str]]:
         else:
             missing.append(f"{name} (no such file)")
     if missing and len(shots) < _MIN_PICTURES:
-        lost = f"{missing[0]}; {len(missing)} of the {len(missing) + len(shots)} listed are missing"
-        held = next(
+        missing_text = (
+            f"{missing[0]}; {len(missing)} of the {len(missing) + len(shots)} listed are missing"
+        )
+        present = next(
             (each.name for each in sorted((camera / "data").glob("*")) if each.is_file()), "none"
         )
-        folder = f"names are relative to {camera.name}/data, whose first file is {held}"
-        raise InputError(f"{path}: {lost}; {folder}")
+        folder = f"names are relative to {camera.name}/data, whose first file is {present}"
+        raise InputError(f"{path}: {missing_text}; {folder}")
     require_increasing(path, lines, np.array([shot.time_ns for shot in shots], dtype=np.int64))
     return shots, missing
 

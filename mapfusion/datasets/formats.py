@@ -177,8 +177,8 @@ def import_recording(
     from mapfusion.datasets.stereo_import import RecordingPart, StereoImport, write_imported
 
     recording = read_recording(format_name, folder, settings, read_yaml)
-    whole = RecordingPart(robot_name(recording.name), slice(None))
-    return write_imported(Path(destination), [StereoImport(recording).log_of(whole)])
+    whole_recording = RecordingPart(robot_name(recording.name), slice(None))
+    return write_imported(Path(destination), [StereoImport(recording).log_of(whole_recording)])
 
 
 def export_drive(

@@ -84,18 +84,18 @@ class ImuData:
         seconds = np.diff(when) / NS
         middle = (when[1:] + when[:-1]) / 2 - when[0]
         rates = [np.interp(middle, self.time_ns - when[0], axis) for axis in self.rate.T]
-        small = Rotation.from_rotvec(np.stack(rates, -1) * seconds[:, None]).as_matrix()
+        step_rotations = Rotation.from_rotvec(np.stack(rates, -1) * seconds[:, None]).as_matrix()
         index = np.searchsorted(when, time_ns)
         # Samples around each interval, which must enclose it without a gap.
-        before = np.searchsorted(self.time_ns, time_ns[:-1], side="right") - 1
-        after = np.searchsorted(self.time_ns, time_ns[1:])
+        index_before = np.searchsorted(self.time_ns, time_ns[:-1], side="right") - 1
+        index_after = np.searchsorted(self.time_ns, time_ns[1:])
         turns = np.full((len(time_ns), 3), np.nan)
         for k, (first, stop) in enumerate(itertools.pairwise(index), start=1):
-            i, j = int(before[k - 1]), int(after[k - 1])
+            i, j = int(index_before[k - 1]), int(index_after[k - 1])
             if i < 0 or j == len(self.time_ns):
                 continue
             if int(np.diff(self.time_ns[i : j + 1]).max()) <= _MAX_GAP_NS:
-                R = functools.reduce(np.matmul, small[first:stop])
+                R = functools.reduce(np.matmul, step_rotations[first:stop])
                 turns[k] = Rotation.from_matrix(R).as_rotvec()
         return turns
 
@@ -107,14 +107,14 @@ def _effective_sigma(values: Float) -> float:
     correlated ones. Autocorrelations are summed until they become negative (Geyer 1992, "Practical
     Markov chain Monte Carlo").
     """
-    off = values - values.mean()
-    square = float(off @ off)
+    deviation = values - values.mean()
+    square = float(deviation @ deviation)
     if square == 0:
         return 0.0
     correlation_time = 1.0
-    for lag in range(1, len(off)):
-        correlation = float(off[lag:] @ off[:-lag]) / square
+    for lag in range(1, len(deviation)):
+        correlation = float(deviation[lag:] @ deviation[:-lag]) / square
         if correlation <= 0:
             break
         correlation_time += 2 * correlation
-    return float(np.sqrt(square / len(off) * correlation_time))
+    return float(np.sqrt(square / len(deviation) * correlation_time))

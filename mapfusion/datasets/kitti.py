@@ -109,12 +109,14 @@ def numbered_shots(
     named = "[0-9]" * digits + ".png"
     pictures = {int(path.stem): path for path in sorted(folder.glob(named))}
     if not pictures:
-        there = next((path.name for path in sorted(folder.iterdir()) if path.is_file()), "no file")
-        named = f"{'0' * digits}.png, ..., expected of a KITTI recording; it holds {there}"
+        example = next(
+            (path.name for path in sorted(folder.iterdir()) if path.is_file()), "no file"
+        )
+        named = f"{'0' * digits}.png, ..., expected of a KITTI recording; it holds {example}"
         raise InputError(f"{folder}: holds no picture named {named}")
-    late = [number for number in pictures if number >= len(time_ns)]
-    if late:
-        raise InputError(f"{times}: has {len(time_ns)} times, none for {pictures[late[0]]}")
+    beyond_last = [number for number in pictures if number >= len(time_ns)]
+    if beyond_last:
+        raise InputError(f"{times}: has {len(time_ns)} times, none for {pictures[beyond_last[0]]}")
     return [
         Shot(int(time_ns[number]), f"{camera}/{path.name}", PictureFile(path))
         for number, path in pictures.items()
@@ -250,8 +252,8 @@ def read_kitti_raw(folder: Path, settings: KittiSettings, _: ReadYaml) -> Stereo
     width, height = stated_size.astype(int)
     size = pictures[0][0]().shape[1::-1]
     if size != (width, height):
-        found = f"pictures are {size[0]}x{size[1]}, rectified ones {width}x{height}"
-        raise InputError(f"{folder}: {found}; give the drive whose name ends in _sync")
+        sizes_text = f"pictures are {size[0]}x{size[1]}, rectified ones {width}x{height}"
+        raise InputError(f"{folder}: {sizes_text}; give the drive whose name ends in _sync")
     pair = rectified_calibration(calibration_file, P, size)
     baseline_m = float(pair.T_left_right[0, 3])
     T_robot_left = settings.mount.applied(level_mount(baseline_m, 0.0, HEIGHT_M))
@@ -309,7 +311,7 @@ def _find_calibration(drive: Path, name: str) -> Path:
 def _read_oxts(oxts: Path) -> TimedPoses:
     """Return T_world_imu: east, north, up, in the Mercator projection of the first latitude."""
     stamps = oxts / "timestamps.txt"
-    time_ns, known, rows = _read_timestamps(stamps), list[int](), list[list[float]]()
+    time_ns, used_rows, rows = _read_timestamps(stamps), list[int](), list[list[float]]()
     for k, stamp_ns in enumerate(time_ns.tolist()):
         path = oxts / "data" / f"{k:0{_RAW_DIGITS}d}.txt"
         if path.is_file():  # some drives lack a few
@@ -318,9 +320,11 @@ def _read_oxts(oxts: Path) -> TimedPoses:
                 continue
             line, words = state
             if len(words) != _OXTS_NUMBERS:
-                found = f"has {len(words)} columns, expected {_OXTS_NUMBERS} (of an OXTS unit)"
-                raise InputError(f"{path}, line {line}: {found}")
-            known.append(stamp_ns)
+                column_text = (
+                    f"has {len(words)} columns, expected {_OXTS_NUMBERS} (of an OXTS unit)"
+                )
+                raise InputError(f"{path}, line {line}: {column_text}")
+            used_rows.append(stamp_ns)
             rows.append(parse_numbers(path, line, words))
     if not rows:
         raise InputError(f"{oxts}: holds no data/{'0' * _RAW_DIGITS}.txt")
@@ -330,7 +334,7 @@ def _read_oxts(oxts: Path) -> TimedPoses:
     north = scale * np.arcsinh(np.tan(np.radians(latitude)))
     R = se3.from_planar(np.column_stack([east, north, yaw]))[:, :3, :3] @ se3.tilt(roll, pitch)
     position = np.column_stack([east, north, up])
-    return TimedPoses(np.array(known, dtype=np.int64), se3.pose(R, position - position[0]))
+    return TimedPoses(np.array(used_rows, dtype=np.int64), se3.pose(R, position - position[0]))
 
 
 def write_kitti(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[Path]:

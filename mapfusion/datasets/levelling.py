@@ -82,12 +82,12 @@ def robot_in_body(T_body_camera: Float) -> tuple[Float, Float]:
     """
     from scipy.spatial.transform import Rotation
 
-    ahead = T_body_camera @ inverse(pose(R_ROBOT_OPTICAL, np.zeros(3)))
+    T_body_robot_camera = T_body_camera @ inverse(pose(R_ROBOT_OPTICAL, np.zeros(3)))
     permutations = np.rint(Rotation.create_group("O").as_matrix())
-    similarity = np.einsum("nij,ij->n", permutations, ahead[:3, :3])
+    similarity = np.einsum("nij,ij->n", permutations, T_body_robot_camera[:3, :3])
     nearest = permutations[np.argmax(similarity)]
     T_body_robot = pose(nearest, np.zeros(3))
-    return T_body_robot, inverse(T_body_robot) @ ahead
+    return T_body_robot, inverse(T_body_robot) @ T_body_robot_camera
 
 
 def level_observations(
@@ -172,8 +172,8 @@ def fit_floor(points: Observations, camera_height_m: float, probability: float) 
     for tolerance in _TOLERANCES:
         for _ in range(_STEPS):
             across = np.array([-plane[0], -plane[1], 1.0])
-            own = np.einsum("i,nij,j->n", across, covariance, across)
-            variance = own + (tolerance * camera_height_m) ** 2
+            variance_across = np.einsum("i,nij,j->n", across, covariance, across)
+            variance = variance_across + (tolerance * camera_height_m) ** 2
             square = (position[:, 2] - design @ plane) ** 2 / variance
             inside = square <= gate
             if inside.sum() < _MIN_POINTS:
@@ -260,7 +260,7 @@ class AttitudeMeasurements:
             return None
         return self._rotations[0][k], float(self._rotations[1][k])
 
-    def measured(self, k: int, found: Features, sigma_uv_px: float) -> AttitudeMeasurement:
+    def measured(self, k: int, features: Features, sigma_uv_px: float) -> AttitudeMeasurement:
         """Return the measured attitude of frame k; its features are used to find the floor."""
         if self._source == "odometry":
             assert self._odometry is not None
@@ -274,8 +274,10 @@ class AttitudeMeasurements:
             height = np.nan if k else 0.0  # defined by the first frame, then estimated
             return AttitudeMeasurement(np.array([*tilt[k], height]), np.array([*sigma_tilt, 0.0]))
         if self._source == "floor":
-            noise = (sigma_uv_px, found.sigma_disparity_px)
-            points = Observations(*self.camera.triangulate(found.uv_px, found.disparity_px, *noise))
+            noise = (sigma_uv_px, features.sigma_disparity_px)
+            points = Observations(
+                *self.camera.triangulate(features.uv_px, features.disparity_px, *noise)
+            )
             points = level_observations(points, self.camera, self.T_robot_left)
             floor = fit_floor(points, float(self.T_robot_left[2, 3]), _FLOOR_PROBABILITY)
             if floor is not None:
@@ -316,23 +318,23 @@ class LevelledFrames:
         """Estimated attitude of the frames; None for a level body."""
         return self._levelling.attitude if self._measurements.measures else None
 
-    def add(self, found: Features, steps: float) -> None:
+    def add(self, features: Features, steps: float) -> None:
         """Add a frame; `steps` is the time since the frame before in usual time steps."""
         measurements = self._measurements
         if measurements.measures:
             k = len(self.observed)
-            attitude = measurements.measured(k, found, self._sigma_uv_px)
+            attitude = measurements.measured(k, features, self._sigma_uv_px)
             turn = self._levelling.expected_turn(attitude)
-            frame = self._observer.observe(found, steps, turn)
+            frame = self._observer.observe(features, steps, turn)
             self._levelling.add(frame.tracks.motion, attitude, measurements.rotation(k))
-            own = self._levelling.to_level_frame(frame.observations)
+            levelled = self._levelling.to_level_frame(frame.observations)
         else:
-            frame = self._observer.observe(found, steps)
-            own = level_observations(
+            frame = self._observer.observe(features, steps)
+            levelled = level_observations(
                 frame.observations, measurements.camera, measurements.T_robot_left
             )
-        again = float(np.sum(frame.tracks.length > 1)) / max(self._before, 1)
-        self.linked.append(again if self.observed else np.nan)
-        self._before = len(found)
+        tracked_share = float(np.sum(frame.tracks.length > 1)) / max(self._before, 1)
+        self.linked.append(tracked_share if self.observed else np.nan)
+        self._before = len(features)
         self.motions.append(frame.tracks.motion)
-        self.observed.append(own)
+        self.observed.append(levelled)

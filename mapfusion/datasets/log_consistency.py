@@ -199,8 +199,8 @@ def truth_finding(reference: str, spans: Sequence[Motions], poses: Float) -> Fin
         spans: motions that are compared with the truth, over spans of several lengths.
         poses: the truth.
     """
-    known = np.isfinite(poses.reshape(len(poses), -1)).all(axis=1)
-    if poses.ndim == 3 and known.any() and np.median(poses[known, 2, 2]) < UPRIGHT:
+    is_known = np.isfinite(poses.reshape(len(poses), -1)).all(axis=1)
+    if poses.ndim == 3 and is_known.any() and np.median(poses[is_known, 2, 2]) < UPRIGHT:
         text = f"the truth stands on end or on its head in most frames: {ORDER_OF_QUATERNIONS}"
         return Finding("truth", -1, text)
     subject = f"the truth contradicts {reference}"
@@ -351,22 +351,22 @@ def estimate_odometry_noise(
     walks = np.maximum(walks, _LEAST_RANDOM * sigma)
     medians, factors, exceeds, n_observed = list[float](), list[float](), False, len(spans[0].end)
     for observed in spans:
-        off, S, C = _differences(log.odometry, sigma, observed)
+        difference, S, C = _differences(log.odometry, sigma, observed)
         is_accurate = np.all(_diagonal(S) < _diagonal(C), axis=1)
         if np.count_nonzero(is_accurate) < _LEAST_MOTIONS:
             continue
-        off, S, C = off[is_accurate], S[is_accurate], C[is_accurate]
+        difference, S, C = difference[is_accurate], S[is_accurate], C[is_accurate]
         if not factors:  # the shortest spans are the most
             # sign test: more squared distances than by chance exceed the median
             median = chi_square_bound(0.5, len(_MEASURED))
-            n_larger = int(np.count_nonzero(_squared_distances(off, S + C) > median))
-            by_chance = scipy.special.bdtrc(n_larger - 1, len(off), 0.5)
+            n_larger = int(np.count_nonzero(_squared_distances(difference, S + C) > median))
+            by_chance = scipy.special.bdtrc(n_larger - 1, len(difference), 0.5)
             exceeds = n_larger > 0 and float(by_chance) < _NOISE_FALSE_ALARM
             stated = np.median(sigma[observed.end[is_accurate]][:, _MEASURED], axis=0)
         _, _, C_walks = _differences(log.odometry, walks, observed)
-        given = off, S, C_walks[is_accurate]
-        medians.append(_factor(*given, 0.5))
-        factors.append(max(medians[-1], _factor(*given, _UPPER)))
+        terms = difference, S, C_walks[is_accurate]
+        medians.append(_factor(*terms, 0.5))
+        factors.append(max(medians[-1], _factor(*terms, _UPPER)))
     if not factors:
         return OdometryNoise(np.nan, False, np.full(2, np.nan), n_observed)
     is_larger = exceeds and min(medians) > _IGNORED_FACTOR
@@ -380,31 +380,31 @@ def _standard_deviations(odometry: Float, noise: MotionNoise) -> Float:
 def _differences(odometry: Float, sigma: Float, observed: Motions) -> tuple[Float, Float, Float]:
     """Return the differences (N, 2) from observed motions, and both covariances (N, 2, 2)."""
     T, C, _ = odometry_over_spans(odometry, sigma, observed)
-    off = observed.motion[:, PLANAR] - T
-    off[:, 2] = wrap(off[:, 2])
+    difference = observed.motion[:, PLANAR] - T
+    difference[:, 2] = wrap(difference[:, 2])
     S = observed.covariance[:, PLANAR][:, :, PLANAR]
     measured = np.ix_(range(len(S)), _MEASURED, _MEASURED)
-    return off[:, _MEASURED], S[measured], C[measured]
+    return difference[:, _MEASURED], S[measured], C[measured]
 
 
 def _diagonal(covariance: Float) -> Float:
     return np.diagonal(covariance, axis1=1, axis2=2)
 
 
-def _squared_distances(off: Float, covariance: Float) -> Float:
-    return np.sum(off * np.linalg.solve(covariance, off[:, :, None])[:, :, 0], axis=1)
+def _squared_distances(difference: Float, covariance: Float) -> Float:
+    return np.sum(difference * np.linalg.solve(covariance, difference[:, :, None])[:, :, 0], axis=1)
 
 
-def _factor(off: Float, S: Float, C: Float, probability: float) -> float:
+def _factor(difference: Float, S: Float, C: Float, probability: float) -> float:
     """Return the factor f at which a quantile of the squared distances is that of chi-square."""
-    wanted = chi_square_bound(probability, len(_MEASURED))
+    target = chi_square_bound(probability, len(_MEASURED))
 
     def excess(factor: float) -> float:
-        squares = _squared_distances(off, S + factor**2 * C)
-        return float(np.quantile(squares, probability)) - wanted
+        squares = _squared_distances(difference, S + factor**2 * C)
+        return float(np.quantile(squares, probability)) - target
 
     # Without S the distances are larger, so f is at most this factor.
-    largest = float(np.sqrt(np.quantile(_squared_distances(off, C), probability) / wanted))
+    largest = float(np.sqrt(np.quantile(_squared_distances(difference, C), probability) / target))
     smallest = _SMALLEST_SHARE * largest
     if not smallest > 0 or excess(smallest) <= 0:
         return 0.0
@@ -447,28 +447,30 @@ def check_log(log: RobotLog, noise: MotionNoise) -> LogConsistency:
     finding = disagreement(
         "odometry", subject, spans, ReportedMotions(mistakes[""], noise), mistakes
     )
-    found = estimate_odometry_noise(log, spans, noise)
+    estimated_noise = estimate_odometry_noise(log, spans, noise)
     if finding is not None:
-        noisier = found.is_larger and ReportedMotions(mistakes[""], noise.scaled(found.factor))
+        noisier = estimated_noise.is_larger and ReportedMotions(
+            mistakes[""], noise.scaled(estimated_noise.factor)
+        )
         if not (noisier and _agrees_on_average(spans[0], noisier)):
-            return LogConsistency((finding,), (), found)
-    used_noise = noise.scaled(found.factor) if found.is_larger else noise
+            return LogConsistency((finding,), (), estimated_noise)
+    used_noise = noise.scaled(estimated_noise.factor) if estimated_noise.is_larger else noise
     direction, text = find_direction_error(log.odometry, spans, used_noise)
     findings = list[Finding]()
     if text:
         findings.append(Finding("direction", -1, text))
         log = replace(log, odometry=direction.corrected(log.odometry))
-        found = estimate_odometry_noise(log, spans, noise)
+        estimated_noise = estimate_odometry_noise(log, spans, noise)
     jumps, unchecked, needed = tuple(find_jumps(log, spans[0], noise)), "", links_needed(log)
-    if found.n_observed < MIN_MOTIONS:
+    if estimated_noise.n_observed < MIN_MOTIONS:
         counts = np.bincount(log.iteration, minlength=len(log))
         n_full = int(np.count_nonzero(counts >= needed))
         unchecked = (
             f"the odometry is not checked: {n_full} of {len(log)} frames show {needed} points or "
-            f"more, and {found.n_observed} share as many with the frame before"
+            f"more, and {estimated_noise.n_observed} share as many with the frame before"
         )
     findings += [jump.finding for jump in jumps]
-    return LogConsistency(tuple(findings), jumps, found, direction, unchecked)
+    return LogConsistency(tuple(findings), jumps, estimated_noise, direction, unchecked)
 
 
 def outside_gate(log: RobotLog, landmark: np.ndarray) -> tuple[int, int]:

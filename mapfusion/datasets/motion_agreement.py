@@ -262,12 +262,12 @@ def likely_cause(
     best: _Cause | None = None
     # Candidates, the simplest first: common axes, mistakes, other axes, axes and mistakes combined.
     axes = list(_axis_conventions())
-    common, others = axes[:_COMMON_AXES], axes[_COMMON_AXES:]
+    common_axes, other_axes = axes[:_COMMON_AXES], axes[_COMMON_AXES:]
     mistaken = [(text, each) for text, each in mistakes.items() if text]
     candidate_groups = (
-        [(text, R, poses) for R, text in common],
-        [(text, common[0][0], each) for text, each in mistaken],
-        [(text, R, poses) for R, text in others],
+        [(text, R, poses) for R, text in common_axes],
+        [(text, common_axes[0][0], each) for text, each in mistaken],
+        [(text, R, poses) for R, text in other_axes],
         [
             (f"{text}{_AND}{axes_text}", R, each)
             for R, axes_text in axes[1:]
@@ -295,8 +295,8 @@ def likely_cause(
         return _AND.join(text for text in (best.text, _unit_text(best.ratio)) if text)
 
     # No combination of axes, units and mistakes explains the motions.
-    if late := _frames_late(observed, poses):
-        each = (f"{abs(n)} frames too {'late' if n > 0 else 'early'}" for n in late)
+    if delays := _frames_late(observed, poses):
+        each = (f"{abs(n)} frames too {'late' if n > 0 else 'early'}" for n in delays)
         return f"its times look {' or '.join(itertools.islice(each, _MAX_OFFSETS))}"
     uncorrected = compare(observed, ReportedMotions(poses, noise))
     if uncorrected.shift.ratio < _STANDS_STILL:

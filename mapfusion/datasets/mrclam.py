@@ -187,9 +187,11 @@ def _read_barcodes(path: Path) -> dict[int, int]:
     for (subject, barcode), line in zip(table, lines, strict=True):
         if subject % 1 or barcode % 1:
             raise InputError(f"{path}, line {line}: not whole numbers (subject, barcode)")
-        known = subject_of.setdefault(int(barcode), int(subject))
-        if known != subject:
-            raise InputError(f"{path}, line {line}: barcode {int(barcode)} is subject {known}'s")
+        first_subject = subject_of.setdefault(int(barcode), int(subject))
+        if first_subject != subject:
+            raise InputError(
+                f"{path}, line {line}: barcode {int(barcode)} is subject {first_subject}'s"
+            )
     return subject_of
 
 
@@ -202,17 +204,17 @@ def _read_measurements(
     `landmarks` is given.
     """
     table, lines = _read_table(path, "time barcode range bearing")
-    wrong = np.flatnonzero(table[:, 2] <= 0)
-    if len(wrong):
-        row = wrong[0]
+    invalid = np.flatnonzero(table[:, 2] <= 0)
+    if len(invalid):
+        row = invalid[0]
         raise InputError(
             f"{path}, line {lines[row]}: range is {table[row, 2]:g} m, must be positive"
         )
     table[:, 1] = [subject_of_barcode.get(int(barcode), -1) for barcode in table[:, 1]]
-    kept = table[:, 1] > _LAST_ROBOT_SUBJECT
+    is_landmark = table[:, 1] > _LAST_ROBOT_SUBJECT
     if landmarks is not None:
-        kept &= np.isin(table[:, 1], list(landmarks))
-    table = table[kept]
+        is_landmark &= np.isin(table[:, 1], list(landmarks))
+    table = table[is_landmark]
     return table[np.argsort(table[:, 0], kind="stable")]
 
 

@@ -140,27 +140,27 @@ def find_direction_error(
 
 def _fit(odometry: Float, sigma: Float, observed: Motions, unit: DirectionError) -> _Fit:
     """Estimate the multiple of `unit` that explains the observed motions best."""
-    value, information, usual = 0.0, 0.0, np.ones(len(observed.end), dtype=bool)
+    value, information, is_usual = 0.0, 0.0, np.ones(len(observed.end), dtype=bool)
     angles, without = unit.angles(odometry), np.empty(0)
     for _ in range(_MAX_ROUNDS):
         turned = _multiple(unit, value).corrected(odometry)
         T, C, B = odometry_over_spans(turned, sigma, observed, angles)
         r = observed.motion[:, :2] - T[:, :2]
         W = np.linalg.inv(observed.covariance[:, :2, :2] + C[:, :2, :2])
-        information = float(np.einsum("ni,nij,nj->", B[usual], W[usual], B[usual]))
+        information = float(np.einsum("ni,nij,nj->", B[is_usual], W[is_usual], B[is_usual]))
         if not information > 0:
             return _Fit(0.0, 0.0, unit, 0.0)
         if not len(without):
             without = np.einsum("ni,nij,nj->n", r, W, r)
-        step = float(np.einsum("ni,nij,nj->", B[usual], W[usual], r[usual])) / information
+        step = float(np.einsum("ni,nij,nj->", B[is_usual], W[is_usual], r[is_usual])) / information
         value += step
-        off = r - step * B
-        squares = np.einsum("ni,nij,nj->n", off, W, off)
+        residual = r - step * B
+        squares = np.einsum("ni,nij,nj->n", residual, W, residual)
         scale = max(float(np.median(squares)) / chi_square_bound(0.5, 2), 1.0)
         information /= scale
         gate = scale * chi_square_bound(_GATE, 2)
-        before, usual = usual, squares <= gate
-        if abs(step) < _CONVERGED_RAD and np.array_equal(usual, before):
+        was_usual, is_usual = is_usual, squares <= gate
+        if abs(step) < _CONVERGED_RAD and np.array_equal(is_usual, was_usual):
             break
     largest = _LARGEST_SHARE if unit.turn_share else _LARGEST_RAD
     in_range = float(np.clip(value, -largest, largest))

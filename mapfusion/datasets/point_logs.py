@@ -75,9 +75,9 @@ _POLAR_FIELDS = ["range_m", "bearing_rad"]
 _TIME = described(pa.field("time_s", pa.float64()), "time in seconds")
 
 
-def _unknown(fields: list[pa.Field], about: str) -> list[pa.Field]:
+def _unknown(fields: list[pa.Field], description: str) -> list[pa.Field]:
     """Return optional columns, NaN where they are missing."""
-    return [described(field, about, np.nan) for field in fields]
+    return [described(field, description, np.nan) for field in fields]
 
 
 ODOMETRY = schema(
@@ -233,7 +233,7 @@ def _import_robots(
     if not robots:
         missing = "no odometry.csv or odometry.parquet, nor in a folder below"
         raise InputError(f"{folder}: {missing}; see `mapfusion docs point_logs`")
-    made = []
+    written = []
     for robot in robots[:1] if robots[0] == folder else robots:
         try:
             table, odometry = table_path(robot, kind), table_path(robot, "odometry")
@@ -259,10 +259,10 @@ def _import_robots(
             survey = next((path for path in surveys if path.is_file()), None)
             if survey is not None:
                 points = _true_points(survey, log.observations.label)
-            made.append((destination / log.robot, log, T_world_robot, points))
+            written.append((destination / log.robot, log, T_world_robot, points))
         except InputError as error:
             raise InputError(f"{error}; see `mapfusion docs point_logs`") from error
-    for path, log, T_world_robot, points in made:
+    for path, log, T_world_robot, points in written:
         write_log(path, log)
         for outdated in TRUTH_FILES:  # of an earlier import into the same folder
             (path / outdated).unlink(missing_ok=True)
@@ -270,7 +270,7 @@ def _import_robots(
             write_truth_poses(path, T_world_robot)
         if points is not None:
             write_truth_points(path, points)
-    return [path for path, *_ in made]
+    return [path for path, *_ in written]
 
 
 def _contradicts_itself(log: RobotLog) -> bool:
@@ -293,8 +293,8 @@ def _require_radians(path: Path, log: RobotLog, clock_s: Float, measured: Measur
     table, _ = _read_timed(path, ODOMETRY)
     has_poses = not np.isnan(column(table, "theta_rad")).all()
     name, unit = ("theta_rad", "degrees") if has_poses else (_VELOCITY_FIELDS[1], "degrees/s")
-    said = f"holds {unit}: only then the odometry agrees with the observations"
-    raise InputError(f"{path}: column {name}: {said}; multiply it by pi/180")
+    contents = f"holds {unit}: only then the odometry agrees with the observations"
+    raise InputError(f"{path}: column {name}: {contents}; multiply it by pi/180")
 
 
 def _read_timed(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str, str]]:
@@ -303,9 +303,9 @@ def _read_timed(path: Path, table_schema: pa.Schema) -> tuple[pa.Table, dict[str
     require_cells(path, table, ["time_s"], np.isfinite, "give a finite number")
     if not table.num_rows:
         raise InputError(f"{path}: holds no row")
-    back = np.flatnonzero(np.diff(column(table, "time_s")) < 0)
-    if len(back):
-        row = int(back[0]) + 1
+    decreasing = np.flatnonzero(np.diff(column(table, "time_s")) < 0)
+    if len(decreasing):
+        row = int(decreasing[0]) + 1
         raise InputError(f"{path}: column time_s: runs back in row {row}; sort the rows by time")
     return table, attributes
 
@@ -343,8 +343,8 @@ def _read_ranges(path: Path, settings: RangesSettings) -> Measurements:
     lacking = [] if settings.range_sigma_m or settings.range_sigma_ratio else ["range_sigma_m"]
     lacking += [] if settings.bearing_sigma_rad else ["bearing_sigma_rad"]
     if lacking:
-        asked = " ".join(f"--param {name}=..." for name in lacking)
-        raise InputError(f"{path}: the noise is not stated; give {asked} (standard deviations)")
+        options = " ".join(f"--param {name}=..." for name in lacking)
+        raise InputError(f"{path}: the noise is not stated; give {options} (standard deviations)")
     range_m, bearing_rad = columns(table, _POLAR_FIELDS).T
     range_sigma_m = np.hypot(settings.range_sigma_m, settings.range_sigma_ratio * range_m)
     points = points_of_ranges(range_m, bearing_rad, range_sigma_m, settings.bearing_sigma_rad)
@@ -405,8 +405,8 @@ def log_on_clock(
         extras: further arguments of `RobotLog`.
     """
     frame, seen = np.searchsorted(clock_s, measured.time_s), measured.observations
-    kept = (frame < len(clock_s)) & ~_seen_again(frame, seen.label)
-    frame, seen, time_s = frame[kept], seen[kept], measured.time_s[kept]
+    is_used = (frame < len(clock_s)) & ~_seen_again(frame, seen.label)
+    frame, seen, time_s = frame[is_used], seen[is_used], measured.time_s[is_used]
 
     T_start_frame = poses_at(clock_s)
     T_frame_measured = between(T_start_frame[frame], poses_at(time_s))
@@ -418,20 +418,22 @@ def log_on_clock(
 
     increments = np.zeros((len(clock_s), 3))
     increments[1:] = between(T_start_frame[:-1], T_start_frame[1:])
-    looks = seen.descriptor, seen.label
-    observations = Observations(position, covariance, *looks, descriptor_kind=seen.descriptor_kind)
+    appearance = seen.descriptor, seen.label
+    observations = Observations(
+        position, covariance, *appearance, descriptor_kind=seen.descriptor_kind
+    )
     times = clock_s - clock_s[0]
     return RobotLog(robot, measured.planar, times, increments, frame, observations, **extras)
 
 
 def _seen_again(frame: np.ndarray, label: np.ndarray | None) -> np.ndarray:
     """Return True for rows (N,) whose label a later row of the same frame has, too."""
-    again = np.zeros(len(frame), dtype=bool)
+    is_repeated = np.zeros(len(frame), dtype=bool)
     if label is not None:
         pairs = np.stack([frame, label], -1)[::-1]
-        again[:] = label != NO_LABEL
-        again[len(frame) - 1 - np.unique(pairs, axis=0, return_index=True)[1]] = False
-    return again
+        is_repeated[:] = label != NO_LABEL
+        is_repeated[len(frame) - 1 - np.unique(pairs, axis=0, return_index=True)[1]] = False
+    return is_repeated
 
 
 def _tell_repeated_labels(path: Path, clock_s: Float, measured: Measurements) -> None:
@@ -441,11 +443,14 @@ def _tell_repeated_labels(path: Path, clock_s: Float, measured: Measurements) ->
     if label is None or not len(rows):
         return
     labels = np.unique(label[rows]).tolist()
-    more = ", ..." if len(labels) > _MAX_LABELS else ""
-    which = f"label{'s' if len(labels) > 1 else ''} {', '.join(map(str, labels[:_MAX_LABELS]))}"
-    found = f"{len(rows)} of {len(label)} rows are left out ({which}{more}; first: row {rows[0]})"
+    ellipsis = ", ..." if len(labels) > _MAX_LABELS else ""
+    labels_text = (
+        f"label{'s' if len(labels) > 1 else ''} {', '.join(map(str, labels[:_MAX_LABELS]))}"
+    )
+    message = f"{len(rows)} of {len(label)} rows are left out "
+    message += f"({labels_text}{ellipsis}; first: row {rows[0]})"
     reason = "a frame keeps the last row of each label"
-    text = f"{path}: {found}: {reason}; if they show several landmarks, give each its own label"
+    text = f"{path}: {message}: {reason}; if they show several landmarks, give each its own label"
     warnings.warn(text, TellingWarning, stacklevel=4)
 
 
@@ -460,13 +465,17 @@ def _read_odometry(path: Path, measured_s: Float, radians: float = 1.0) -> Poses
     table, _ = _read_timed(path, ODOMETRY)
     time_s = column(table, "time_s")
     poses, velocities = (columns(table, names) for names in (POSE_FIELDS, _VELOCITY_FIELDS))
-    given = [not np.isnan(each).all() for each in (poses, velocities)]
-    if sum(given) != 1:
-        found = "has both poses and velocities" if all(given) else "has no poses or velocities"
+    is_given = [not np.isnan(each).all() for each in (poses, velocities)]
+    if sum(is_given) != 1:
+        problem = "has both poses and velocities" if all(is_given) else "has no poses or velocities"
         either = f"{', '.join(POSE_FIELDS)}, or {', '.join(_VELOCITY_FIELDS)}"
-        raise InputError(f"{path}: {found}; give either {either}")
-    names, values = (POSE_FIELDS, poses) if given[0] else (_VELOCITY_FIELDS, velocities)
-    if absent := [name for name, own in zip(names, values.T, strict=True) if np.isnan(own).all()]:
+        raise InputError(f"{path}: {problem}; give either {either}")
+    names, values = (POSE_FIELDS, poses) if is_given[0] else (_VELOCITY_FIELDS, velocities)
+    if absent := [
+        name
+        for name, values_of_column in zip(names, values.T, strict=True)
+        if np.isnan(values_of_column).all()
+    ]:
         raise InputError(f"{path}: has no column {absent[0]}; odometry needs {', '.join(names)}")
     require_cells(path, table, names, np.isfinite, "give a finite number")
     values[:, -1] *= radians
@@ -479,13 +488,13 @@ def _read_odometry(path: Path, measured_s: Float, radians: float = 1.0) -> Poses
         row_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
         within = np.count_nonzero((time_s >= moments_s[0]) & (time_s <= moments_s[-1]))
         if within < 2 < len(time_s) and row_s > _LARGEST_STEP * step_s:
-            found = f"rows are {row_s:.3g} s apart, and measurements {step_s:.3g} s"
-            raise InputError(f"{path}: column time_s: {found}; are its times in seconds?")
-        turn = step_s * float(np.median(np.abs(velocities[:, 1]))) if given[1] else 0.0
+            problem = f"rows are {row_s:.3g} s apart, and measurements {step_s:.3g} s"
+            raise InputError(f"{path}: column time_s: {problem}; are its times in seconds?")
+        turn = step_s * float(np.median(np.abs(velocities[:, 1]))) if is_given[1] else 0.0
         if turn > np.pi:
-            found = f"the robot turns by {turn:.3g} rad between two measurements (median); "
-            found += "are all times in seconds? if it holds degrees/s, multiply it by pi/180"
-            raise InputError(f"{path}: column {_VELOCITY_FIELDS[1]}: {found}")
+            problem = f"the robot turns by {turn:.3g} rad between two measurements (median); "
+            problem += "are all times in seconds? if it holds degrees/s, multiply it by pi/180"
+            raise InputError(f"{path}: column {_VELOCITY_FIELDS[1]}: {problem}")
 
     def poses_at(wanted_s: Float) -> Float:
         beyond = np.abs(wanted_s - np.clip(wanted_s, time_s[0], time_s[-1])) > _LONGEST_HOLD_S
@@ -494,7 +503,7 @@ def _read_odometry(path: Path, measured_s: Float, radians: float = 1.0) -> Poses
             moment = f"{wanted_s[beyond][0]:.15g} s, where something is measured"
             raise InputError(f"{path}: {spans} {moment}; is it another recording's, or clock's?")
         held_s = np.clip(wanted_s, time_s[0], time_s[-1])
-        if given[1]:
+        if is_given[1]:
             return dead_reckoning(np.column_stack([time_s, velocities]), held_s)
         return interpolate_poses(held_s, np.column_stack([time_s, poses]), np.inf)
 
@@ -545,8 +554,8 @@ def interpolate_poses(wanted_s: Float, timed: Float, longest_gap_s: float) -> Fl
     share = (wanted_s - before[:, 0]) / np.where(gap_s > 0, gap_s, 1.0)
     pose = before[:, 1:] + share[:, None] * (after[:, 1:] - before[:, 1:])
     pose[:, 2] = wrap(before[:, 3] + share * wrap(after[:, 3] - before[:, 3]))
-    known = (share >= 0) & (share <= 1) & (gap_s <= longest_gap_s)
-    return np.where(known[:, None], pose, np.nan)
+    is_known = (share >= 0) & (share <= 1) & (gap_s <= longest_gap_s)
+    return np.where(is_known[:, None], pose, np.nan)
 
 
 def _read_true_poses(path: Path, clock_s: Float, settings: _Frames) -> Float:
@@ -567,11 +576,11 @@ def _true_points(path: Path, label: np.ndarray | None) -> Float:
     if label is None:
         raise InputError(f"{path}: names landmarks by label, but the measurements have no labels")
     require_cells(path, table, POSITION_FIELDS, np.isfinite, "give a finite number")
-    known, point_m = column(table, "label"), columns(table, POSITION_FIELDS)
-    twice = np.flatnonzero(np.bincount(known - known.min(initial=0)) > 1)
+    labels, point_m = column(table, "label"), columns(table, POSITION_FIELDS)
+    twice = np.flatnonzero(np.bincount(labels - labels.min(initial=0)) > 1)
     if len(twice):
-        raise InputError(f"{path}: has label {int(twice[0] + known.min())} twice")
-    order = np.argsort(known)
-    place = np.clip(np.searchsorted(known[order], label), 0, len(known) - 1)
-    found = known[order][place] == label
-    return np.where(found[:, None], point_m[order][place], np.nan)
+        raise InputError(f"{path}: has label {int(twice[0] + labels.min())} twice")
+    order = np.argsort(labels)
+    index = np.clip(np.searchsorted(labels[order], label), 0, len(labels) - 1)
+    has_truth = labels[order][index] == label
+    return np.where(has_truth[:, None], point_m[order][index], np.nan)

@@ -108,10 +108,10 @@ def links(
     if observations.descriptor_kind != USURF:
         squares = (np.einsum("ij,ij->i", each, each) for each in (descriptor_a, descriptor_b))
         similarity += 1 - np.add.outer(*squares) / 2
-    index_b, back = similarity.argmax(axis=1), similarity.argmax(axis=0)
+    index_b, best_a = similarity.argmax(axis=1), similarity.argmax(axis=0)
     max_distance = euclidean_distance_at(_MAX_DESCRIPTOR_DISTANCE, observations.descriptor_kind)
     similar = similarity.max(axis=1) > 1 - max_distance**2 / 2
-    mutual = similar & (back[index_b] == np.arange(len(a)))
+    mutual = similar & (best_a[index_b] == np.arange(len(a)))
     return a[mutual], b[index_b[mutual]]
 
 
@@ -252,16 +252,16 @@ def observed_motions(log: RobotLog, lag: int = 1, factor: float | None = None) -
     A factor replaces the stated covariances by equal errors in all directions, whose variance is
     `factor` times the mean of the stated variances.
     """
-    starts, frames, found = log.frame_starts(), [], list[_PairMotion]()
+    starts, frames, pair_motions = log.frame_starts(), [], list[_PairMotion]()
     for end in range(lag, len(log), lag):
         motion = _pair_motion(log, starts, end - lag, end, factor)
         if motion is not None:
             frames.append((end - lag, end))
-            found.append(motion)
+            pair_motions.append(motion)
     start, end = np.array(frames, dtype=np.int64).reshape(-1, 2).T
-    T = np.array([motion.T for motion in found]).reshape(-1, 4, 4)
-    covariance = np.array([motion.covariance for motion in found]).reshape(-1, 6, 6)
-    counts = np.array([(motion.n_links, motion.n_agree) for motion in found], dtype=np.int64)
+    T = np.array([motion.T for motion in pair_motions]).reshape(-1, 4, 4)
+    covariance = np.array([motion.covariance for motion in pair_motions]).reshape(-1, 6, 6)
+    counts = np.array([(motion.n_links, motion.n_agree) for motion in pair_motions], dtype=np.int64)
     return Motions(start, end, _motion_vectors(T), covariance, *counts.reshape(-1, 2).T)
 
 
@@ -281,8 +281,8 @@ def odometry_motions(log: RobotLog, noise: MotionNoise) -> Motions:
     motion[:, PLANAR] = log.odometry[1:]
     sigma = np.array([noise.standard_deviations(each) for each in log.odometry[1:]]).reshape(-1, 3)
     covariance[:, PLANAR, PLANAR] = sigma**2
-    end, none = np.arange(1, n + 1), np.zeros(n, dtype=np.int64)
-    return Motions(end - 1, end, motion, covariance, none, none)
+    end, zeros = np.arange(1, n + 1), np.zeros(n, dtype=np.int64)
+    return Motions(end - 1, end, motion, covariance, zeros, zeros)
 
 
 def odometry_over_spans(
@@ -342,8 +342,8 @@ def _observed_steps(log: RobotLog) -> tuple[Motions, float | None]:
         tried = np.unique(np.linspace(1, len(log) - 1, _TRIAL_FRAMES).astype(int)).tolist()
         frames = [k for k in tried if len(links(log, starts, k - 1, k)[0]) >= min_links]
         for factor in (None, *_COVARIANCE_FACTORS):
-            found = [_pair_motion(log, starts, k - 1, k, factor) for k in frames]
-            if 2 * sum(motion is not None for motion in found) >= len(frames):
+            pair_motions = [_pair_motion(log, starts, k - 1, k, factor) for k in frames]
+            if 2 * sum(motion is not None for motion in pair_motions) >= len(frames):
                 break
         steps = steps if factor is None else observed_motions(log, 1, factor)
     return steps, factor

@@ -87,23 +87,27 @@ class Bag:
             InputError: the topic does not exist, or its type is none of `types`; the message names
                 the option.
         """
-        known = self.topics
-        if topic not in known:
-            named = ", ".join(sorted(known)[:_SHOWN_TOPICS]) or "none"
-            meant = did_you_mean(topic, known)
-            raise InputError(f"{self.path}: {option} {topic}: no such topic{meant}; there: {named}")
-        if known[topic].rsplit("/", 1)[-1] not in types:
-            wanted = " or ".join(types)
-            found = f"holds {known[topic]}, expected {wanted}"
-            raise InputError(f"{self.path}: {option} {topic}: {found}")
-        return known[topic]
+        type_by_topic = self.topics
+        if topic not in type_by_topic:
+            named = ", ".join(sorted(type_by_topic)[:_SHOWN_TOPICS]) or "none"
+            suggestion = did_you_mean(topic, type_by_topic)
+            raise InputError(
+                f"{self.path}: {option} {topic}: no such topic{suggestion}; there: {named}"
+            )
+        if type_by_topic[topic].rsplit("/", 1)[-1] not in types:
+            expected = " or ".join(types)
+            problem = f"holds {type_by_topic[topic]}, expected {expected}"
+            raise InputError(f"{self.path}: {option} {topic}: {problem}")
+        return type_by_topic[topic]
 
     def messages(self, topic: str, at_ns: int | None = None) -> Iterator[tuple[int, Any]]:
         """Yield recording time (ns) and message of a topic, only those of time `at_ns` if given."""
-        own: list[Connection] = [each for each in self._reader.connections if each.topic == topic]
+        connections: list[Connection] = [
+            each for each in self._reader.connections if each.topic == topic
+        ]
         stop = None if at_ns is None else at_ns + 1
         try:
-            for connection, time_ns, data in self._reader.messages(own, at_ns, stop):
+            for connection, time_ns, data in self._reader.messages(connections, at_ns, stop):
                 yield time_ns, self._reader.deserialize(data, connection.msgtype)
         except InputError:
             raise
@@ -181,12 +185,12 @@ def decode_image(message: Any) -> np.ndarray:
         raise _unknown_encoding(message.encoding)
     kind, channels, conversion = _ENCODINGS[message.encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
-    own = width * channels * np.dtype(kind).itemsize
+    row_bytes = width * channels * np.dtype(kind).itemsize
     data = np.asarray(message.data, dtype=np.uint8)
-    if not 0 < own <= step or len(data) < height * step:
+    if not 0 < row_bytes <= step or len(data) < height * step:
         raise InputError(f"picture of {width}x{height}: has {len(data)} bytes, rows of {step}")
     order = ">" if message.is_bigendian else "<"
-    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :own])
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row_bytes])
     levels = rows.view(np.dtype(kind).newbyteorder(order)).astype(kind)
     levels = levels.reshape((height, width, channels) if channels > 1 else (height, width))
     return levels if conversion is None else cv2.cvtColor(levels, conversion)
@@ -207,8 +211,8 @@ def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibrat
         raise InputError("camera_info: the right camera's P holds no focal length")
     baseline_m = -P_right[0, 3] / P_right[0, 0]
     if not baseline_m > 0:
-        found = "the right camera's P holds no baseline"
-        raise InputError(f"camera_info: {found}; are the cameras a pair, and not exchanged?")
+        problem = "the right camera's P holds no baseline"
+        raise InputError(f"camera_info: {problem}; are the cameras a pair, and not exchanged?")
     apart = se3.pose(np.eye(3), [baseline_m, 0.0, 0.0])
     if rectified:
         return StereoCalibration(_rectified_lens(left), _rectified_lens(right), apart)
@@ -219,15 +223,17 @@ def stereo_calibration(left: Any, right: Any, rectified: bool) -> StereoCalibrat
         try:
             K, model = _matrix(info, "K", (3, 3)), str(info.distortion_model)
             if model not in _DISTORTIONS:
-                known = ", ".join(name for name in _DISTORTIONS if name)
-                raise InputError(f"distortion_model {model!r} is unknown; known: {known}")
+                known_names = ", ".join(name for name in _DISTORTIONS if name)
+                raise InputError(f"distortion_model {model!r} is unknown; known: {known_names}")
             coefficients = _matrix(info, "D", (-1,))
             if model == "rational_polynomial" and not coefficients[5:].any():
                 coefficients = coefficients[:5]
             distortion = _DISTORTIONS[model] if coefficients.any() else "none"
-            own = tuple(coefficients.tolist()) if distortion != "none" else ()
+            coefficient_tuple = tuple(coefficients.tolist()) if distortion != "none" else ()
             size = (int(info.width), int(info.height))
-            lenses.append(Lens(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, own))
+            lenses.append(
+                Lens(size, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]), distortion, coefficient_tuple)
+            )
         except InputError as error:
             raise InputError(f"camera_info of the {side} camera: {error}") from error
     return StereoCalibration(lenses[0], lenses[1], T_left_right)
@@ -238,8 +244,8 @@ def pose_of_message(message: Any) -> Float:
     if hasattr(message, "transform"):
         t, q = message.transform.translation, message.transform.rotation
     else:
-        own = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-        t, q = own.position, own.orientation
+        pose_message = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        t, q = pose_message.position, pose_message.orientation
     xyzw = np.array([q.x, q.y, q.z, q.w])
     if not np.linalg.norm(xyzw) > 0:
         raise InputError("a pose has a quaternion of length 0")
@@ -256,12 +262,12 @@ def lookup_transform(transforms: list[Any], target: str, source: str) -> Float |
     ancestors = []
     for name in (target, source):
         frame, T = _frame(name), np.eye(4)
-        found = {frame: T}
-        while frame in parent and parent[frame][0] not in found:
+        T_by_frame = {frame: T}
+        while frame in parent and parent[frame][0] not in T_by_frame:
             frame, T_parent_frame = parent[frame]
             T = T_parent_frame @ T
-            found[frame] = T
-        ancestors.append(found)
+            T_by_frame[frame] = T
+        ancestors.append(T_by_frame)
     for frame, T_frame_source in ancestors[1].items():
         if frame in ancestors[0]:
             return se3.inverse(ancestors[0][frame]) @ T_frame_source
@@ -418,14 +424,14 @@ def _info_topic(bag: Bag, option: str, topic: str, own: str) -> str:
     tried = [f"{space}/camera_info" for space in spaces]
     if not bag.topics[topic].endswith("/CompressedImage"):
         tried = tried[:1]
-    there = [each for each in tried if each in bag.topics]
-    if not own and not there:
+    present = [each for each in tried if each in bag.topics]
+    if not own and not present:
         others = [name for name, kind in bag.topics.items() if kind.endswith("/CameraInfo")]
-        found = f"topics of this type: {', '.join(sorted(others)) or 'none'}"
+        topics_text = f"topics of this type: {', '.join(sorted(others)) or 'none'}"
         remedy = f"give one by --param {option}=TOPIC, or a file by --calibration FILE"
         lacking = f"no such topic {tried[0]} (CameraInfo of {topic})"
-        raise InputError(f"{bag.path}: {lacking}; {found}; {remedy}")
-    chosen = own or there[0]
+        raise InputError(f"{bag.path}: {lacking}; {topics_text}; {remedy}")
+    chosen = own or present[0]
     bag.require(option, chosen, "CameraInfo")
     return chosen
 
@@ -444,11 +450,13 @@ def _read_pictures(
             n_repeated += 1
             continue
         if last_ns is not None and own_ns <= last_ns:
-            back = f"runs back by {(last_ns - own_ns) / 1e9:g} s; times must increase"
+            order_problem = f"runs back by {(last_ns - own_ns) / 1e9:g} s; times must increase"
             if own_ns == last_ns:
-                back = "repeats the time before; --repeated first keeps the first of each time"
-            found = f"the picture recorded at {recorded_ns} ns {back}"
-            raise InputError(f"{bag.path}: {topic}: {found}")
+                order_problem = (
+                    "repeats the time before; --repeated first keeps the first of each time"
+                )
+            problem = f"the picture recorded at {recorded_ns} ns {order_problem}"
+            raise InputError(f"{bag.path}: {topic}: {problem}")
         last_ns = own_ns
         load = _BagPicture(bag, topic, recorded_ns, own_ns)
         shots.append(Shot(own_ns, f"{topic} at {own_ns} ns", load))
@@ -461,14 +469,18 @@ def _read_pictures(
 def _read_poses(bag: Bag, topic: str) -> TimedPoses:
     """Return the poses of a topic in the order of time."""
     try:
-        found = {stamp_ns(message): pose_of_message(message) for _, message in bag.messages(topic)}
+        pose_by_stamp = {
+            stamp_ns(message): pose_of_message(message) for _, message in bag.messages(topic)
+        }
     except InputError as error:
         raise InputError(f"{bag.path}: {topic}: {error}") from error
-    if not found:
+    if not pose_by_stamp:
         raise InputError(f"{bag.path}: topic {topic} holds no message")
-    times = sorted(found)
+    times = sorted(pose_by_stamp)
     try:
-        return TimedPoses(np.array(times, dtype=np.int64), np.stack([found[t] for t in times]))
+        return TimedPoses(
+            np.array(times, dtype=np.int64), np.stack([pose_by_stamp[t] for t in times])
+        )
     except ValueError as error:
         raise InputError(f"{bag.path}: {topic}: {error}") from error
 
@@ -494,8 +506,8 @@ def _read_mount(
     imu = bag.first(settings.imu).header.frame_id
     T_left_imu = lookup_transform(transforms, camera, imu)
     if T_left_imu is None:
-        lost = f"/tf_static leads from {imu!r} to no camera {camera!r}"
-        raise InputError(f"{bag.path}: --imu {settings.imu}: {lost}")
+        message = f"/tf_static leads from {imu!r} to no camera {camera!r}"
+        raise InputError(f"{bag.path}: --imu {settings.imu}: {message}")
     T_camera_imu = (optical @ T_left_imu)[:3, :3]
     measured = {stamp_ns(m): m for _, m in bag.messages(settings.imu)}
     time_ns = np.array(sorted(measured), dtype=np.int64)

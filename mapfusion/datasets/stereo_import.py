@@ -197,17 +197,21 @@ def scale_descriptor_window(
     return replace(vision, usurf=replace(vision.usurf, side_m=float(np.clip(side_m, *_SIDE_M))))
 
 
-def reprojection_errors_px(camera: StereoCamera, before: Tracks, after: Tracks) -> Float:
+def reprojection_errors_px(
+    camera: StereoCamera, tracks_before: Tracks, tracks_after: Tracks
+) -> Float:
     """Return reprojection errors of tracked points after the motion, u and v, shape (2N,).
 
-    The motion of the frame `after` must be known.
+    The motion of the frame `tracks_after` must be known.
     """
-    assert after.motion is not None
-    _, old, new = np.intersect1d(before.track_id, after.track_id, return_indices=True)
-    p_after, _ = camera.triangulate(after.uv_px[new], after.disparity_px[new], 1.0, 1.0)
-    T = after.motion.T_before_after
+    assert tracks_after.motion is not None
+    _, old, new = np.intersect1d(tracks_before.track_id, tracks_after.track_id, return_indices=True)
+    p_after, _ = camera.triangulate(
+        tracks_after.uv_px[new], tracks_after.disparity_px[new], 1.0, 1.0
+    )
+    T = tracks_after.motion.T_before_after
     moved = camera.project(p_after @ T[:3, :3].T + T[:3, 3])
-    return (moved[:, :2] - before.uv_px[old]).ravel()
+    return (moved[:, :2] - tracks_before.uv_px[old]).ravel()
 
 
 @dataclass(frozen=True)
@@ -260,8 +264,8 @@ class Imported:
             seen = f"{usual:g} observations a frame (median), {_MIN_OBSERVATIONS} are the least"
             return f"{self.log.robot}: too little to map: {seen}"
         if self.guessed > _MAX_EXTRAPOLATED * n:
-            lost = f"{self.guessed} of {n} motions could not be told from the pictures"
-            return f"{self.log.robot}: too little to map: {lost}"
+            message = f"{self.guessed} of {n} motions could not be told from the pictures"
+            return f"{self.log.robot}: too little to map: {message}"
         return ""
 
 
@@ -319,19 +323,25 @@ class StereoImport:
 
     def _require_row_alignment(self, pairs: Sequence[Pair], vision: FrontEndParameters) -> None:
         """Raise InputError if matched corners have a row offset or a negative disparity."""
-        off = np.concatenate([rectification_offsets(*pair, vision.harris) for pair in pairs])
-        if len(off) < _MIN_MATCHES:
+        offsets = np.concatenate([rectification_offsets(*pair, vision.harris) for pair in pairs])
+        if len(offsets) < _MIN_MATCHES:
             return
-        rows = float(np.median(np.abs(off[:, 1])))
+        rows = float(np.median(np.abs(offsets[:, 1])))
         if rows > _MAX_ROW_OFFSET:
-            found = f"points lie {rows:.1f} rows apart in the two images (median of {len(off)})"
+            problem = (
+                f"points lie {rows:.1f} rows apart in the two images (median of {len(offsets)})"
+            )
             remedy = "the pair is not rectified, or its calibration is another's"
-            raise InputError(f"{self._recording.name}: {found}; {remedy}")
-        columns = float(np.median(off[:, 0]))
+            raise InputError(f"{self._recording.name}: {problem}; {remedy}")
+        columns = float(np.median(offsets[:, 0]))
         if columns > _MAX_NEGATIVE_DISPARITY:
-            found = f"points lie {columns:.1f} px farther right in the right image than in the left"
+            problem = (
+                f"points lie {columns:.1f} px farther right in the right image than in the left"
+            )
             remedy = "are the cameras the other way round?"
-            raise InputError(f"{self._recording.name}: {found} (median of {len(off)}); {remedy}")
+            raise InputError(
+                f"{self._recording.name}: {problem} (median of {len(offsets)}); {remedy}"
+            )
 
     def log_of(
         self,
@@ -352,8 +362,8 @@ class StereoImport:
         recording, name = self._recording, self._recording.name
         rows = range(len(recording))[part.rows]
         if len(rows) < 2:
-            found = f"frames of {part.robot} are {len(rows)} of {len(recording)} pairs"
-            raise InputError(f"{name}: {found}; 2 are the least")
+            frames_text = f"frames of {part.robot} are {len(rows)} of {len(recording)} pairs"
+            raise InputError(f"{name}: {frames_text}; 2 are the least")
         time_ns = recording.time_ns[rows]
         reckoned, T_world_robot = self._odometry_at(time_ns), self._truth_at(time_ns)
 
@@ -426,8 +436,8 @@ class StereoImport:
             raise InputError(f"{self._recording.name}: no odometry {missing}")
         fallen = np.flatnonzero(T[:, 2, 2] <= 0)
         if len(fallen):
-            found = f"by the odometry the robot stands on its head in frame {int(fallen[0])}"
-            raise InputError(f"{self._recording.name}: {found}; is its quaternion x y z w?")
+            problem = f"by the odometry the robot stands on its head in frame {int(fallen[0])}"
+            raise InputError(f"{self._recording.name}: {problem}; is its quaternion x y z w?")
         return T
 
     def _truth_at(self, time_ns: np.ndarray) -> Float | None:
@@ -440,8 +450,8 @@ class StereoImport:
         if truth is None:
             return None
         T = truth.at(time_ns, _LONGEST_TRUTH_GAP_S)
-        times, own = self._recording.time_ns, truth.time_ns
-        overlap = len(own) and own[0] <= times[-1] and times[0] <= own[-1]
+        times, truth_times = self._recording.time_ns, truth.time_ns
+        overlap = len(truth_times) and truth_times[0] <= times[-1] and times[0] <= truth_times[-1]
         if np.isnan(T[:, 0, 0]).all() and not overlap:
             spans = _time_spans_text("truth", truth, time_ns)
             raise InputError(f"{self._recording.name}: {spans}")
@@ -466,20 +476,20 @@ def _find_contradictions(
     T_world_robot: Float | None,
 ) -> tuple[Finding, ...]:
     """Return findings about odometry and truth (T, 4, 4) that contradict the visual motions."""
-    known = [(k, motion) for k, motion in enumerate(motions) if k and motion is not None]
-    spans = composed_spans(motions_between_frames(known), len(motions))
-    found = []
+    known_motions = [(k, motion) for k, motion in enumerate(motions) if k and motion is not None]
+    spans = composed_spans(motions_between_frames(known_motions), len(motions))
+    findings = []
     if reckoned is not None:
         subject = "the odometry contradicts the motion that the pictures show"
         reported = ReportedMotions(reckoned, MotionNoise())
-        found.append(disagreement("odometry", subject, spans, reported, pose_mistakes(reckoned)))
+        findings.append(disagreement("odometry", subject, spans, reported, pose_mistakes(reckoned)))
     if T_world_robot is not None and np.isnan(T_world_robot[:, 0, 0]).all():
         gap = f"over gaps longer than {_LONGEST_TRUTH_GAP_S:g} s it is not interpolated"
-        found.append(Finding("truth", -1, f"the truth is known at none of the frames: {gap}"))
+        findings.append(Finding("truth", -1, f"the truth is known at none of the frames: {gap}"))
     elif T_world_robot is not None:
         reference = "the motion that the pictures show"
-        found.append(truth_finding(reference, spans, T_world_robot))
-    return tuple(one for one in found if one is not None)
+        findings.append(truth_finding(reference, spans, T_world_robot))
+    return tuple(one for one in findings if one is not None)
 
 
 def write_imported(destination: Path, imported: Sequence[Imported]) -> list[Path]:

@@ -216,15 +216,17 @@ def _warn_of_shifted_times(
 
     So do two cameras whose clocks differ by a constant. One picture may be a late start.
     """
-    before = pairs[0]
-    after = tuple(n - 1 - last for n, last in zip(lengths, pairs[-1], strict=True))
+    n_unpaired_first = pairs[0]
+    n_unpaired_last = tuple(n - 1 - last for n, last in zip(lengths, pairs[-1], strict=True))
     for first, last in ((0, 1), (1, 0)):
-        n = min(before[first], after[last])
-        if n >= _SHIFTED_PICTURES and not before[last] and not after[first]:
-            found = f"the first {before[first]} pictures of {cameras[first]} and the last "
-            found += f"{after[last]} of {cameras[last]} have no partner"
-            asked = "are both timed by one clock?"
-            warnings.warn(f"{source}: {found}: {asked}", TellingWarning, stacklevel=3)
+        n = min(n_unpaired_first[first], n_unpaired_last[last])
+        if n >= _SHIFTED_PICTURES and not n_unpaired_first[last] and not n_unpaired_last[first]:
+            message = (
+                f"the first {n_unpaired_first[first]} pictures of {cameras[first]} and the last "
+            )
+            message += f"{n_unpaired_last[last]} of {cameras[last]} have no partner"
+            question = "are both timed by one clock?"
+            warnings.warn(f"{source}: {message}: {question}", TellingWarning, stacklevel=3)
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -303,14 +305,14 @@ class StereoDrive:
     def mount(self, camera: int) -> Float:
         """Return T_robot_camera (4, 4) in optical axes of the left (0) or the right camera (1)."""
         half_m = self.camera.baseline_m / 2
-        place = self.camera.p_robot_eye(-half_m if camera else half_m)
-        return se3.pose(self.camera.camera_axes @ R_ROBOT_OPTICAL, place)
+        p_robot_eye = self.camera.p_robot_eye(-half_m if camera else half_m)
+        return se3.pose(self.camera.camera_axes @ R_ROBOT_OPTICAL, p_robot_eye)
 
 
 def write_dead_reckoning(folder: Path, drive: StereoDrive) -> None:
     """Write the dead-reckoned trajectory of a drive to `odometry.tum` in a folder."""
-    about = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
-    text = tum_text(drive.time_s, drive.reckoned_bodies, about)
+    comment = f"{drive.robot}: dead reckoning by the wheels, in the frame of the first pose"
+    text = tum_text(drive.time_s, drive.reckoned_bodies, comment)
     write_text(folder / ODOMETRY_FILE, text.splitlines())
 
 

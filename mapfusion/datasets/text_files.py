@@ -109,13 +109,13 @@ def parse_time_ns(path: Path, line: int, word: str, unit_ns: int) -> int:
 
 def require_increasing(path: Path, lines: list[int], time_ns: np.ndarray) -> None:
     """Raise InputError for the first line whose time does not increase."""
-    wrong = np.flatnonzero(np.diff(time_ns) <= 0)
-    if len(wrong):
-        k = int(wrong[0]) + 1
+    not_increasing = np.flatnonzero(np.diff(time_ns) <= 0)
+    if len(not_increasing):
+        k = int(not_increasing[0]) + 1
         step_s = (int(time_ns[k]) - int(time_ns[k - 1])) / NS
-        back = "repeats the time before" if step_s == 0 else f"runs back by {-step_s:g} s"
+        problem = "repeats the time before" if step_s == 0 else f"runs back by {-step_s:g} s"
         unit = "; are they rounded, or in another unit?" if step_s == 0 else ""
-        raise InputError(f"{path}, line {lines[k]}: {back}; times must increase{unit}")
+        raise InputError(f"{path}, line {lines[k]}: {problem}; times must increase{unit}")
 
 
 def read_time_series(
@@ -194,24 +194,27 @@ class TimedPoses:
         poses = np.full((len(time_ns), 4, 4), np.nan)
         if not len(self.time_ns):
             return poses
-        after = np.clip(np.searchsorted(self.time_ns, time_ns), 1, max(len(self.time_ns) - 1, 1))
-        before = after - 1
-        after = np.minimum(after, len(self.time_ns) - 1)
+        index_after = np.clip(
+            np.searchsorted(self.time_ns, time_ns), 1, max(len(self.time_ns) - 1, 1)
+        )
+        index_before = index_after - 1
+        index_after = np.minimum(index_after, len(self.time_ns) - 1)
         nearest = np.where(
-            np.abs(self.time_ns[before] - time_ns) < np.abs(self.time_ns[after] - time_ns),
-            before,
-            after,
+            np.abs(self.time_ns[index_before] - time_ns)
+            < np.abs(self.time_ns[index_after] - time_ns),
+            index_before,
+            index_after,
         )
         is_same_time = np.abs(self.time_ns[nearest] - time_ns) <= _SAME_TIME_NS
         poses[is_same_time] = self.T[nearest[is_same_time]]
-        gap_ns = self.time_ns[after] - self.time_ns[before]
-        inside = (self.time_ns[before] <= time_ns) & (time_ns <= self.time_ns[after])
+        gap_ns = self.time_ns[index_after] - self.time_ns[index_before]
+        inside = (self.time_ns[index_before] <= time_ns) & (time_ns <= self.time_ns[index_after])
         interpolated = np.flatnonzero(~is_same_time & inside & (gap_ns <= 1e9 * longest_gap_s))
         if len(interpolated):
             from scipy.spatial.transform import Rotation
 
-            fraction = (time_ns - self.time_ns[before])[interpolated] / gap_ns[interpolated]
-            first, second = self.T[before[interpolated]], self.T[after[interpolated]]
+            fraction = (time_ns - self.time_ns[index_before])[interpolated] / gap_ns[interpolated]
+            first, second = self.T[index_before[interpolated]], self.T[index_after[interpolated]]
             between = np.array(first)
             between[:, :3, 3] += fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
             turn = Rotation.from_matrix(first[:, :3, :3].swapaxes(1, 2) @ second[:, :3, :3])

@@ -218,9 +218,9 @@ def write_tum_rgbd(folder: Path, drive: StereoDrive, on_frame: OnFrame) -> list[
     for name, kind in ((_COLOUR, "rgb"), (_DEPTH, "depth")):
         lines = [f"{stamp} {kind}/{stamp}.png" for stamp in stamps]
         write_text(root / name, ["# timestamp filename", *lines])
-    about = f"{drive.robot}: true poses of the colour camera, x right, y down, z ahead"
+    comment = f"{drive.robot}: true poses of the colour camera, x right, y down, z ahead"
     poses = drive.true_bodies @ drive.mount(0)
-    write_text(root / _TRUTH, tum_text(drive.time_s, poses, about).splitlines())
+    write_text(root / _TRUTH, tum_text(drive.time_s, poses, comment).splitlines())
     camera = [
         f"intrinsics: [{drive.camera.focal_px}, {drive.camera.focal_px}, {cu}, {cv}]",
         f"resolution: [{drive.camera.width_px}, {drive.camera.height_px}]",

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import Estimates, boxes_overlap, slots_near
+from mapfusion.fastslam.landmark_arrays import Estimates, boxes_overlap, slots_near
 from mapfusion.fastslam.measurement import DROPPED, NEW, MapObservations, innovation, quadratic_form
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.geometry.numerics import Float, kernel

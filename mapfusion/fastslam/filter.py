@@ -18,7 +18,7 @@ from mapfusion.fastslam.association import (
     candidate_pairs,
     label_pairs,
 )
-from mapfusion.fastslam.landmarks import ActiveTracks
+from mapfusion.fastslam.landmark_arrays import ActiveTracks
 from mapfusion.fastslam.loop_closing import (
     DriftModel,
     FrameAssociation,
@@ -249,17 +249,17 @@ class FastSlam:
             self._history.add(self._poses, source)
         self._n_observations += len(chosen)
         n_effective = effective_sample_size(self._log_weights)
-        few = n_effective <= settings.resample_fraction * settings.n_particles
+        must_resample = n_effective <= settings.resample_fraction * settings.n_particles
         result = StepResult(
             best_pose=self._poses[self._best],
             effective_sample_size=n_effective,
-            resampled=few,
+            resampled=must_resample,
             n_landmarks=int(maps.n_landmarks[self._best]),
             cloud=self._poses,
             log_weights=self._log_weights,
             log_evidence=log_evidence,
         )
-        if few:  # replace particles of low weight by copies of heavy ones
+        if must_resample:  # replace particles of low weight by copies of heavy ones
             ancestors = systematic_ancestors(self._log_weights, self._rng)
             self._poses = self._poses[ancestors]
             maps.resample(ancestors)
@@ -325,8 +325,8 @@ class FastSlam:
             return poses, np.zeros(settings.n_particles)
         predicted = compose(self._poses, odometry)
         seen = observations_in_map(predicted, observations.position_m, noise, self._planar)
-        wide = with_odometry_noise(seen, predicted, odometry, sigma)
-        chosen, _ = self._associate(wide, observations)
+        widened = with_odometry_noise(seen, predicted, odometry, sigma)
+        chosen, _ = self._associate(widened, observations)
         if settings.close_loops and self._close_loops(chosen, seen, predicted, odometry, sigma):
             predicted = compose(self._poses, odometry)
             seen = observations_in_map(predicted, observations.position_m, noise, self._planar)

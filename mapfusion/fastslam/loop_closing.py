@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import Slots
+from mapfusion.fastslam.landmark_arrays import Slots
 from mapfusion.fastslam.measurement import NEW, MapObservations, quadratic_form
 from mapfusion.geometry.numerics import (
     Float,
@@ -58,15 +58,17 @@ class DriftModel:
         """Add a frame, in which the drift grows with a covariance (3, 3)."""
         if self.frame - self._knots[-1] >= self._spacing:
             self._knots = np.append(self._knots, self.frame)
-            kept = np.arange(len(self._knots) + 1)
+            kept_knots = np.arange(len(self._knots) + 1)
             if len(self._knots) > _MAX_KNOTS:
                 self._spacing *= 2
-                kept = np.append(kept[:-1:2], kept[-1])
+                kept_knots = np.append(kept_knots[:-1:2], kept_knots[-1])
             # The new knot starts as a copy of the present state.
-            state = (3 * np.minimum(kept, len(self._knots) - 1)[:, None] + np.arange(3)).ravel()
+            state = (
+                3 * np.minimum(kept_knots, len(self._knots) - 1)[:, None] + np.arange(3)
+            ).ravel()
             self._covariance = self._covariance[np.ix_(state, state)]
             self._pending = self._pending[state]
-            self._knots = self._knots[kept[:-1]]
+            self._knots = self._knots[kept_knots[:-1]]
         self.frame += 1
         self._covariance[-3:, -3:] += covariance
 

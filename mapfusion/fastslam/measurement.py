@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import LANES, Estimates
+from mapfusion.fastslam.landmark_arrays import LANES, Estimates
 from mapfusion.geometry.numerics import Float, cofactors, kernel
 from mapfusion.geometry.se2 import add_turned
 

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import (
+from mapfusion.fastslam.landmark_arrays import (
     BLOCK,
     COMMON,
     FREE,

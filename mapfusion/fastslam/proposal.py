@@ -14,7 +14,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from mapfusion.fastslam.landmarks import LANES, Estimates
+from mapfusion.fastslam.landmark_arrays import LANES, Estimates
 from mapfusion.fastslam.measurement import MapObservations, innovation, quadratic_form
 from mapfusion.geometry.numerics import Float, cholesky, kernel, solve_lower, solve_upper
 

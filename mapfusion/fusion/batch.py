@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import IDENTITY, between, compose
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog

@@ -42,11 +42,11 @@ def intersect_covariances(
     # det(w A + (1 - w) B) = det B prod(1 + w m), where 1 + m are the generalised eigenvalues of
     # (A, B)
     root = np.linalg.cholesky(covariance_j)
-    more = np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ A @ root).T - 1
+    eigenvalue_excess = np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ A @ root).T - 1
     low, high = np.zeros(len(A)), np.ones(len(A))
     for _ in range(_HALVINGS):  # log det is concave in w, so its slope decreases
         w = (low + high) / 2
-        rises = np.sum(more / (1 + w * more), axis=0) > 0
+        rises = np.sum(eigenvalue_excess / (1 + w * eigenvalue_excess), axis=0) > 0
         low, high = np.where(rises, w, low), np.where(rises, high, w)
     w = ((low + high) / 2)[:, None, None]
     covariance = np.linalg.inv(w * A + (1 - w) * B)

@@ -16,7 +16,7 @@ import numpy as np
 from mapfusion.align.alignment import Alignment
 from mapfusion.align.correspondences import Correspondences, HeightGate
 from mapfusion.errors import did_you_mean, moved_module_note
-from mapfusion.fusion.aligned_landmarks import AssociationTest
+from mapfusion.fusion.landmark_association import AssociationTest
 from mapfusion.fusion.team_graph import EdgeStatus, TeamParameters
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap
@@ -118,7 +118,10 @@ def name_order(name: str) -> tuple[list[Any], str]:
     parts = _DIGITS.split(name)  # alternating words and numbers
     numbers = [(len(digits), digits) for digits in (part.lstrip("0") for part in parts[1::2])]
     return [
-        key for both in zip_longest(parts[::2], numbers) for key in both if key is not None
+        key
+        for text_and_number in zip_longest(parts[::2], numbers)
+        for key in text_and_number
+        if key is not None
     ], name
 
 
@@ -222,8 +225,8 @@ class Component:
         of_maps = np.full(len(self.maps), np.nan)
         for k in self.members:
             pairs = zip(self.pairs, sigma_m, strict=True)
-            own = [sigma for pair, sigma in pairs if k in (pair.a, pair.b)]
-            of_maps[k] = np.sqrt(np.mean(np.square(own)) / 2) if own else 0.0
+            map_sigmas = [sigma for pair, sigma in pairs if k in (pair.a, pair.b)]
+            of_maps[k] = np.sqrt(np.mean(np.square(map_sigmas)) / 2) if map_sigmas else 0.0
         return of_maps
 
 
@@ -273,9 +276,9 @@ def target_of(name: str) -> str:
         return FUSERS[name]
     offered = {entry.name: entry.value for entry in entry_points(group=GROUP)}
     if name not in offered:
-        known = [*FUSERS, *offered]
-        there = f"known are {', '.join(known)}{did_you_mean(name, known)}"
-        raise ValueError(f"unknown fuser {name!r}, {there}")
+        known_names = [*FUSERS, *offered]
+        known_text = f"known are {', '.join(known_names)}{did_you_mean(name, known_names)}"
+        raise ValueError(f"unknown fuser {name!r}, {known_text}")
     return offered[name]
 
 
@@ -287,11 +290,11 @@ def make_fuser(name: str = USUAL) -> Fuser:
     """
     target = target_of(name)
     try:
-        made = load_class(target)()
+        fuser = load_class(target)()
     except Exception as error:
-        told = f"{error}{moved_module_note(error)}"
-        raise ValueError(f"fuser {name}: {target} cannot be made: {told}") from error
-    for wanted in ("fuse", "smoothed"):
-        if not hasattr(made, wanted):
-            raise ValueError(f"fuser {name}: {target} has no {wanted}")
-    return made
+        message = f"{error}{moved_module_note(error)}"
+        raise ValueError(f"fuser {name}: {target} cannot be made: {message}") from error
+    for attribute in ("fuse", "smoothed"):
+        if not hasattr(fuser, attribute):
+            raise ValueError(f"fuser {name}: {target} has no {attribute}")
+    return fuser

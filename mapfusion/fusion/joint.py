@@ -14,12 +14,6 @@ import scipy
 
 from mapfusion.align.alignment import MIN_PAIRS
 from mapfusion.descriptors import USURF, merged_kind, relative_distance
-from mapfusion.fusion.aligned_landmarks import (
-    ABSENT,
-    AlignedLandmarks,
-    CandidatePairs,
-    cluster_landmarks,
-)
 from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.fusion.joint_estimate import (
     JointEstimate,
@@ -28,6 +22,12 @@ from mapfusion.fusion.joint_estimate import (
     weighted_information,
 )
 from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.landmark_association import (
+    ABSENT,
+    AlignedLandmarks,
+    CandidatePairs,
+    cluster_landmarks,
+)
 from mapfusion.geometry.joint_covariance import JointCovariance, reduce_rank
 from mapfusion.geometry.numerics import Float, inverses, one_blas_thread
 from mapfusion.geometry.se2 import IDENTITY
@@ -59,22 +59,22 @@ class JointlyFused:
         """Return the fused map with descriptors, labels and parents."""
         members, n_maps = self.component.members, len(self.component.maps)
         position, joint = self._positions()
-        given = [self.component.maps[k] for k in members]
-        n, has = len(self.points), self.points != ABSENT
+        maps = [self.component.maps[k] for k in members]
+        n, has_parent = len(self.points), self.points != ABSENT
         count, largest_count = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        kind = merged_kind(*(own.descriptor_kind for own in given))
+        kind = merged_kind(*(landmark_map.descriptor_kind for landmark_map in maps))
         descriptor = np.full((n, USURF.length if kind is None else kind.length), np.nan, np.float32)
         label = np.full(n, NO_LABEL, np.int32)
-        for k, own in enumerate(given):
-            rows, landmarks = np.flatnonzero(has[:, k]), self.points[has[:, k], k]
-            count[rows] += own.count[landmarks]
-            if own.descriptor is not None:  # of the landmark with most observations
-                more = own.count[landmarks] > largest_count[rows]
-                descriptor[rows[more]] = own.descriptor[landmarks[more]]
-                largest_count[rows[more]] = own.count[landmarks[more]]
-            if own.label is not None:
+        for k, landmark_map in enumerate(maps):
+            rows, landmarks = np.flatnonzero(has_parent[:, k]), self.points[has_parent[:, k], k]
+            count[rows] += landmark_map.count[landmarks]
+            if landmark_map.descriptor is not None:  # of the landmark with most observations
+                has_more = landmark_map.count[landmarks] > largest_count[rows]
+                descriptor[rows[has_more]] = landmark_map.descriptor[landmarks[has_more]]
+                largest_count[rows[has_more]] = landmark_map.count[landmarks[has_more]]
+            if landmark_map.label is not None:
                 unlabelled = label[rows] == NO_LABEL
-                label[rows] = np.where(unlabelled, own.label[landmarks], label[rows])
+                label[rows] = np.where(unlabelled, landmark_map.label[landmarks], label[rows])
         fused = LandmarkMap(
             position,
             joint.marginal_m2,
@@ -83,7 +83,7 @@ class JointlyFused:
             None if np.isnan(descriptor).all() else descriptor,
             None if np.all(label == NO_LABEL) else label,
             self.component.planar,
-            given[0].name,
+            maps[0].name,
             joint,
             descriptor_kind=kind,
         )
@@ -106,34 +106,35 @@ class JointlyFused:
 
         A point g has the error dg/du of the unknowns' errors, and an independent error.
         """
-        n, has, estimate = len(self.points), self.points != ABSENT, self.estimate
+        n, has_parent, estimate = len(self.points), self.points != ABSENT, self.estimate
         n_dimensions, n_unknowns = self.maps[0].position_m.shape[1], len(estimate.covariance)
-        weight = has.astype(np.float64)
+        weight = has_parent.astype(np.float64)
         weight[: len(estimate.weight)] = estimate.weight
         factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
-        rows = [np.flatnonzero(has[:, k]) for k in range(len(self.maps))]
+        rows = [np.flatnonzero(has_parent[:, k]) for k in range(len(self.maps))]
         transformed = [
-            estimate.transformed(self.maps, k, self.points[own, k]) for k, own in enumerate(rows)
+            estimate.transformed(self.maps, k, self.points[is_in_map, k])
+            for k, is_in_map in enumerate(rows)
         ]
         W = [
-            weighted_information(each, weight[own, k])
-            for k, (own, each) in enumerate(zip(rows, transformed, strict=True))
+            weighted_information(each, weight[is_in_map, k])
+            for k, (is_in_map, each) in enumerate(zip(rows, transformed, strict=True))
         ]
         information = np.zeros((n, n_dimensions, n_dimensions))
-        for own, its in zip(rows, W, strict=True):
-            information[own] += its
+        for is_in_map, its in zip(rows, W, strict=True):
+            information[is_in_map] += its
         V = inverses(information)
         total, jacobian = np.zeros((n, n_dimensions)), np.zeros((n, n_dimensions, n_unknowns))
-        for k, (own, each, its) in enumerate(zip(rows, transformed, W, strict=True)):
-            gain = V[own] @ its
-            total[own] += np.einsum("nij,nj->ni", gain, each.y_m)
-            jacobian[own] += gain @ estimate.moved_m(self.maps, k, each, factor)
+        for k, (is_in_map, each, its) in enumerate(zip(rows, transformed, W, strict=True)):
+            gain = V[is_in_map] @ its
+            total[is_in_map] += np.einsum("nij,nj->ni", gain, each.y_m)
+            jacobian[is_in_map] += gain @ estimate.moved_m(self.maps, k, each, factor)
         covariance, position = np.zeros((n, 3, 3)), np.zeros((n, 3))
         covariance[:, :n_dimensions, :n_dimensions] = V
         position[:, :n_dimensions] = total
-        shared = np.zeros((n_unknowns, n, 3))
-        shared[:, :, :n_dimensions] = jacobian.transpose(2, 0, 1)
-        return position, reduce_rank(covariance, shared.reshape(n_unknowns, 3 * n))
+        shared_jacobian = np.zeros((n_unknowns, n, 3))
+        shared_jacobian[:, :, :n_dimensions] = jacobian.transpose(2, 0, 1)
+        return position, reduce_rank(covariance, shared_jacobian.reshape(n_unknowns, 3 * n))
 
 
 # Largest number of rounds of association and estimation.
@@ -172,26 +173,26 @@ class JointFuser:
         """Return the fused map; None if common landmarks do not connect all maps."""
         n_dimensions = 2 if component.planar else 3
         drift, height = component.drift_sigma_m, component.height_sigma_m
-        given = [component.maps[k] for k in component.members]
+        member_maps = [component.maps[k] for k in component.members]
         maps = [
             JointMap.of(landmarks, float(drift[k]), float(height[k]), n_dimensions)
-            for landmarks, k in zip(given, component.members, strict=True)
+            for landmarks, k in zip(member_maps, component.members, strict=True)
         ]
         # inliers of the alignments; `a` is the lesser of the two members
         member = {int(k): row for row, k in enumerate(component.members)}
         inliers = []
         for pair in component.pairs:
-            known = pair.inliers
-            sides = [(member[pair.a], known.index_a), (member[pair.b], known.index_b)]
+            pair_inliers = pair.inliers
+            sides = [(member[pair.a], pair_inliers.index_a), (member[pair.b], pair_inliers.index_b)]
             (a, row_a), (b, row_b) = sorted(sides, key=lambda side: side[0])
-            inliers.append(CandidatePairs(a, b, row_a, row_b, known.distance))
-        sizes = [len(landmarks) for landmarks in given]
+            inliers.append(CandidatePairs(a, b, row_a, row_b, pair_inliers.distance))
+        sizes = [len(landmarks) for landmarks in member_maps]
         points = cluster_landmarks(inliers, sizes)
         if not _is_connected(points):
             return None
         estimate = _estimate(maps, component.T_first_map[component.members], points)
         for _ in range(_MOST_ROUNDS):
-            pairs = _candidates(given, maps, estimate, inliers, parameters)
+            pairs = _candidates(member_maps, maps, estimate, inliers, parameters)
             new_points = cluster_landmarks(pairs, sizes)
             if np.array_equal(points, new_points) or not _is_connected(new_points):
                 break
@@ -201,9 +202,9 @@ class JointFuser:
 
 def _is_connected(points: np.ndarray) -> bool:
     """Return True if pairs of maps with enough common points (C, K) connect all maps."""
-    has = (points != ABSENT).astype(np.int64)
+    has_parent = (points != ABSENT).astype(np.int64)
     n_components, _ = scipy.sparse.csgraph.connected_components(
-        scipy.sparse.csr_matrix(has.T @ has >= MIN_PAIRS), directed=False
+        scipy.sparse.csr_matrix(has_parent.T @ has_parent >= MIN_PAIRS), directed=False
     )
     return n_components == 1
 
@@ -232,12 +233,12 @@ class _PlacedMap:
     @cached_property
     def bound_m2(self) -> Float:
         """Share of each landmark in a bound of the variance of a difference, shape (n,)."""
-        own, shared = np.trace(self.own_m2, axis1=1, axis2=2), self.shared_m
-        return own + 2 * np.einsum("nij,nij->n", shared, shared)
+        trace_m2, shared_m = np.trace(self.own_m2, axis1=1, axis2=2), self.shared_m
+        return trace_m2 + 2 * np.einsum("nij,nij->n", shared_m, shared_m)
 
 
 def _candidates(
-    given: Sequence[LandmarkMap],
+    landmark_maps: Sequence[LandmarkMap],
     maps: Sequence[JointMap],
     estimate: JointEstimate,
     inliers: Sequence[CandidatePairs],
@@ -252,16 +253,19 @@ def _candidates(
     """
     factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
     placed = []
-    for k, own in enumerate(maps):
-        transformed = estimate.transformed(maps, k, np.arange(len(own)))
+    for k, placed_map in enumerate(maps):
+        transformed = estimate.transformed(maps, k, np.arange(len(placed_map)))
         shared_m = estimate.moved_m(maps, k, transformed, factor)
         placed.append(_PlacedMap(transformed.y_m, transformed.own_m2, shared_m))
-    labels = [np.full(len(own), NO_LABEL) if own.label is None else own.label for own in given]
+    labels = [
+        np.full(len(placed_map), NO_LABEL) if placed_map.label is None else placed_map.label
+        for placed_map in landmark_maps
+    ]
     dof = max(estimate.dof, _LEAST_DOF)
     bound = student_bound(parameters.gate_probability, dof, placed[0].position_m.shape[1])
-    found = []
-    for a, b in combinations(range(len(given)), 2):
-        first, second = given[a].descriptor, given[b].descriptor
+    pairs = []
+    for a, b in combinations(range(len(landmark_maps)), 2):
+        first, second = landmark_maps[a].descriptor, landmark_maps[b].descriptor
         if first is None or second is None:
             of_maps = [pair for pair in inliers if (pair.a, pair.b) == (a, b)]
             rows = [np.stack([pair.row_a, pair.row_b]) for pair in of_maps]
@@ -272,24 +276,30 @@ def _candidates(
             unlabelled = (labels[a][i] == NO_LABEL) | (labels[b][j] == NO_LABEL)
             i, j = i[unlabelled], j[unlabelled]
             apart = np.linalg.norm(first[i] - second[j], axis=1).astype(np.float64)
-            distance = relative_distance(apart, given[a].descriptor_kind, given[b].descriptor_kind)
+            distance = relative_distance(
+                apart, landmark_maps[a].descriptor_kind, landmark_maps[b].descriptor_kind
+            )
             similar = distance <= parameters.max_descriptor_distance
             i, j, distance = i[similar], j[similar], distance[similar]
 
         # gate of the differences, in which common errors cancel
-        one, other = placed[a], placed[b]
-        shared = one.shared_m[i] - other.shared_m[j]
-        S = one.own_m2[i] + other.own_m2[j] + shared @ np.swapaxes(shared, 1, 2)
-        off = one.position_m[i] - other.position_m[j]
-        inside = np.einsum("ni,nij,nj->n", off, inverses(S), off) <= bound
+        placed_a, placed_b = placed[a], placed[b]
+        shared_difference_m = placed_a.shared_m[i] - placed_b.shared_m[j]
+        S = (
+            placed_a.own_m2[i]
+            + placed_b.own_m2[j]
+            + shared_difference_m @ np.swapaxes(shared_difference_m, 1, 2)
+        )
+        difference_m = placed_a.position_m[i] - placed_b.position_m[j]
+        inside = np.einsum("ni,nij,nj->n", difference_m, inverses(S), difference_m) <= bound
 
         labelled_a, labelled_b = (np.flatnonzero(labels[k] != NO_LABEL) for k in (a, b))
         same_a, same_b = np.nonzero(labels[a][labelled_a][:, None] == labels[b][labelled_b])
         i = np.concatenate([labelled_a[same_a], i[inside]])
         j = np.concatenate([labelled_b[same_b], j[inside]])
         dissimilarity = np.concatenate([np.zeros(len(same_a)), distance[inside]])
-        found.append(CandidatePairs(a, b, i, j, dissimilarity))
-    return found
+        pairs.append(CandidatePairs(a, b, i, j, dissimilarity))
+    return pairs
 
 
 def _neighbours(a: _PlacedMap, b: _PlacedMap, bound: float) -> tuple[np.ndarray, np.ndarray]:
@@ -306,9 +316,13 @@ def _neighbours(a: _PlacedMap, b: _PlacedMap, bound: float) -> tuple[np.ndarray,
         radius_m = np.sqrt(bound * (bound_a + 2.0**each))
         tree = scipy.spatial.KDTree(b.position_m[rows])
         neighbours = tree.query_ball_point(a.position_m, radius_m, return_sorted=True)
-        rows_a.append(np.repeat(np.arange(len(bound_a)), [len(own) for own in neighbours]))
+        rows_a.append(
+            np.repeat(
+                np.arange(len(bound_a)), [len(neighbour_rows) for neighbour_rows in neighbours]
+            )
+        )
         rows_b.append(rows[np.fromiter(chain.from_iterable(neighbours), np.int64)])
     i, j = np.concatenate(rows_a), np.concatenate(rows_b)
-    off = a.position_m[i] - b.position_m[j]
-    near = np.einsum("ni,ni->n", off, off) <= bound * (bound_a[i] + bound_b[j])
-    return i[near], j[near]
+    difference_m = a.position_m[i] - b.position_m[j]
+    is_near = np.einsum("ni,ni->n", difference_m, difference_m) <= bound * (bound_a[i] + bound_b[j])
+    return i[is_near], j[is_near]

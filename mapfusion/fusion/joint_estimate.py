@@ -23,7 +23,7 @@ import scipy
 
 from mapfusion.align.rigid_motion import motion_jacobian
 from mapfusion.camera import EXACT, N_OF_CAMERA, CalibrationError
-from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float, inverses
 from mapfusion.geometry.se2 import inverse, rotation_about_z, transform_points, wrap
@@ -123,14 +123,14 @@ class LandmarkRows(NamedTuple):
 
 
 def transform_landmarks(
-    landmarks: LandmarkRows, T: Float, shared: Float, arm_m: Float
+    landmarks: LandmarkRows, T: Float, shared_coefficients: Float, arm_m: Float
 ) -> TransformedLandmarks:
     """Transform landmarks into the common frame.
 
     Args:
         landmarks: landmarks of a map.
         T: pose of the map, shape (3,).
-        shared: shared variables of the map, shape (R,).
+        shared_coefficients: shared variables of the map, shape (R,).
         arm_m: positions in the map that the errors of the camera displace, shape (n, D).
     """
     (n, d), moved = landmarks.position_m.shape, landmarks.moved_m
@@ -138,8 +138,10 @@ def transform_landmarks(
         by_camera = landmarks.calibration.moves_m(arm_m)[:, :, :d]
         moved = np.concatenate([moved, np.swapaxes(by_camera, 1, 2)], axis=2)
     R = rotation_about_z(T[2])[:d, :d]
-    point = landmarks.position_m + (moved.reshape(n * d, len(shared)) @ shared).reshape(n, d)
-    by = np.empty((n, d, 3 + len(shared)))
+    point = landmarks.position_m + (
+        moved.reshape(n * d, len(shared_coefficients)) @ shared_coefficients
+    ).reshape(n, d)
+    by = np.empty((n, d, 3 + len(shared_coefficients)))
     by[:, :2, :3], by[:, 2:, :3] = motion_jacobian(T, point), 0.0
     np.matmul(R, moved, out=by[:, :, 3:])
     turned = R @ landmarks.own_m2 @ R.T, R @ landmarks.information @ R.T
@@ -210,26 +212,26 @@ class JointEstimate:
             factor: lower triangular factor (U, U) of the unknowns' covariance.
         """
         columns = self.unknowns(maps, k)
-        known = columns != ABSENT
-        by = transformed.by_unknown[:, :, known].reshape(
-            transformed.y_m.size, np.count_nonzero(known)
+        is_unknown = columns != ABSENT
+        by = transformed.by_unknown[:, :, is_unknown].reshape(
+            transformed.y_m.size, np.count_nonzero(is_unknown)
         )
         n = 1 + int(columns.max(initial=ABSENT))  # later columns of the factor are zero
         moved = np.zeros((transformed.y_m.size, len(factor)))
-        np.matmul(by, factor[columns[known], :n], out=moved[:, :n])
+        np.matmul(by, factor[columns[is_unknown], :n], out=moved[:, :n])
         return moved.reshape(*transformed.y_m.shape, len(factor))
 
 
 def _columns(maps: Sequence[JointMap]) -> list[np.ndarray]:
     """Return the indices of each map's unknowns in u; ABSENT for the pose of the first map."""
     first, of_camera, columns = 3 * (len(maps) - 1), dict[str, np.ndarray](), list[np.ndarray]()
-    for k, own in enumerate(maps):
+    for k, landmark_map in enumerate(maps):
         motion = np.arange(3 * k - 3, 3 * k) if k else np.full(3, ABSENT)
-        name = "" if own.calibration.is_none else own.calibration.camera
+        name = "" if landmark_map.calibration.is_none else landmark_map.calibration.camera
         columns_of_camera = of_camera.get(name, np.empty(0, np.int64))
-        shared = np.arange(first, first + own.n_shared - len(columns_of_camera))
-        first += len(shared)
-        columns.append(np.concatenate([motion, shared, columns_of_camera]))
+        shared_columns = np.arange(first, first + landmark_map.n_shared - len(columns_of_camera))
+        first += len(shared_columns)
+        columns.append(np.concatenate([motion, shared_columns, columns_of_camera]))
         if name:
             of_camera[name] = columns[-1][-N_OF_CAMERA:]
     return columns
@@ -246,15 +248,19 @@ def estimate_jointly(
         parents: rows of each point's landmarks in the maps, shape (C, K), ABSENT for none; each
             point has landmarks of at least two maps.
     """
-    T, shared = np.array(T_first_map), [np.zeros(each.n_shared) for each in maps]
+    T, shared_coefficients = np.array(T_first_map), [np.zeros(each.n_shared) for each in maps]
     columns = _columns(maps)
-    has = parents != ABSENT
-    rows = [LandmarkRows.of(own, parents[has[:, k], k]) for k, own in enumerate(maps)]
-    weight, dof, n_steps = has.astype(np.float64), MOST_DOF, 0
-    transformed = _transform_all(rows, T, shared, has, weight)
+    has_parent = parents != ABSENT
+    rows = [
+        LandmarkRows.of(each_map, parents[has_parent[:, k], k]) for k, each_map in enumerate(maps)
+    ]
+    weight, dof, n_steps = has_parent.astype(np.float64), MOST_DOF, 0
+    transformed = _transform_all(rows, T, shared_coefficients, has_parent, weight)
     while True:
-        points = _points(transformed, has, weight)
-        A, gradient = _equations(transformed, has, weight, points, columns, shared)
+        points = _points(transformed, has_parent, weight)
+        A, gradient = _equations(
+            transformed, has_parent, weight, points, columns, shared_coefficients
+        )
         factor = scipy.linalg.cholesky(A, lower=True)
         step = -scipy.linalg.cho_solve((factor, True), gradient)
         moved = float(np.sum((factor.T @ step) ** 2))
@@ -265,21 +271,27 @@ def estimate_jointly(
             z = _shared(columns)
             A[z, z] += 1.0 - share  # the prior is not scaled
             covariance = scipy.linalg.inv(A)
-            return JointEstimate(T, tuple(shared), covariance, weight, dof)
-        for k, own in enumerate(columns):
-            shared[k] = shared[k] + step[own[3:]]
+            return JointEstimate(T, tuple(shared_coefficients), covariance, weight, dof)
+        for k, each_map in enumerate(columns):
+            shared_coefficients[k] = shared_coefficients[k] + step[each_map[3:]]
             if k:
-                T[k] += step[own[:3]]
+                T[k] += step[each_map[:3]]
         T[:, 2] = wrap(T[:, 2])
-        transformed = _transform_all(rows, T, shared, has, weight)
-        weight, dof = _update_weights(transformed, has, weight, dof)
-        if not all(own.calibration.is_none for own in maps):
-            transformed = _transform_all(rows, T, shared, has, weight)  # at the new points
+        transformed = _transform_all(rows, T, shared_coefficients, has_parent, weight)
+        weight, dof = _update_weights(transformed, has_parent, weight, dof)
+        if not all(each_map.calibration.is_none for each_map in maps):
+            transformed = _transform_all(
+                rows, T, shared_coefficients, has_parent, weight
+            )  # at the new points
         n_steps += 1
 
 
 def _transform_all(
-    rows: Sequence[LandmarkRows], T: Float, shared: Sequence[Float], has: np.ndarray, weight: Float
+    rows: Sequence[LandmarkRows],
+    T: Float,
+    shared_coefficients: Sequence[Float],
+    has_parent: np.ndarray,
+    weight: Float,
 ) -> list[TransformedLandmarks]:
     """Transform the landmarks of all maps into the common frame.
 
@@ -287,13 +299,14 @@ def _transform_all(
     their noise would be scaled as well, and the maps would shrink to reduce the residuals.
     """
     transformed = [
-        transform_landmarks(*each, each[0].position_m) for each in zip(rows, T, shared, strict=True)
+        transform_landmarks(*each, each[0].position_m)
+        for each in zip(rows, T, shared_coefficients, strict=True)
     ]
-    if all(own.calibration.is_none for own in rows):
+    if all(map_rows.calibration.is_none for map_rows in rows):
         return transformed
-    g = _points(transformed, has, weight).g_m
-    arms = [transform_points(inverse(T[k]), g[has[:, k]]) for k in range(len(rows))]
-    return list(map(transform_landmarks, rows, T, shared, arms))
+    g = _points(transformed, has_parent, weight).g_m
+    arms = [transform_points(inverse(T[k]), g[has_parent[:, k]]) for k in range(len(rows))]
+    return list(map(transform_landmarks, rows, T, shared_coefficients, arms))
 
 
 class _Points(NamedTuple):
@@ -308,61 +321,66 @@ class _Points(NamedTuple):
     covariance_m2: Float
 
 
-def _points(transformed: Sequence[TransformedLandmarks], has: np.ndarray, weight: Float) -> _Points:
+def _points(
+    transformed: Sequence[TransformedLandmarks], has_parent: np.ndarray, weight: Float
+) -> _Points:
     n_dimensions = transformed[0].y_m.shape[1]
-    information = np.zeros((len(has), n_dimensions, n_dimensions))
-    total = np.zeros((len(has), n_dimensions))
-    for k, own in enumerate(transformed):
-        W = weighted_information(own, weight[has[:, k], k])
-        information[has[:, k]] += W
-        total[has[:, k]] += np.einsum("nij,nj->ni", W, own.y_m)
+    information = np.zeros((len(has_parent), n_dimensions, n_dimensions))
+    total = np.zeros((len(has_parent), n_dimensions))
+    for k, map_landmarks in enumerate(transformed):
+        W = weighted_information(map_landmarks, weight[has_parent[:, k], k])
+        information[has_parent[:, k]] += W
+        total[has_parent[:, k]] += np.einsum("nij,nj->ni", W, map_landmarks.y_m)
     V = inverses(information)
     return _Points(np.einsum("nij,nj->ni", V, total), V)
 
 
 def _equations(
     transformed: Sequence[TransformedLandmarks],
-    has: np.ndarray,
+    has_parent: np.ndarray,
     weight: Float,
     points: _Points,
     columns: Sequence[np.ndarray],
-    shared: Sequence[Float],
+    shared_coefficients: Sequence[Float],
 ) -> tuple[Float, Float]:
     """Return the normal equations of a step: matrix (U, U) and gradient (U,)."""
-    n_unknowns = 1 + max(int(own.max(initial=ABSENT)) for own in columns)
+    n_unknowns = 1 + max(int(each_map.max(initial=ABSENT)) for each_map in columns)
     A, gradient = np.zeros((n_unknowns + 1,) * 2), np.zeros(n_unknowns + 1)  # last: ABSENT
-    W = [weighted_information(own, weight[has[:, k], k]) for k, own in enumerate(transformed)]
-    for k, own in enumerate(transformed):
-        off = own.y_m - points.g_m[has[:, k]]
-        weighted = (W[k] @ off[:, :, None]).ravel()
-        gradient[columns[k]] += own.by_unknown.reshape(-1, len(columns[k])).T @ weighted
-        by, its = own.by_unknown, columns[k]
-        between = W[k] - W[k] @ points.covariance_m2[has[:, k]] @ W[k]
+    W = [
+        weighted_information(each_map, weight[has_parent[:, k], k])
+        for k, each_map in enumerate(transformed)
+    ]
+    for k, each_map in enumerate(transformed):
+        residual = each_map.y_m - points.g_m[has_parent[:, k]]
+        weighted = (W[k] @ residual[:, :, None]).ravel()
+        gradient[columns[k]] += each_map.by_unknown.reshape(-1, len(columns[k])).T @ weighted
+        by, its = each_map.by_unknown, columns[k]
+        between = W[k] - W[k] @ points.covariance_m2[has_parent[:, k]] @ W[k]
         A[np.ix_(its, its)] += by.reshape(-1, len(its)).T @ (between @ by).reshape(-1, len(its))
         for m, other in enumerate(transformed[:k]):
-            both = has[:, k] & has[:, m]
-            here, there = both[has[:, k]], both[has[:, m]]
-            between = -W[k][here] @ points.covariance_m2[both] @ W[m][there]
-            left = by[here].reshape(-1, len(its))
-            right = between @ other.by_unknown[there]
+            in_both = has_parent[:, k] & has_parent[:, m]
+            in_k, in_m = in_both[has_parent[:, k]], in_both[has_parent[:, m]]
+            between = -W[k][in_k] @ points.covariance_m2[in_both] @ W[m][in_m]
+            left = by[in_k].reshape(-1, len(its))
+            right = between @ other.by_unknown[in_m]
             block = left.T @ right.reshape(-1, len(columns[m]))
             A[np.ix_(its, columns[m])] += block
             A[np.ix_(columns[m], its)] += block.T
     z = _shared(columns)
     A[z, z] += 1.0
     value = np.zeros_like(gradient)
-    for own, its in zip(columns, shared, strict=True):
-        value[own[3:]] = its
+    for each_map, its in zip(columns, shared_coefficients, strict=True):
+        value[each_map[3:]] = its
     return A[:-1, :-1], (gradient + value)[:-1]
 
 
 def _shared(columns: Sequence[np.ndarray]) -> np.ndarray:
     """Return the indices of the shared variables in u."""
-    return np.unique(np.concatenate([own[3:] for own in columns]))
+    return np.unique(np.concatenate([map_columns[3:] for map_columns in columns]))
 
 
 def _update_weights(
-    transformed: Sequence[TransformedLandmarks], has: np.ndarray, weight: Float, dof: float
+    transformed: Sequence[TransformedLandmarks], has_parent: np.ndarray, weight: Float, dof: float
 ) -> tuple[Float, float]:
     """Compute new weights (C, K) and degrees of freedom of the Student-t distribution.
 
@@ -371,18 +389,22 @@ def _update_weights(
     D (M - 1) degrees of freedom. The weights are those of the squares about the true points (E step
     of Lange et al., 1989).
     """
-    unweighted = _points(transformed, has, has.astype(np.float64))
-    total = np.zeros(len(has))
-    for k, own in enumerate(transformed):
-        off = own.y_m - unweighted.g_m[has[:, k]]
-        total[has[:, k]] += np.einsum("ni,nij,nj->n", off, own.information, off)
+    unweighted = _points(transformed, has_parent, has_parent.astype(np.float64))
+    total = np.zeros(len(has_parent))
+    for k, map_landmarks in enumerate(transformed):
+        residual = map_landmarks.y_m - unweighted.g_m[has_parent[:, k]]
+        total[has_parent[:, k]] += np.einsum(
+            "ni,nij,nj->n", residual, map_landmarks.information, residual
+        )
     n_dimensions = unweighted.g_m.shape[1]
-    dof = fit_dof(total, n_dimensions * (np.count_nonzero(has, axis=1) - 1), dof)
+    dof = fit_dof(total, n_dimensions * (np.count_nonzero(has_parent, axis=1) - 1), dof)
 
-    new, points = np.zeros_like(weight), _points(transformed, has, weight)
-    for k, own in enumerate(transformed):
-        off = own.y_m - points.g_m[has[:, k]]
-        spread = off[:, :, None] * off[:, None, :] + points.covariance_m2[has[:, k]]
-        squares = np.einsum("nij,nij->n", own.information, spread)
-        new[has[:, k], k] = student_weights(squares, dof, n_dimensions)
+    new, points = np.zeros_like(weight), _points(transformed, has_parent, weight)
+    for k, map_landmarks in enumerate(transformed):
+        residual = map_landmarks.y_m - points.g_m[has_parent[:, k]]
+        spread = (
+            residual[:, :, None] * residual[:, None, :] + points.covariance_m2[has_parent[:, k]]
+        )
+        squares = np.einsum("nij,nij->n", map_landmarks.information, spread)
+        new[has_parent[:, k], k] = student_weights(squares, dof, n_dimensions)
     return new, dof

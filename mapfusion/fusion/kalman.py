@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapfusion.fusion.aligned_landmarks import (
+from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
+from mapfusion.fusion.landmark_association import (
     ABSENT,
     AlignedLandmarks,
     FusePairs,
     one_to_one,
 )
-from mapfusion.fusion.fusers import Component, FusedMap, MergeParameters
 from mapfusion.geometry.numerics import Float
 
 
@@ -71,10 +71,10 @@ def fuse_landmarks_sequentially(
             parent = fused.parents[:, placed]
             inside = (parent != ABSENT) & (parent < len(row_of))
             row_of[parent[inside]] = np.flatnonzero(inside)
-            has = row_of[index] != ABSENT
-            known_rows.append(row_of[index[has]])
-            other_rows.append(index_in_new[has])
-            dissimilarity.append(pair.inliers.distance[has])
+            is_present = row_of[index] != ABSENT
+            known_rows.append(row_of[index[is_present]])
+            other_rows.append(index_in_new[is_present])
+            dissimilarity.append(pair.inliers.distance[is_present])
         rows, others = one_to_one(
             np.concatenate(known_rows), np.concatenate(other_rows), np.concatenate(dissimilarity)
         )
@@ -157,5 +157,5 @@ class KalmanAsPrinted:
         several = np.count_nonzero(fused.parents != ABSENT, axis=1) > 1
         covariance = fused.landmarks.covariance_m2[several, :dimensions, :dimensions]
         n_wrong = int(np.count_nonzero(np.linalg.eigvalsh(covariance)[:, 0] <= 0))
-        wrong = f"{n_wrong} of {len(covariance)} fused covariances are not positive definite"
-        return replace(fused, fallback=wrong if n_wrong else "")
+        message = f"{n_wrong} of {len(covariance)} fused covariances are not positive definite"
+        return replace(fused, fallback=message if n_wrong else "")

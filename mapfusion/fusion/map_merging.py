@@ -153,14 +153,14 @@ class MapAlignment:
     @property
     def alignment(self) -> Alignment:
         """Refined alignment with the status of the verdict, for `fuse_maps`."""
-        found = self.registered.applied
-        if found.status in NOT_RUN:  # the reason does not name the aligner
-            return replace(found, reason=f"{self.aligner}: {found.status}: {found.reason}")
-        if not found.ok and self.cause:
+        applied = self.registered.applied
+        if applied.status in NOT_RUN:  # the reason does not name the aligner
+            return replace(applied, reason=f"{self.aligner}: {applied.status}: {applied.reason}")
+        if not applied.ok and self.cause:
             replaced = f"; {self._note}" if self.hint == self.cause else ""
-            reason = found.reason.removesuffix(replaced)
-            return replace(found, reason=f"{reason}; {self.cause}")
-        return found
+            reason = applied.reason.removesuffix(replaced)
+            return replace(applied, reason=f"{reason}; {self.cause}")
+        return applied
 
     @cached_property
     def cause(self) -> str:
@@ -224,8 +224,8 @@ class MapAlignment:
         """Other motions that many correspondences support, the best supported first."""
         pairs, p_b, T = self.ready.pairs, self.map_b.position_m[:, :2], self.T_a_b
         local = distinct_motions(pairs, _MOST_RIVALS + 1, self._acceptance, self._refinement)
-        found = [each._replace(T_a_b=pairs.given_motion(each.T_a_b)[0]) for each in local]
-        rivals = [each for each in found if not rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M]
+        motions = [each._replace(T_a_b=pairs.given_motion(each.T_a_b)[0]) for each in local]
+        rivals = [each for each in motions if not rms_distance_m(T, each.T_a_b, p_b) < DISTINCT_M]
         return sorted(rivals, key=lambda each: -np.count_nonzero(each.inlier))[:_MOST_RIVALS]
 
     @property
@@ -263,15 +263,15 @@ class MapAlignment:
         """
         import pandas as pd
 
-        given = Pairs(self.map_a, self.map_b, self.correspondences)
-        off = residuals(self.T_a_b, given.p_a, given.p_b)
+        pairs = Pairs(self.map_a, self.map_b, self.correspondences)
+        residual = residuals(self.T_a_b, pairs.p_a, pairs.p_b)
         return pd.DataFrame(
             {
                 "landmark_a": self.correspondences.index_a,
                 "landmark_b": self.correspondences.index_b,
                 "descriptor_distance": self.correspondences.distance,
                 "inlier": self.inlier,
-                "residual_m": np.hypot(*off[:, :2].T),
+                "residual_m": np.hypot(*residual[:, :2].T),
             }
         )
 
@@ -377,18 +377,18 @@ def _log10_chance(alignment: MapAlignment) -> float:
     return math.inf if math.isnan(log10) else log10
 
 
-def advice(found: Sequence[MapAlignment]) -> str:
+def advice(alignments: Sequence[MapAlignment]) -> str:
     """Say in a few sentences which motion to use, how sure it is, or why not and what to do.
 
     Args:
-        found: alignments of the same two maps by different methods, at least one.
+        alignments: alignments of the same two maps by different methods, at least one.
     """
-    best, several = best_alignment(found), len(found) > 1
+    best, several = best_alignment(alignments), len(alignments) > 1
     if not best.accepted:
-        tried = f"None of {len(found)} methods has an accepted motion. " if several else ""
+        tried = f"None of {len(alignments)} methods has an accepted motion. " if several else ""
         return f"Use no T_a_b. {tried}{best.refusal}"
     p_b = best.map_b.position_m[:, :2]
-    accepted = [each for each in found if each.accepted]
+    accepted = [each for each in alignments if each.accepted]
     others = [e for e in accepted if rms_distance_m(best.T_a_b, e.T_a_b, p_b) >= DISTINCT_M]
     if others:
         listed = ", ".join(f"{motion_text(e.T_a_b)} of {e.aligner}" for e in [best, *others])
@@ -406,8 +406,8 @@ def advice(found: Sequence[MapAlignment]) -> str:
     n_pairs = f"1e{log10_pairs:.0f}" if math.isfinite(log10_pairs) else "an unknown number of"
     text += f"chance gives as much once in {n_pairs} pairs of maps"
     if several:
-        agree = "all" if len(accepted) == len(found) else f"{len(accepted)} of"
-        text += f", and {agree} {len(found)} methods agree"
+        agree = "all" if len(accepted) == len(alignments) else f"{len(accepted)} of"
+        text += f", and {agree} {len(alignments)} methods agree"
     text += "."
     if best.far_away:
         text += f" {best.far_away}"
@@ -465,9 +465,9 @@ class MergedMaps:
     def reasons(self) -> dict[tuple[int, int], str]:
         """Return by pair of maps the reason why their alignment is not used; empty if it is."""
         reasons: dict[tuple[int, int], str] = {}
-        for pair, place in zip(self.pairs, self.fusion.edge_status, strict=True):
-            reason = pair.alignment.reason or _TEAM_REASONS.get(place, "")
-            if place in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
+        for pair, edge_status in zip(self.pairs, self.fusion.edge_status, strict=True):
+            reason = pair.alignment.reason or _TEAM_REASONS.get(edge_status, "")
+            if edge_status in (EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE):
                 reasons[pair.a, pair.b] = ""
             else:
                 reasons.setdefault((pair.a, pair.b), reason)
@@ -477,20 +477,22 @@ class MergedMaps:
     def notes(self) -> dict[tuple[int, int], str]:
         """Remarks on accepted alignments, by pair of maps."""
         return {
-            pair: found.registered.verdict.reason
-            for pair, found in self.alignments.items()
-            if found.registered.verdict.accepted and found.registered.verdict.reason
+            pair: alignment.registered.verdict.reason
+            for pair, alignment in self.alignments.items()
+            if alignment.registered.verdict.accepted and alignment.registered.verdict.reason
         }
 
     @property
     def note(self) -> str:
         """Notes on the alignments that are used, in one line; empty if there is none."""
         used, notes = [pair for pair, reason in self.reasons().items() if not reason], self.notes
-        told = [notes[pair] for pair in used if pair in notes]
-        if not told:
+        note_texts = [notes[pair] for pair in used if pair in notes]
+        if not note_texts:
             return ""
-        others = f" (and for {len(told) - 1} more pairs of maps)" if len(told) > 1 else ""
-        return f"{told[0]}{others}"
+        others = (
+            f" (and for {len(note_texts) - 1} more pairs of maps)" if len(note_texts) > 1 else ""
+        )
+        return f"{note_texts[0]}{others}"
 
     def is_lower_bound(self, fused: FusedMap) -> bool:
         """Return True if the covariances of a fused map's motions are lower bounds.
@@ -539,8 +541,8 @@ class MergedMaps:
         fused = self.fusion.fused
         paths = [numbered_path(Path(path), k) for k in range(1, len(fused) + 1)]
         writes: dict[Path, Write] = {}
-        for place, each in zip(paths, fused, strict=True):
-            writes |= map_writes(place, each.landmarks)
+        for fused_path, each in zip(paths, fused, strict=True):
+            writes |= map_writes(fused_path, each.landmarks)
         write_all_atomically(writes)
         return paths
 
@@ -634,8 +636,8 @@ def load_maps(
     require_one_kind(kinds)
     if sum(each.label is not None for each in loaded) > 1:
         for place, landmarks in opened:
-            if told := _repeated_labels(landmarks):
-                warnings.warn(f"{place}: {told}", TellingWarning, stacklevel=3)
+            if warning := _repeated_labels(landmarks):
+                warnings.warn(f"{place}: {warning}", TellingWarning, stacklevel=3)
     return loaded
 
 
@@ -647,10 +649,10 @@ def _repeated_labels(landmarks: LandmarkMap) -> str:
     rows = np.flatnonzero(n > 1)
     if not len(rows):
         return ""
-    shown = [f"label {labels[k]} is on {n[k]} landmarks" for k in rows[:_MAX_LABELS]]
-    shown += [f"{len(rows) - len(shown)} more are on several"] if len(rows) > len(shown) else []
+    texts = [f"label {labels[k]} is on {n[k]} landmarks" for k in rows[:_MAX_LABELS]]
+    texts += [f"{len(rows) - len(texts)} more are on several"] if len(rows) > len(texts) else []
     rule = "of each only the landmark with the largest count is matched (the first, if equal)"
-    return f"{', '.join(shown)}, of {len(labels)} labels: {rule}; give each landmark its own label"
+    return f"{', '.join(texts)}, of {len(labels)} labels: {rule}; give each landmark its own label"
 
 
 def _registration(aligner: "str | Method | Aligner | Registration") -> Registration:

@@ -60,8 +60,8 @@ class ConnectedMaps:
             parameters: parameters of the merge.
             recordings: logs of the maps, if these are smoothed, for fusers that smooth again.
         """
-        given = [replace(each, recordings=tuple(recordings)) for each in self.components]
-        return Fusion(tuple(fuser.fuse(each, parameters) for each in given), self.edge_status)
+        components = [replace(each, recordings=tuple(recordings)) for each in self.components]
+        return Fusion(tuple(fuser.fuse(each, parameters) for each in components), self.edge_status)
 
 
 def merge(
@@ -240,12 +240,12 @@ def _require_valid_pairs(maps: Sequence[LandmarkMap], pairs: Sequence[AlignedPai
         raise ValueError(f"maps: {len(maps)} given, at least 2 are needed")
     seen_pairs: set[frozenset[int]] = set()
     for k, pair in enumerate(pairs):
-        both = frozenset((pair.a, pair.b))
-        if len(both) < 2 or not 0 <= min(both) <= max(both) < len(maps):
+        pair_set = frozenset((pair.a, pair.b))
+        if len(pair_set) < 2 or not 0 <= min(pair_set) <= max(pair_set) < len(maps):
             raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are no two of {len(maps)} maps")
-        if both in seen_pairs and pair.alignment.status is not Status.AMBIGUOUS:
+        if pair_set in seen_pairs and pair.alignment.status is not Status.AMBIGUOUS:
             raise ValueError(f"pairs[{k}]: {pair.a} and {pair.b} are given twice")
-        seen_pairs.add(both)
+        seen_pairs.add(pair_set)
         require_shape(
             f"pairs[{k}].alignment.inlier", pair.alignment.inlier, (len(pair.correspondences),)
         )

@@ -55,8 +55,8 @@ class AlignmentEdges:
     def concatenated(self, other: "AlignmentEdges") -> "AlignmentEdges":
         """Return these edges followed by others between the same robots."""
         names = ("robots", "T_a_b", "covariance", "log10_false_alarms")
-        both = (np.concatenate([getattr(self, n), getattr(other, n)]) for n in names)
-        return AlignmentEdges(self.n_robots, *both)
+        joined = (np.concatenate([getattr(self, n), getattr(other, n)]) for n in names)
+        return AlignmentEdges(self.n_robots, *joined)
 
     def max_distance_m(self) -> float:
         """Return the largest translation of an edge, in m."""
@@ -75,13 +75,13 @@ class Motions:
 
     def inverse(self) -> "Motions":
         """Return the inverse motions, with covariances to first order."""
-        back = inverse(self.T)
+        T_inverse = inverse(self.T)
         cos, sin = np.cos(self.T[:, 2]), np.sin(self.T[:, 2])
-        J = np.zeros((len(back), 3, 3))
+        J = np.zeros((len(T_inverse), 3, 3))
         J[:, 0, 0] = J[:, 1, 1] = -cos
         J[:, 1, 0], J[:, 0, 1] = sin, -sin
-        J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = back[:, 1], -back[:, 0], -1.0
-        return Motions(back, J @ self.covariance @ J.swapaxes(1, 2))
+        J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = T_inverse[:, 1], -T_inverse[:, 0], -1.0
+        return Motions(T_inverse, J @ self.covariance @ J.swapaxes(1, 2))
 
     def compose_independent(self, other: "Motions") -> "Motions":
         """Compose with independent motions, with covariances to first order."""
@@ -128,11 +128,11 @@ class Placement:
             squared Mahalanobis distances (n,) and their covariances S (n, 3, 3).
         """
         a, b = self.row[robots[:, 0]], self.row[robots[:, 1]]
-        e, before, after = _residuals(self.T_root_robot, a, b, motions.T)
+        e, jacobian_a, jacobian_b = _residuals(self.T_root_robot, a, b, motions.T)
         P = self.covariance
-        S = motions.covariance + before @ P[a, a] @ before.swapaxes(1, 2)
-        S = S + after @ P[b, b] @ after.swapaxes(1, 2)
-        cross = before @ P[a, b] @ after.swapaxes(1, 2)
+        S = motions.covariance + jacobian_a @ P[a, a] @ jacobian_a.swapaxes(1, 2)
+        S = S + jacobian_b @ P[b, b] @ jacobian_b.swapaxes(1, 2)
+        cross = jacobian_a @ P[a, b] @ jacobian_b.swapaxes(1, 2)
         S = S + cross + cross.swapaxes(1, 2)
         return np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0]), S
 
@@ -192,13 +192,13 @@ def _residuals(at: Float, a: np.ndarray, b: np.ndarray, T_a_b: Float) -> tuple[F
     e[:, 2] = wrap(e[:, 2])
     to_a = rotation(at[a, 2]).swapaxes(1, 2)
     translation = at[b, :2] - at[a, :2]
-    before, after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    after[:, :2, :2], after[:, 2, 2] = to_a, 1.0
-    before[:, :2, :2], before[:, 2, 2] = -to_a, -1.0
-    before[:, :2, 2] = np.einsum(
+    jacobian_a, jacobian_b = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    jacobian_b[:, :2, :2], jacobian_b[:, 2, 2] = to_a, 1.0
+    jacobian_a[:, :2, :2], jacobian_a[:, 2, 2] = -to_a, -1.0
+    jacobian_a[:, :2, 2] = np.einsum(
         "nij,nj->ni", to_a, np.stack([translation[:, 1], -translation[:, 0]], 1)
     )
-    return e, before, after
+    return e, jacobian_a, jacobian_b
 
 
 def _equations(
@@ -206,12 +206,12 @@ def _equations(
 ) -> tuple[Float, Float]:
     """Return normal matrix and right side for a step of all poses except the first."""
     n = len(at)
-    e, before, after = _residuals(at, a, b, T_a_b)
+    e, jacobian_a, jacobian_b = _residuals(at, a, b, T_a_b)
     normal, right = np.zeros((n, n, 3, 3)), np.zeros((n, 3))
-    for i, J in ((a, before), (b, after)):
+    for i, J in ((a, jacobian_a), (b, jacobian_b)):
         weighted = J.swapaxes(1, 2) @ information
         np.add.at(right, i, -np.einsum("nij,nj->ni", weighted, e))
-        for k, K in ((a, before), (b, after)):
+        for k, K in ((a, jacobian_a), (b, jacobian_b)):
             np.add.at(normal, (i, k), weighted @ K)
     size = 3 * (n - 1)
     return normal[1:, 1:].swapaxes(1, 2).reshape(size, size), right[1:].ravel()

@@ -199,7 +199,7 @@ class LoopSearch:
 
 def resolve_alternatives(
     edges: AlignmentEdges,
-    kept: np.ndarray,
+    is_kept: np.ndarray,
     component: np.ndarray,
     alternatives: AlignmentEdges,
     test: LoopTest,
@@ -208,7 +208,7 @@ def resolve_alternatives(
 
     Args:
         edges: accepted alignments.
-        kept: true for those that are used, shape (E,).
+        is_kept: true for those that are used, shape (E,).
         component: connected component of each robot, shape (N,).
         alternatives: alternatives of ambiguous alignments; those of the same two robots exclude
             each other.
@@ -218,7 +218,7 @@ def resolve_alternatives(
     together = np.flatnonzero(component[low] == component[high])
     distance, by_chance = np.full(len(alternatives), np.inf), np.ones(len(alternatives))
     for name in np.unique(component[low[together]]):
-        inside = kept & (component[edges.robots] == name).all(axis=1)
+        inside = is_kept & (component[edges.robots] == name).all(axis=1)
         placement = optimize_poses(edges, np.flatnonzero(inside))
         rows = together[component[low[together]] == name]
         motions = Motions(alternatives.T_a_b, alternatives.covariance)[rows]
@@ -310,8 +310,10 @@ def team_graph(
     if alternatives is None or not len(alternatives):
         return _graph_of_accepted(edges, parameters, rank)
     connected = _graph_of_accepted(edges, replace(parameters, unconfirmed=Unconfirmed.KEEP), rank)
-    kept = np.isin(connected.edge_status, [EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE])
-    resolved = resolve_alternatives(edges, kept, connected.component, alternatives, parameters.loop)
+    is_kept = np.isin(connected.edge_status, [EdgeStatus.CONFIRMED, EdgeStatus.BRIDGE])
+    resolved = resolve_alternatives(
+        edges, is_kept, connected.component, alternatives, parameters.loop
+    )
     graph = _graph_of_accepted(edges.concatenated(alternatives[resolved]), parameters, rank)
     of_alternatives = np.full(len(alternatives), EdgeStatus.REFUSED, dtype=object)
     of_alternatives[resolved] = graph.edge_status[len(edges) :]
@@ -325,23 +327,23 @@ def _graph_of_accepted(
     """Return the graph of accepted alignments and resolved alternatives."""
     search = LoopSearch(edges, parameters.loop)
     confirmed, ambiguous = _confirmed_edges(search, parameters.unconfirmed)
-    kept, bridge = confirmed.copy(), np.zeros_like(confirmed)
+    is_kept, is_bridge = confirmed.copy(), np.zeros_like(confirmed)
     if parameters.unconfirmed is Unconfirmed.KEEP:
         # connect separate components by single alignments, most reliable first
-        component, free = _components(edges, kept), ~confirmed & ~ambiguous
+        component, free = _components(edges, is_kept), ~confirmed & ~ambiguous
         for row in np.argsort(edges.log10_false_alarms, kind="stable"):
             a, b = component[edges.robots[row]]
             if free[row] and a != b:
-                bridge[row] = True
+                is_bridge[row] = True
                 component[component == b] = a
-        kept |= bridge
+        is_kept |= is_bridge
 
-    component = _components(edges, kept)
+    component = _components(edges, is_kept)
     rank = np.arange(edges.n_robots) if rank is None else rank
     T, covariance = np.zeros((len(component), 3)), np.zeros((len(component), 3, 3))
-    agrees = kept.copy()
+    agrees = is_kept.copy()
     for name in np.unique(component):
-        inside = kept & (component[edges.robots] == name).all(axis=1)
+        inside = is_kept & (component[edges.robots] == name).all(axis=1)
         if not inside.any():
             continue
         robots = np.flatnonzero(component == name)
@@ -350,13 +352,13 @@ def _graph_of_accepted(
         row = placement.row[robots]
         T[robots] = placement.T_root_robot[row]
         covariance[robots] = placement.covariance[row, row]
-        agrees[search.consistent_rows(placement, np.ones_like(kept))] = True
+        agrees[search.consistent_rows(placement, np.ones_like(is_kept))] = True
 
     status = np.full(len(edges), EdgeStatus.UNCONFIRMED, dtype=object)
     together = component[edges.robots[:, 0]] == component[edges.robots[:, 1]]
     status[ambiguous] = EdgeStatus.AMBIGUOUS
     status[together & ~agrees] = EdgeStatus.CONTRADICTED
-    status[bridge] = EdgeStatus.BRIDGE
+    status[is_bridge] = EdgeStatus.BRIDGE
     status[confirmed] = EdgeStatus.CONFIRMED
     return TeamGraph(component, T, covariance, status)
 
@@ -383,9 +385,9 @@ def _confirmed_edges(search: LoopSearch, unconfirmed: Unconfirmed) -> tuple[np.n
         if rivals:
             group = np.zeros((edges.n_robots, len(rivals)), dtype=np.int64)
             for k, rival in enumerate(rivals):
-                shared = np.intersect1d(edge_set.robots, rival.robots)
-                same = _same_relative_poses(search, edge_set, rival, shared)
-                group[shared, k] = 1 + np.argmax(same, axis=1)
+                shared_robots = np.intersect1d(edge_set.robots, rival.robots)
+                same = _same_relative_poses(search, edge_set, rival, shared_robots)
+                group[shared_robots, k] = 1 + np.argmax(same, axis=1)
             a, b = edges.robots.T
             inside = np.zeros(len(edges), dtype=bool)
             inside[edge_set.rows] = True
@@ -397,29 +399,29 @@ def _confirmed_edges(search: LoopSearch, unconfirmed: Unconfirmed) -> tuple[np.n
     return confirmed, ambiguous & ~confirmed
 
 
-def _contradict(search: LoopSearch, one: ConsistentSet, other: ConsistentSet) -> bool:
+def _contradict(search: LoopSearch, first: ConsistentSet, second: ConsistentSet) -> bool:
     """Return True if the relative pose of two robots differs between two sets."""
-    shared = np.intersect1d(one.robots, other.robots)
-    return not _same_relative_poses(search, one, other, shared).all()
+    shared_robots = np.intersect1d(first.robots, second.robots)
+    return not _same_relative_poses(search, first, second, shared_robots).all()
 
 
 def _same_relative_poses(
-    search: LoopSearch, one: ConsistentSet, other: ConsistentSet, shared: np.ndarray
+    search: LoopSearch, first: ConsistentSet, second: ConsistentSet, shared_robots: np.ndarray
 ) -> np.ndarray:
     """Return True for pairs (n, n) of shared robots (n,) with equal relative poses in both sets."""
-    i, j = np.triu_indices(len(shared), 1)
-    pairs = np.stack([shared[i], shared[j]], axis=1)
-    motions = other.placement.relative(pairs)
-    distance, _ = one.placement.squared_distances(pairs, motions)
-    same = np.eye(len(shared), dtype=bool)
+    i, j = np.triu_indices(len(shared_robots), 1)
+    pairs = np.stack([shared_robots[i], shared_robots[j]], axis=1)
+    motions = second.placement.relative(pairs)
+    distance, _ = first.placement.squared_distances(pairs, motions)
+    same = np.eye(len(shared_robots), dtype=bool)
     same[i, j] = same[j, i] = distance <= search.test.gate
     return same
 
 
-def _components(edges: AlignmentEdges, kept: np.ndarray) -> np.ndarray:
+def _components(edges: AlignmentEdges, is_kept: np.ndarray) -> np.ndarray:
     """Return the component of each robot, shape (N,), ordered by size and then by first robot."""
     label = np.arange(edges.n_robots)
-    for a, b in edges.robots[kept]:
+    for a, b in edges.robots[is_kept]:
         low, high = sorted((label[a], label[b]))
         label[label == high] = low
     first, inverse, count = np.unique(label, return_inverse=True, return_counts=True)

@@ -40,8 +40,8 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
     groups = np.concatenate([group, n_groups + chain, n_groups + chain])
     members = np.concatenate([member, chain, chain + 1])
     shape = (n_members, n_groups + len(chain))
-    has = scipy.sparse.csr_matrix((np.ones(len(groups)), (members, groups)), shape=shape)
-    related = (has @ has.T).tocsr()
+    incidence = scipy.sparse.csr_matrix((np.ones(len(groups)), (members, groups)), shape=shape)
+    related = (incidence @ incidence.T).tocsr()
     related.data[:] = 1.0
     starts, column = related.indptr[:-1], related.indices.astype(np.int64)
 
@@ -50,12 +50,14 @@ def envelope_order(group: np.ndarray, member: np.ndarray, n_members: int) -> np.
         return int(np.sum((position - np.minimum.reduceat(position[column], starts)) ** 2))
 
     begins = np.unique(np.linspace(0, n_members - 1, _SEARCHES).round().astype(np.int64))
-    found = [
+    candidate_orders = [
         scipy.sparse.csgraph.breadth_first_order(related, each, return_predecessors=False)[::-1]
         for each in begins
     ]
-    found.append(scipy.sparse.csgraph.reverse_cuthill_mckee(related, symmetric_mode=True))
-    swept = min(map(_places, found), key=cost)
+    candidate_orders.append(
+        scipy.sparse.csgraph.reverse_cuthill_mckee(related, symmetric_mode=True)
+    )
+    swept = min(map(_places, candidate_orders), key=cost)
     orders = [by_number, swept]
     for _ in range(_SWEEPS):
         mean = related @ swept / np.diff(related.indptr)
@@ -80,9 +82,9 @@ def first_entries(group: np.ndarray, member: np.ndarray, position: np.ndarray) -
         position: result of `envelope_order`, shape (n,).
     """
     n, at = len(position), position[member]
-    first, least = np.arange(n), np.full(int(group.max(initial=-1)) + 1, n)
-    np.minimum.at(least, group, at)
-    np.minimum.at(first, at, least[group])
+    first, first_of_group = np.arange(n), np.full(int(group.max(initial=-1)) + 1, n)
+    np.minimum.at(first_of_group, group, at)
+    np.minimum.at(first, at, first_of_group[group])
     np.minimum.at(
         first, np.maximum(position[1:], position[:-1]), np.minimum(position[1:], position[:-1])
     )
@@ -154,8 +156,8 @@ class Envelope:
         panels = []
         for rows, start in zip(self.blocks, self.starts, strict=True):
             first, height = start * _BLOCK, rows.stop - rows.start
-            begin = self.offset[rows.start] + first
-            stored = entries[begin : begin + height * (rows.stop - first)]
+            panel_start = self.offset[rows.start] + first
+            stored = entries[panel_start : panel_start + height * (rows.stop - first)]
             panels.append((rows, first, stored.reshape(height, -1)))
         return panels
 
@@ -261,8 +263,8 @@ class Factor:
                     at, L = _of_columns(lower[i], columns)
                     np.matmul(L, inverse, out=follows[at])
                 for i in below:
-                    rows, begin, Z = panels[i]
-                    at, right = _after(rows, columns), Z[:, columns.stop - begin :]
+                    rows, start, Z = panels[i]
+                    at, right = _after(rows, columns), Z[:, columns.stop - start :]
                     with_it[at] += right @ follows[: at.stop]
                     with_it[: at.start] += right[:, : at.start].T @ follows[at]
                 for i in below:
@@ -301,8 +303,8 @@ def factor_in_envelope(entries: Float, envelope: Envelope) -> Factor:
             done = max(first, first_too)
             left = panel[:, columns.start - first : columns.stop - first]
             if done < columns.start:
-                before = panel[:, done - first : columns.start - first]
-                product = before @ others[:, done - first_too : columns.start - first_too].T
+                done_columns = panel[:, done - first : columns.start - first]
+                product = done_columns @ others[:, done - first_too : columns.start - first_too].T
                 left -= product
             if i == j:
                 # LAPACK without SciPy's checks: blocks are many and small

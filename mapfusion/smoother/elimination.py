@@ -72,9 +72,13 @@ class ReducedPoses:
         # blocks of odometry and of each pose's own observations
         index = self.obs.pose_index[1:] - 1
         S[envelope.where(index, index)] = self.equations.pose_block[1:]
-        after, before, link = index[1:], index[:-1], self.equations.link[1:]
-        link = np.where((after > before)[:, None, None], link, np.swapaxes(link, 1, 2))
-        S[envelope.where(np.maximum(after, before), np.minimum(after, before))] = link
+        index_after, index_before, link = index[1:], index[:-1], self.equations.link[1:]
+        link = np.where((index_after > index_before)[:, None, None], link, np.swapaxes(link, 1, 2))
+        S[
+            envelope.where(
+                np.maximum(index_after, index_before), np.minimum(index_after, index_before)
+            )
+        ] = link
         obs, coupling = self.obs, self.equations.coupling
         couplings = coupling, reduced_couplings(obs, coupling, self.reduced)
         rows, index = obs.by_landmark, obs.unknown_index
@@ -334,13 +338,13 @@ def pose_covariances(
     chosen = np.zeros((n_unknown, 3, n, 3))
     row = obs.pose_index[frames] if solution.landmarks_first else frames
     chosen[row - 1, :, np.arange(n)] = np.eye(3)
-    right, alone = chosen.reshape(3 * n_unknown, 3 * n), 0.0
+    right, correction = chosen.reshape(3 * n_unknown, 3 * n), 0.0
     if not solution.landmarks_first:
         # errors of the path for known points, and errors from the points
         solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
-        right, alone = pose_point_blocks(obs, equations)[0].T @ solved, right.T @ solved
+        right, correction = pose_point_blocks(obs, equations)[0].T @ solved, right.T @ solved
     root = solution.factor.solve(right)
-    return (root.T @ root + alone).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+    return (root.T @ root + correction).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
 
 def _eliminate_landmarks_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:
@@ -386,9 +390,9 @@ def pose_point_blocks(
     has_offset, n_poses = obs.has_offset, len(equations.pose_block)
     row, number = has_offset[obs.track], np.cumsum(has_offset) - 1
     n, n_points = np.count_nonzero(has_offset), np.count_nonzero(has_offset) + obs.n_landmarks
-    wide, K = np.zeros((n_poses, n_points, 3, 3)), np.zeros((n_points, n_points, 3, 3))
-    np.add.at(wide, (obs.frame[row], number[obs.track[row]]), equations.coupling[row])
-    np.add.at(wide, (obs.frame, n + obs.landmark), equations.coupling)
+    full_blocks, K = np.zeros((n_poses, n_points, 3, 3)), np.zeros((n_points, n_points, 3, 3))
+    np.add.at(full_blocks, (obs.frame[row], number[obs.track[row]]), equations.coupling[row])
+    np.add.at(full_blocks, (obs.frame, n + obs.landmark), equations.coupling)
     S, each, landmark = (
         equations.points.track_block,
         np.arange(n_points),
@@ -406,7 +410,7 @@ def pose_point_blocks(
         (equations.points.track_gradient + equations.points.offset_gradient)[has_offset],
         obs.sum_tracks(equations.points.track_gradient),
     ]
-    as_matrix = wide.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
+    as_matrix = full_blocks.transpose(0, 2, 1, 3).reshape(3 * n_poses, 3 * n_points)[3:]
     K = K.transpose(0, 2, 1, 3).reshape(3 * n_points, 3 * n_points)
     return as_matrix, K, np.concatenate(gradient).ravel()
 

@@ -327,8 +327,8 @@ def _estimate_observation_scale(
     beside = min(scale, 1.0) * (square + of_point)
     student_weight = student_weights(beside, fit_dof(beside, n, tails.observation), n)
     stated = np.median(np.trace(obs.information[rows], axis1=1, axis2=2)) * scale / n
-    least = min(_LEAST_M**2 * stated, 1.0)
-    return max(float(scale * np.sum(student_weight * square) / degrees_of_freedom), least)
+    min_scale = min(_LEAST_M**2 * stated, 1.0)
+    return max(float(scale * np.sum(student_weight * square) / degrees_of_freedom), min_scale)
 
 
 _NONE_DETERMINED = 1e-9  # disturbances; fewer are rounding errors
@@ -359,8 +359,8 @@ class PosteriorShares(NamedTuple):
         return np.array([self._known(axis, scale) for axis, scale in enumerate(scales)])
 
     def _known(self, axis: int, scale: float) -> float:
-        share, more = self.share[:, axis], scale / self.scales[axis]
-        return float(np.sum(1 - share / (share + (1 - share) * more)))
+        share, scale_ratio = self.share[:, axis], scale / self.scales[axis]
+        return float(np.sum(1 - share / (share + (1 - share) * scale_ratio)))
 
     def estimate_scales(self, problem: Problem, path: Float, scales: Float) -> Float:
         """Return the noise scales (3,) along, across and in the heading.
@@ -389,9 +389,9 @@ class PosteriorShares(NamedTuple):
         """
 
         def excess(scale: float) -> float:
-            known = self._known(axis, scale)
-            missing = max(LEAST_DISTURBANCES - known, 0.0)
-            return (likely - scale) * known + (1 - scale) * missing
+            n_determined = self._known(axis, scale)
+            missing = max(LEAST_DISTURBANCES - n_determined, 0.0)
+            return (likely - scale) * n_determined + (1 - scale) * missing
 
         if excess(likely) == 0 or likely == 1:
             return likely

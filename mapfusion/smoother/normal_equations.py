@@ -115,8 +115,8 @@ def smallest_scales(information: Float) -> Float:
 
     They are 1 without any information.
     """
-    least = np.min(np.where(information > 0, information, np.inf), axis=0, initial=np.inf)
-    return np.where(np.isfinite(least), least * _STILL**2, 1.0)
+    min_information = np.min(np.where(information > 0, information, np.inf), axis=0, initial=np.inf)
+    return np.where(np.isfinite(min_information), min_information * _STILL**2, 1.0)
 
 
 def heading_cos_sin(path: Float) -> Float:
@@ -136,13 +136,13 @@ def disturbance_jacobians(path: Float) -> tuple[Float, Float]:
     n = len(path) - 1
     to_robot = np.swapaxes(rotation(path[:-1, 2]), 1, 2)
     translation = path[1:, :2] - path[:-1, :2]
-    before, after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    after[:, :2, :2], after[:, 2, 2] = to_robot, 1.0
-    before[:, :2, :2], before[:, 2, 2] = -to_robot, -1.0
-    before[:, :2, 2] = np.einsum(
+    jacobian_before, jacobian_after = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    jacobian_after[:, :2, :2], jacobian_after[:, 2, 2] = to_robot, 1.0
+    jacobian_before[:, :2, :2], jacobian_before[:, 2, 2] = -to_robot, -1.0
+    jacobian_before[:, :2, 2] = np.einsum(
         "nij,nj->ni", to_robot, np.stack([translation[:, 1], -translation[:, 0]], 1)
     )
-    return before, after
+    return jacobian_before, jacobian_after
 
 
 def normal_equations(
@@ -179,12 +179,14 @@ def normal_equations(
     )
     # odometry
     d = disturbances(at.path, odometry)
-    before, after = disturbance_jacobians(at.path)
-    for J, poses in ((before, slice(0, n_poses - 1)), (after, slice(1, n_poses))):
+    jacobian_before, jacobian_after = disturbance_jacobians(at.path)
+    for J, poses in ((jacobian_before, slice(0, n_poses - 1)), (jacobian_after, slice(1, n_poses))):
         weighted = np.swapaxes(J, 1, 2) * information[:, None, :]
         equations.pose_block[poses] += weighted @ J
         equations.pose_gradient[poses] += np.einsum("nij,nj->ni", weighted, d)
-    equations.link[:] = (np.swapaxes(after, 1, 2) * information[:, None, :]) @ before
+    equations.link[:] = (
+        np.swapaxes(jacobian_after, 1, 2) * information[:, None, :]
+    ) @ jacobian_before
     return equations
 
 

@@ -125,8 +125,8 @@ def linearize_and_solve(
     """
     obs, odometry, information, offset_prior = problem
     shares = information_shares(tails, obs.n_dimensions)
-    given = weights, offset_prior, odometry, information, shares
-    equations = normal_equations(obs, at, *given)
+    arguments = weights, offset_prior, odometry, information, shares
+    equations = normal_equations(obs, at, *arguments)
     solution = solve(obs, equations)
     return OptimizerState(obs, at, weights, tails, n_steps, equations, solution)
 
@@ -138,9 +138,9 @@ def take_step(
 
     These are of the observations `obs` if given.
     """
-    after = problem if obs is None else problem._replace(obs=obs)
+    new_problem = problem if obs is None else problem._replace(obs=obs)
     return update_points_and_weights(
-        after, _line_search(problem, state), state.weights, state.tails
+        new_problem, _line_search(problem, state), state.weights, state.tails
     )
 
 
@@ -169,11 +169,13 @@ def _line_search(problem: Problem, state: OptimizerState) -> Estimate:
     would reject steps under weights from expected squares.
     """
     at, weights, step = state.estimate, state.weights, state.solution.step
-    before, share = problem.cost(at, weights), 1.0
+    old_cost, step_fraction = problem.cost(at, weights), 1.0
     for _ in range(_MOST_HALVINGS):
-        after = Estimate(*(old + share * new for old, new in zip(at, step, strict=True)))
-        after.path[:, 2] = wrap(after.path[:, 2])
-        if problem.cost(after, weights) <= before:
-            return after
-        share /= 2
+        candidate = Estimate(
+            *(old + step_fraction * new for old, new in zip(at, step, strict=True))
+        )
+        candidate.path[:, 2] = wrap(candidate.path[:, 2])
+        if problem.cost(candidate, weights) <= old_cost:
+            return candidate
+        step_fraction /= 2
     return at

@@ -184,10 +184,10 @@ def order_observations(
     """
     require_shape("landmark", landmark, (len(log.observations),))
     names, inverse, count = np.unique(landmark, return_inverse=True, return_counts=True)
-    taken = np.flatnonzero(((names >= 0) & (count >= min_count))[inverse])
+    used_rows = np.flatnonzero(((names >= 0) & (count >= min_count))[inverse])
     track = log.observations.track
     track = track if with_offsets and track is not None else np.full(len(landmark), NO_TRACK)
-    row = taken[np.lexsort((track[taken], inverse[taken]))]
+    row = used_rows[np.lexsort((track[used_rows], inverse[used_rows]))]
     begins = np.diff(inverse[row], prepend=-1) != 0
     starts = np.append(np.flatnonzero(begins), len(row))
     begins |= np.diff(track[row], prepend=NO_TRACK) != 0

@@ -97,13 +97,13 @@ def student_slope(squares: Float, dof: float, n_dimensions: Float | int) -> floa
     return float(of_tails - of_weights - share * np.sum(of_normal))
 
 
-def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -> float:
+def fit_dof(squares: Float, n_dimensions: Float | int, initial_dof: float = MOST_DOF) -> float:
     """Return the maximum likelihood degrees of freedom of squared distances.
 
     Args:
         squares: squared Mahalanobis distances, shape (N,).
         n_dimensions: one number, or shape (N,).
-        near: where the search starts.
+        initial_dof: where the search starts.
     """
 
     @functools.cache  # root finders evaluate the ends again
@@ -111,8 +111,8 @@ def fit_dof(squares: Float, n_dimensions: Float | int, near: float = MOST_DOF) -
         return student_slope(squares, float(np.exp(log_dof)), n_dimensions)
 
     low, high = float(np.log(LEAST_DOF)), float(np.log(MOST_DOF))
-    if near < MOST_DOF:
-        root = _secant_root(slope, float(np.log(near)), low, high)
+    if initial_dof < MOST_DOF:
+        root = _secant_root(slope, float(np.log(initial_dof)), low, high)
         if root is not None:
             return float(np.exp(root))
     if slope(high) <= 0:
@@ -130,20 +130,20 @@ def _secant_root(
 
     The error of a secant step is about the product of the errors of its two points.
     """
-    before, slope_before = start, slope(start)
-    at, off_before = before + np.copysign(_ASIDE, -slope_before), 1.0
+    previous, previous_slope = start, slope(start)
+    at, off_before = previous + np.copysign(_ASIDE, -previous_slope), 1.0
     for _ in range(_MOST_SECANTS):
         slope_at = slope(at)
-        slope_change = (slope_at - slope_before) / (at - before)
+        slope_change = (slope_at - previous_slope) / (at - previous)
         if not slope_change > 0:
             return None
-        before, slope_before, off = at, slope_at, -slope_at / slope_change
-        at = at + off
-        if not (low < at < high and abs(off) < 1):
+        previous, previous_slope, step = at, slope_at, -slope_at / slope_change
+        at = at + step
+        if not (low < at < high and abs(step) < 1):
             return None
-        if abs(off * off_before) < _FOUND_TO:
+        if abs(step * off_before) < _FOUND_TO:
             return float(at)
-        off_before = off
+        off_before = step
     return None
 
 

@@ -171,23 +171,23 @@ class _Drawing(NamedTuple):
         no second-order part.
         """
         obs, at, path_step = self.state.obs, self.at, error.path
-        moved = Estimate(*(old + off for old, off in zip(at, error, strict=True)))
-        before, after = disturbance_jacobians(at.path)
+        moved = Estimate(*(old + displacement for old, displacement in zip(at, error, strict=True)))
+        jacobian_before, jacobian_after = disturbance_jacobians(at.path)
         disturbance = disturbances(at.path, self.problem.odometry)
-        linear = np.einsum("kij,kj->ki", before, path_step[:-1])
-        linear += np.einsum("kij,kj->ki", after, path_step[1:])
+        linear = np.einsum("kij,kj->ki", jacobian_before, path_step[:-1])
+        linear += np.einsum("kij,kj->ki", jacobian_after, path_step[1:])
         of_motion = disturbances(moved.path, self.problem.odometry) - disturbance - linear
         of_motion[:, 2] = wrap(of_motion[:, 2])
         odometry = self.problem.odometry.copy()
         odometry[1:] += disturbance - of_motion
 
-        off = error.point_m[obs.landmark] + error.offset_m[obs.track]
-        off[:, :2] -= path_step[obs.frame, :2]
-        off[:, :2] = np.einsum("nij,nj->ni", self.to_robot, off[:, :2])
+        displacement = error.point_m[obs.landmark] + error.offset_m[obs.track]
+        displacement[:, :2] -= path_step[obs.frame, :2]
+        displacement[:, :2] = np.einsum("nij,nj->ni", self.to_robot, displacement[:, :2])
         turned = path_step[obs.frame, 2]
-        off[:, 0] += turned * self.predicted_m[:, 1]
-        off[:, 1] -= turned * self.predicted_m[:, 0]
-        of_points = _predicted_observations(self.state, moved) - self.predicted_m - off
+        displacement[:, 0] += turned * self.predicted_m[:, 1]
+        displacement[:, 1] -= turned * self.predicted_m[:, 0]
+        of_points = _predicted_observations(self.state, moved) - self.predicted_m - displacement
         explained = replace(obs, position_m=self.predicted_m - of_points)
         offset_prior, information = self.problem.offset_prior, self.problem.information
         equations = normal_equations(

@@ -97,15 +97,18 @@ def split_landmarks(
     pairs = _inconsistent_pairs(first, point[:, :n], covariance[:, :n, :n], bound)
     corner = _corners(first, counts, pairs)
     names = set(landmark.tolist())
-    for own in np.flatnonzero(np.maximum.reduceat(corner, first[:-1])):
-        track = np.repeat(corner[first[own] : first[own + 1]], counts[first[own] : first[own + 1]])
-        rows = obs.row[obs.starts[own] : obs.starts[own + 1]]
+    for landmark_index in np.flatnonzero(np.maximum.reduceat(corner, first[:-1])):
+        track = np.repeat(
+            corner[first[landmark_index] : first[landmark_index + 1]],
+            counts[first[landmark_index] : first[landmark_index + 1]],
+        )
+        rows = obs.row[obs.starts[landmark_index] : obs.starts[landmark_index + 1]]
         home = track[rows == landmark[rows[0]]]
         keeps = home[0] if len(home) else 0
         for k in np.setdiff1d(track, keeps):
-            mine = rows[track == k]
-            free = [row for row in mine.tolist() if row not in names]
-            split[mine] = min(free, default=-1)
+            track_rows = rows[track == k]
+            free = [row for row in track_rows.tolist() if row not in names]
+            split[track_rows] = min(free, default=-1)
     return split
 
 
@@ -122,17 +125,21 @@ def _corners(first: np.ndarray, counts: np.ndarray, pairs: np.ndarray) -> np.nda
     """
     corner, (i, j) = np.zeros(len(counts), dtype=np.int64), pairs
     of_pair = _landmark_of_tracks(first)[i]
-    for own in np.unique(of_pair):
-        begin, size = first[own], first[own + 1] - first[own]
-        here = slice(*np.searchsorted(of_pair, [own, own + 1]))
-        near, one, other = np.ones((size, size), dtype=bool), i[here] - begin, j[here] - begin
-        near[one, other] = near[other, one] = False
+    for landmark_index in np.unique(of_pair):
+        first_track, size = first[landmark_index], first[landmark_index + 1] - first[landmark_index]
+        pair_slice = slice(*np.searchsorted(of_pair, [landmark_index, landmark_index + 1]))
+        is_consistent = np.ones((size, size), dtype=bool)
+        track_i = i[pair_slice] - first_track
+        track_j = j[pair_slice] - first_track
+        is_consistent[track_i, track_j] = is_consistent[track_j, track_i] = False
         left, k = np.ones(size, dtype=bool), 0
         while left.any():
-            agree = np.where(left, near @ (left * counts[begin : begin + size]), 0)
-            taken = left & near[np.argmax(agree)]
-            corner[begin : begin + size][taken] = k
-            left, k = left & ~taken, k + 1
+            agree = np.where(
+                left, is_consistent @ (left * counts[first_track : first_track + size]), 0
+            )
+            is_split = left & is_consistent[np.argmax(agree)]
+            corner[first_track : first_track + size][is_split] = k
+            left, k = left & ~is_split, k + 1
     return corner
 
 
@@ -145,21 +152,22 @@ def _inconsistent_pairs(
     first: np.ndarray, point: Float, covariance: Float, bound: float
 ) -> np.ndarray:
     """Return inconsistent pairs (2, A) of tracks of one landmark, ordered by the first track."""
-    begin = first[_landmark_of_tracks(first)]
-    before = np.arange(len(point)) - begin  # tracks of the same landmark before each
-    part = np.cumsum(before) // _PAIRS_AT_ONCE
-    S, off = (np.ascontiguousarray(values.T) for values in (covariance, point))
+    first_track = first[_landmark_of_tracks(first)]
+    n_before = np.arange(len(point)) - first_track  # tracks of the same landmark before each
+    part = np.cumsum(n_before) // _PAIRS_AT_ONCE
+    S, position_columns = (np.ascontiguousarray(values.T) for values in (covariance, point))
     pairs = []
     for rows in np.split(np.arange(len(point)), np.flatnonzero(np.diff(part)) + 1):
-        n = before[rows]
+        n = n_before[rows]
         i = np.repeat(rows, n)
-        j = np.arange(len(i)) - np.repeat(np.cumsum(n) - n - begin[rows], n)
+        j = np.arange(len(i)) - np.repeat(np.cumsum(n) - n - first_track[rows], n)
         # squared Mahalanobis distances from S = L D L'; 0 for singular S
-        sums, differences = S[..., i] + S[..., j], off[..., i] - off[..., j]
+        sums = S[..., i] + S[..., j]
+        differences = position_columns[..., i] - position_columns[..., j]
         total, regular = np.zeros(sums.shape[-1]), np.ones(sums.shape[-1], dtype=bool)
-        least = [_SINGULAR * sums[r, r] for r in range(len(sums))]
+        singular_limits = [_SINGULAR * sums[r, r] for r in range(len(sums))]
         for r in range(len(sums)):
-            regular &= sums[r, r] > least[r]
+            regular &= sums[r, r] > singular_limits[r]
             pivot = np.where(regular, sums[r, r], 1.0)
             total += differences[r] ** 2 / pivot
             share = sums[r + 1 :, r] / pivot
@@ -229,11 +237,13 @@ class SmootherParameters:
         blind = np.diff(log.frame_starts()) < _LEAST_OBSERVATIONS
         needed = blind[:-1] | blind[1:]
         stated = self.odometry_covariance[1 : len(log)]
-        sigma = np.array([self.motion.with_floor(own) for own in stated]).reshape(-1, 3)
+        sigma = np.array([self.motion.with_floor(is_missing) for is_missing in stated]).reshape(
+            -1, 3
+        )
         sigma[~needed] = [_UNKNOWN_M, _UNKNOWN_M, _UNKNOWN_RAD]
-        own = np.isnan(stated).any(axis=(1, 2))
+        is_missing = np.isnan(stated).any(axis=(1, 2))
         information = bounded_information(sigma)
-        information[own] = odometry_information(motion, self.motion)[own]
+        information[is_missing] = odometry_information(motion, self.motion)[is_missing]
         return information
 
 
@@ -325,8 +335,8 @@ class Smoothed:
 
     def joint_covariance(self) -> Float:
         """Return the dense joint covariance (3L, 3L), for small maps."""
-        common, n = self.common.spread(np.eye(len(self.common))), len(self.own_m2)
-        joint = common @ common.T
+        shared_m, n = self.common.spread(np.eye(len(self.common))), len(self.own_m2)
+        joint = shared_m @ shared_m.T
         each = np.arange(n)
         joint.reshape(n, 3, n, 3)[each, :, each, :] += self.own_m2
         return joint
@@ -424,15 +434,15 @@ def smoothed_map(
     obs, landmark = smoothed.obs, smoothed.landmark
     if attitude is not None and obs.n_dimensions > 2:
         # add the errors of the attitude to the landmarks' shared errors
-        estimate, common = smoothed.estimate, smoothed.common
+        estimate, shared_error = smoothed.estimate, smoothed.common
         heights = attitude_height_errors(
             attitude, estimate.path, obs.frame, obs.landmark, estimate.point_m
         )
         by_attitude = np.zeros((*heights.shape, 3))
         by_attitude[..., 2] = heights
-        by_path = common.spread(np.eye(len(common))).T
-        both = np.vstack([by_path, by_attitude.reshape(len(by_attitude), -1)])
-        smoothed = replace(smoothed, common=KnownErrors(both))
+        by_path = shared_error.spread(np.eye(len(shared_error))).T
+        error_columns = np.vstack([by_path, by_attitude.reshape(len(by_attitude), -1)])
+        smoothed = replace(smoothed, common=KnownErrors(error_columns))
     point, joint = condensed_points(smoothed, rank)
     source = landmark[obs.row[obs.starts[:-1]]].astype(np.int64)
     source_observation = log.observations[source]
@@ -448,8 +458,8 @@ def smoothed_map(
     seen = log.iteration, log.observations.position_m
     viewing = viewing_of_log(*seen, landmark, smoothed.estimate.path, source)
     kind = source_observation.descriptor_kind
-    more = joint, viewing, log.calibration
-    return LandmarkMap(point, joint.marginal_m2, *attributes, *more, descriptor_kind=kind)
+    map_fields = joint, viewing, log.calibration
+    return LandmarkMap(point, joint.marginal_m2, *attributes, *map_fields, descriptor_kind=kind)
 
 
 def with_path_errors(
@@ -477,13 +487,13 @@ def with_path_errors(
         return filtered
     twin = order[index[in_both]]
     difference_m = filtered.position_m[in_both] - smoothed.position_m[twin]
-    shared = np.concatenate([smoothed.joint.common_m[twin], difference_m[:, None]], axis=1)
+    shared_m = np.concatenate([smoothed.joint.common_m[twin], difference_m[:, None]], axis=1)
     tree = scipy.spatial.KDTree(filtered.position_m[in_both, :2])
     nearest = tree.query(filtered.position_m[:, :2])[1]
     nearest[in_both] = np.arange(len(in_both))
     own_m2 = filtered.covariance_m2.copy()
     own_m2[in_both] = smoothed.joint.own_m2[twin]
-    return replace(filtered, joint=JointCovariance(own_m2, shared[nearest], complete))
+    return replace(filtered, joint=JointCovariance(own_m2, shared_m[nearest], complete))
 
 
 @one_blas_thread

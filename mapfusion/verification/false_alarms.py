@@ -63,20 +63,24 @@ def independent_pairs(p_a: Float, p_b: Float, heights: Float) -> IndependentPair
 @kernel
 def _mark_independent(p_a: Float, p_b: Float, patch_m: float, near_a: Grid) -> np.ndarray:
     """Mark the pairs (N,) of `independent_rows`; `near_a` is the grid over p_a."""
-    kept = np.zeros(len(p_a), np.bool_)
+    is_independent = np.zeros(len(p_a), np.bool_)
     ranges = np.empty((near_a.shape[1], 2), np.int64)
     for i in range(len(p_a)):
         is_neighbour = False
         for r in range(ranges_within(p_a[i, 0], p_a[i, 1], patch_m, near_a, ranges)):
             for k in range(ranges[r, 0], ranges[r, 1]):
                 j = near_a.row[k]
-                if kept[j] and is_closer(p_a, i, j, patch_m) and is_closer(p_b, i, j, patch_m):
+                if (
+                    is_independent[j]
+                    and is_closer(p_a, i, j, patch_m)
+                    and is_closer(p_b, i, j, patch_m)
+                ):
                     is_neighbour = True
                     break
             if is_neighbour:
                 break
-        kept[i] = not is_neighbour
-    return kept
+        is_independent[i] = not is_neighbour
+    return is_independent
 
 
 def independent_rows(p_a: Float, p_b: Float, patch_m: float) -> np.ndarray:
@@ -156,7 +160,7 @@ def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float)
     for i in range(k):
         row = supporters[i]
         square += ((p_b[row, 0] - mean_x) ** 2 + (p_b[row, 1] - mean_y) ** 2) / k
-    nearest, found = math.inf, T_a_b.copy()
+    nearest, best_motion = math.inf, T_a_b.copy()
     two = np.empty(2, np.int64)
     candidates = min(k, _CANDIDATES)
     for m in range(1, candidates):
@@ -169,8 +173,8 @@ def minimal_motion(p_a: Float, p_b: Float, supporters: np.ndarray, T_a_b: Float)
             moved = dx * dx + dy * dy + (turned[0] ** 2 + turned[1] ** 2) * square
             if moved < nearest:
                 nearest = moved
-                found[0], found[1], found[2] = tx, ty, theta
-    return found
+                best_motion[0], best_motion[1], best_motion[2] = tx, ty, theta
+    return best_motion
 
 
 @kernel
@@ -190,9 +194,9 @@ def possible_repairings(heights: Float) -> np.ndarray:
     total = 0
     for m in range(len(heights)):
         for i in range(m):
-            there, back = z_a[i] - z_b[m], z_a[m] - z_b[i]
-            total += there * there <= most_a[i] + most_b[m]
-            total += back * back <= most_a[m] + most_b[i]
+            z_difference_a, z_difference_b = z_a[i] - z_b[m], z_a[m] - z_b[i]
+            total += z_difference_a * z_difference_a <= most_a[i] + most_b[m]
+            total += z_difference_b * z_difference_b <= most_a[m] + most_b[i]
         counts[m] = total
     return counts
 
@@ -471,25 +475,25 @@ class ChanceTest:
         """Test one alignment of the correspondences against chance."""
         if not alignment.ok or not np.all(np.isfinite(alignment.T_a_b)):
             return Verdict(alignment.status, math.nan, alignment.reason)
-        what = "independent correspondences"
+        counted = "independent correspondences"
         if isinstance(self.pairs, IndependentPairs):
             result = fewest_false_alarms(self.pairs, alignment.T_a_b, self.gates_m)
         elif isinstance(self.pairs, tuple):
             result = named_false_alarms(*self.pairs, alignment.T_a_b, self.gates_m)
         else:
             result = self.pairs.fewest_false_alarms(alignment.T_a_b, self.gates_m)
-            what = "landmarks"
+            counted = "landmarks"
         log10, gate_m, n, k = result
         if log10 <= math.log10(self.false_alarms):
             return Verdict(Status.ACCEPTED, log10)
         if n < MIN_PAIRS:
-            reason = f"{n} {what} are too few to tell from chance"
+            reason = f"{n} {counted} are too few to tell from chance"
         elif k < MIN_PAIRS:
-            reason = f"fewer than {MIN_PAIRS} of {n} {what} support it"
+            reason = f"fewer than {MIN_PAIRS} of {n} {counted} support it"
         else:
             times = f"{10**log10:.2g}" if log10 < 4 else f"1e{log10:.0f}"
             reason = (
-                f"{k} of {n} {what} agree within {gate_m:g} m; chance alone "
+                f"{k} of {n} {counted} agree within {gate_m:g} m; chance alone "
                 f"gives as much {times} times for these maps, {self.false_alarms:g} are allowed"
             )
         return Verdict(Status.REFUSED, log10, reason)

@@ -71,9 +71,9 @@ class RandomPlacement:
         gates = math.inf if pairs.planar else height.bound, height.floor_m**2
 
         def thinned(landmarks: LandmarkMap) -> Site:
-            often = np.argsort(-landmarks.count.astype(np.int64), kind="stable")
-            p = np.ascontiguousarray(landmarks.position_m[often, :2])
-            rows = often[independent_rows(p, p, patch_m)]
+            by_count = np.argsort(-landmarks.count.astype(np.int64), kind="stable")
+            p = np.ascontiguousarray(landmarks.position_m[by_count, :2])
+            rows = by_count[independent_rows(p, p, patch_m)]
             return Site.of(landmarks[np.sort(rows)], *gates)
 
         sizes = pairs.correspondences.size_tolerance or 0.0
@@ -86,8 +86,8 @@ class RandomPlacement:
         p = self._b.p
         k = min(_NEIGHBOURS + 1, len(p))
         neighbour = scipy.spatial.KDTree(p).query(p, k=k)[1].reshape(len(p), k)[:, 1:]
-        off = p[neighbour] - p[:, None]
-        places = p[:, None, None] + _SHARES[:, None] * off[:, :, None]
+        difference = p[neighbour] - p[:, None]
+        places = p[:, None, None] + _SHARES[:, None] * difference[:, :, None]
         rows = np.repeat(np.arange(len(p)), (k - 1) * len(_SHARES))
         step = -(-len(rows) // _MOST_PLACES)
         return rows[::step], places.reshape(-1, 2)[::step]
@@ -109,9 +109,9 @@ class RandomPlacement:
         i, j = rng.integers(n_a, size=_SAMPLES), rng.integers(n_b, size=_SAMPLES)
         k = (i + rng.integers(1, n_a, size=_SAMPLES)) % n_a
         l = (j + rng.integers(1, n_b, size=_SAMPLES)) % n_b  # noqa: E741
-        rise = (a.z[i] - b.z[j]) - (a.z[k] - b.z[l])
+        height_difference = (a.z[i] - b.z[j]) - (a.z[k] - b.z[l])
         reach_m = np.sqrt(a.most_z_m2[i] + b.most_z_m2[j])
-        agree = np.abs(rise) <= reach_m + np.sqrt(a.most_z_m2[k] + b.most_z_m2[l])
+        agree = np.abs(height_difference) <= reach_m + np.sqrt(a.most_z_m2[k] + b.most_z_m2[l])
         agree &= attributes_of_pairs_agree(a, b, i, j, self._size_tolerance)
         agree &= attributes_of_pairs_agree(a, b, k, l, self._size_tolerance)
         i, j, k, l = i[agree], j[agree], k[agree], l[agree]  # noqa: E741

@@ -107,16 +107,16 @@ def rates_of_maps(k: np.ndarray, n: np.ndarray) -> Rates:
     """
     rates = RIGHT
     for _ in range(_ROUNDS):
-        right, wrong = log_likelihood(k, n, rates), log_likelihood(k, n, WRONG)
-        weight = scipy.special.expit(right - wrong)
-        found, searched = weight @ k, weight @ n
+        log_right, log_wrong = log_likelihood(k, n, rates), log_likelihood(k, n, WRONG)
+        weight = scipy.special.expit(log_right - log_wrong)
+        n_found, n_searched = weight @ k, weight @ n
         means = [
-            (own.seen + found[c]) / (own.seen + own.missed + searched[c])
-            for c, own in enumerate(RIGHT)
+            (prior_rate.seen + n_found[c]) / (prior_rate.seen + prior_rate.missed + n_searched[c])
+            for c, prior_rate in enumerate(RIGHT)
         ]
         must, may = (
-            own.with_mean(float(np.clip(mean, own.mean / 2, own.mean)))
-            for own, mean in zip(RIGHT, means, strict=True)
+            prior_rate.with_mean(float(np.clip(mean, prior_rate.mean / 2, prior_rate.mean)))
+            for prior_rate, mean in zip(RIGHT, means, strict=True)
         )
         rates = must, may
     return rates
@@ -140,19 +140,19 @@ def log10_ratio(k: np.ndarray, n: np.ndarray, shares: TwinShares, rates: Rates =
         rates: rates of a right motion; a copy has the same ones.
     """
     right, part, chance = (log_likelihood(k, n, r) for r in (rates, rates_in_part(rates), WRONG))
-    whole = right.sum(axis=1)
-    own, copied = (np.log([share, 1 - share]) for share in shares)
+    log_right = right.sum(axis=1)
+    log_share, log_copied = (np.log([share, 1 - share]) for share in shares)
     copies = _twin(right[:, COPIED], part[:, COPIED])
-    copies = np.logaddexp(copied[0] + copies, copied[1] + chance[:, COPIED])
-    twins = _twin(whole, part.sum(axis=1))
-    wrong = np.logaddexp(own[0] + twins, own[1] + chance[:, OWN] + copies)
-    changed = np.logaddexp(np.log1p(-CHANGED) + whole, np.log(CHANGED) + wrong)
-    return (changed - wrong) / np.log(10.0)
+    copies = np.logaddexp(log_copied[0] + copies, log_copied[1] + chance[:, COPIED])
+    twins = _twin(log_right, part.sum(axis=1))
+    log_wrong = np.logaddexp(log_share[0] + twins, log_share[1] + chance[:, OWN] + copies)
+    changed = np.logaddexp(np.log1p(-CHANGED) + log_right, np.log(CHANGED) + log_wrong)
+    return (changed - log_wrong) / np.log(10.0)
 
 
-def _twin(whole: Float, part: Float) -> Float:
+def _twin(total: Float, part: Float) -> Float:
     """Return the log-likelihood of a copy, from those of a complete and of a partial copy."""
-    return np.logaddexp(np.log(fitted_twins.WHOLE) + whole, np.log1p(-fitted_twins.WHOLE) + part)
+    return np.logaddexp(np.log(fitted_twins.WHOLE) + total, np.log1p(-fitted_twins.WHOLE) + part)
 
 
 def log10_without_discovery(log10_ratios: Float) -> float:
@@ -163,7 +163,7 @@ def log10_without_discovery(log10_ratios: Float) -> float:
     """
     if not len(log10_ratios):
         return 0.0
-    one = scipy.special.logsumexp(log10_ratios * np.log(10.0)) / np.log(10.0) - np.log10(
+    log10_mean = scipy.special.logsumexp(log10_ratios * np.log(10.0)) / np.log(10.0) - np.log10(
         len(log10_ratios)
     )
-    return float(np.sum(log10_ratios) - one)
+    return float(np.sum(log10_ratios) - log10_mean)

@@ -121,38 +121,40 @@ class MatchGates(NamedTuple):
 def mark_matched(
     p: Float,
     rows: np.ndarray,
-    own: DescribedLandmarks,
+    landmarks: DescribedLandmarks,
     other: DescribedLandmarks,
     gates: MatchGates,
 ) -> np.ndarray:
-    """Mark the landmarks of `own` that have a match in `other`; return bool, shape (n,).
+    """Mark the landmarks of `landmarks` that have a match in `other`; return bool, shape (n,).
 
     Landmarks without a descriptor (NaN) have no match.
 
     Args:
         p: positions of all own landmarks in the frame of the other map, shape (N, 3).
         rows: own landmarks to search for, shape (n,).
-        own: own landmarks.
+        landmarks: own landmarks.
         other: landmarks of the other map.
         gates: largest differences of a match.
     """
     # unpacked once: each access through the tuple would count references
-    _, z_own, z2_own, descriptor_own = own
-    near, z_other, z2_other, descriptor_other = other
-    at, row_of, distance_m = near.p, near.row, gates.distance_m
+    _, z_own, z2_own, descriptor_own = landmarks
+    grid, z_other, z2_other, descriptor_other = other
+    at, row_of, distance_m = grid.p, grid.row, gates.distance_m
     is_matched = np.zeros(len(rows), np.bool_)
-    runs = np.empty((near.shape[1], 2), np.int64)
-    most, floor_m2, unlike2 = gates.height_bound, gates.height_floor_m2, gates.unlike**2
+    runs = np.empty((grid.shape[1], 2), np.int64)
+    height_bound, floor_m2, unlike2 = gates.height_bound, gates.height_floor_m2, gates.unlike**2
     for m in range(len(rows)):
         i = rows[m]
-        for run in range(ranges_within(p[i, 0], p[i, 1], distance_m, near, runs)):
+        for run in range(ranges_within(p[i, 0], p[i, 1], distance_m, grid, runs)):
             for k in range(runs[run, 0], runs[run, 1]):
                 dx, dy = at[k, 0] - p[i, 0], at[k, 1] - p[i, 1]
                 if dx * dx + dy * dy > distance_m * distance_m:
                     continue
                 j = row_of[k]
                 dz = z_own[i] - z_other[j]
-                if most < math.inf and dz * dz > most * (z2_own[i] + z2_other[j] + floor_m2):
+                if height_bound < math.inf and dz * dz > height_bound * (
+                    z2_own[i] + z2_other[j] + floor_m2
+                ):
                     continue
                 square = 0.0  # distance of the descriptors
                 for first in range(0, descriptor_own.shape[1], _DESCRIPTOR_STEP):
@@ -361,12 +363,14 @@ class ViewedMapPair:
         self._how: dict[tuple[bool, bytes], np.ndarray] = {}
 
     @classmethod
-    def beside_itself(cls, own: ViewedMap, parameters: EvidenceParameters) -> "ViewedMapPair":
+    def beside_itself(
+        cls, viewed_map: ViewedMap, parameters: EvidenceParameters
+    ) -> "ViewedMapPair":
         """Return the pair of a map with itself, kept with the map for later queries."""
         key = cls, parameters
-        if key not in own.cache:
-            own.cache[key] = cls(own, own, parameters)
-        return own.cache[key]
+        if key not in viewed_map.cache:
+            viewed_map.cache[key] = cls(viewed_map, viewed_map, parameters)
+        return viewed_map.cache[key]
 
     @cached_property
     def _of(self) -> dict[str, "ViewedMapPair"]:
@@ -374,72 +378,78 @@ class ViewedMapPair:
         a, b = (self.beside_itself(own, self._parameters) for own in (self.a, self.b))
         return {BETWEEN: self, "a": a, "b": b}
 
-    def regions(self, of: str, T: Float, squares: RegionGrid, copies: RepeatedLandmarks) -> Regions:
+    def regions(
+        self, side: str, T: Float, squares: RegionGrid, copies: RepeatedLandmarks
+    ) -> Regions:
         """Count expected and matched landmarks under a motion, in square regions of frame a.
 
         Landmarks of both maps are counted in the same square.
 
         Args:
-            of: domain of the motion: BETWEEN, "a" or "b".
+            side: domain of the motion: BETWEEN, "a" or "b".
             T: motion, shape (3,).
             squares: the regions.
             copies: landmarks in structure that another motion also explains.
         """
-        if of != BETWEEN:
-            own = copies.in_a if of == "a" else copies.in_b
-            return self._of[of].regions(BETWEEN, T, squares, RepeatedLandmarks(own, own))
+        if side != BETWEEN:
+            copied = copies.in_a if side == "a" else copies.in_b
+            return self._of[side].regions(BETWEEN, T, squares, RepeatedLandmarks(copied, copied))
         T_a_b = T
         of_b, b_in_a = self._expected(self.b, self.a, T_a_b, copies.in_b)
         of_a, _ = self._expected(self.a, self.b, inverse(T_a_b), copies.in_a)
-        both = _Expected(*map(np.concatenate, zip(of_b, of_a, strict=True)))
+        expected_both = _Expected(*map(np.concatenate, zip(of_b, of_a, strict=True)))
         position_m = np.concatenate([b_in_a[of_b.rows], self.a.landmarks.position_m[of_a.rows]])
         region = squares.of(position_m[:, :2])
         n = int(region.max(initial=-1)) + 1
-        found, expected = np.zeros((n, 2, 2), np.int64), np.zeros((n, 2, 2), np.int64)
-        at = region, both.copied.astype(np.int64), np.where(both.how == MUST, 0, 1)
-        np.add.at(expected, at, 1)
-        np.add.at(found, at, both.found)
-        large = expected.sum(axis=(1, 2)) >= LEAST_EXPECTED
-        return Regions(found[large], expected[large])
+        n_found, n_expected = np.zeros((n, 2, 2), np.int64), np.zeros((n, 2, 2), np.int64)
+        at = (
+            region,
+            expected_both.copied.astype(np.int64),
+            np.where(expected_both.how == MUST, 0, 1),
+        )
+        np.add.at(n_expected, at, 1)
+        np.add.at(n_found, at, expected_both.found)
+        large = n_expected.sum(axis=(1, 2)) >= LEAST_EXPECTED
+        return Regions(n_found[large], n_expected[large])
 
-    def copies(self, of: str, T: Float) -> RepeatedLandmarks:
+    def copies(self, side: str, T: Float) -> RepeatedLandmarks:
         """Return the landmarks of both maps that a motion maps onto matching structure."""
-        pair = self._of[of]
+        pair = self._of[side]
         in_a, in_b = pair._repeated(pair.a, pair.b, inverse(T)), pair._repeated(pair.b, pair.a, T)
-        if of == BETWEEN:
+        if side == BETWEEN:
             return RepeatedLandmarks(in_a, in_b)
-        none = RepeatedLandmarks.none(len(self.a.landmarks), len(self.b.landmarks))
-        return none._replace(**{f"in_{of}": in_a | in_b})
+        no_copies = RepeatedLandmarks.none(len(self.a.landmarks), len(self.b.landmarks))
+        return no_copies._replace(**{f"in_{side}": in_a | in_b})
 
-    def _repeated(self, own: ViewedMap, other: ViewedMap, T: Float) -> np.ndarray:
-        key = own is self.a, T.tobytes()
+    def _repeated(self, viewed_map: ViewedMap, other: ViewedMap, T: Float) -> np.ndarray:
+        key = viewed_map is self.a, T.tobytes()
         if key not in self._found:
-            p = own.transformed(T)
+            p = viewed_map.transformed(T)
             is_matched = mark_matched(
-                p, np.arange(len(p)), own.described, other.described, self._gates
+                p, np.arange(len(p)), viewed_map.described, other.described, self._gates
             )
             self._found[key] = is_matched
-        return mark_repeated(self._found[key], own.n_near, own.described.near)
+        return mark_repeated(self._found[key], viewed_map.n_near, viewed_map.described.near)
 
     def _expected(
-        self, own: ViewedMap, other: ViewedMap, T: Float, copied: np.ndarray
+        self, viewed_map: ViewedMap, other: ViewedMap, T: Float, copied: np.ndarray
     ) -> tuple[_Expected, Float]:
-        """Return the landmarks of `own` that `other` is expected to contain.
+        """Return the landmarks of `viewed_map` that `other` is expected to contain.
 
         Also return all own positions in the frame of `other`; T (3,) maps into this frame.
         """
-        key = own is self.a, T.tobytes()
+        key = viewed_map is self.a, T.tobytes()
         if key in self._how:
-            p = own.transformed(T)
+            p = viewed_map.transformed(T)
         else:
-            seen = own.observed_from(T)
+            seen = viewed_map.observed_from(T)
             how, p = classify_visibility(seen, other.history), seen.p
-            how[(how == MUST) & ~own.recognisable] = MAY
+            how[(how == MUST) & ~viewed_map.recognisable] = MAY
             self._how[key] = how
-        how, known = self._how[key], self._found.get(key)
+        how, cached = self._how[key], self._found.get(key)
         rows = np.flatnonzero(how != UNSEEN)
-        described = own.described, other.described
+        described = viewed_map.described, other.described
         is_matched = (
-            mark_matched(p, rows, *described, self._gates) if known is None else known[rows]
+            mark_matched(p, rows, *described, self._gates) if cached is None else cached[rows]
         )
         return _Expected(rows, how[rows], is_matched, copied[rows]), p

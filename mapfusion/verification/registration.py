@@ -233,8 +233,10 @@ class PairRegistration:
             return []
         if (origins := self._refinement.pairs.origins) is None:
             return self.verifier.rivals_of(refined)
-        back = moved_motion(refined.T_a_b, refined.covariance, *(-origin for origin in origins))
-        local = replace(refined, T_a_b=back[0], covariance=back[1])
+        motion_in_maps = moved_motion(
+            refined.T_a_b, refined.covariance, *(-origin for origin in origins)
+        )
+        local = replace(refined, T_a_b=motion_in_maps[0], covariance=motion_in_maps[1])
         return [self._moved(each) for each in self.verifier.rivals_of(local)]
 
     def _in_given_frames(self, local: Registered) -> Registered:
@@ -296,12 +298,12 @@ def heights_of(pairs: Pairs, alignment: Alignment, gate_m: float) -> HeightDiffe
         rows = np.flatnonzero(to_b[to_a] == np.arange(len(b)))
         offered = Correspondences(to_a[rows], rows, np.zeros(len(rows)))
     free = pairs if offered is None else Pairs(pairs.map_a, pairs.map_b, offered)
-    near = np.linalg.norm(residuals(alignment.T_a_b, free.p_a, free.p_b), axis=1) <= gate_m
+    is_near = np.linalg.norm(residuals(alignment.T_a_b, free.p_a, free.p_b), axis=1) <= gate_m
     supports = np.isin(free.index_a, pairs.index_a[alignment.inlier])
     gate = HeightGate()
     variance = free.covariance_a[:, 2, 2] + free.covariance_b[:, 2, 2] + gate.floor_m**2
     removed_m = pairs.correspondences.height_offset_m
-    parts = (free.p_a[near], free.p_b[near], variance[near], gate.bound, supports[near])
+    parts = (free.p_a[is_near], free.p_b[is_near], variance[is_near], gate.bound, supports[is_near])
     return height_difference(*parts, removed_m)
 
 

@@ -59,34 +59,34 @@ class RepeatedLandmarks(NamedTuple):
         return RepeatedLandmarks(in_a, in_b)
 
 
-def repeated_under_others(copies: Sequence[RepeatedLandmarks], own: int) -> RepeatedLandmarks:
-    """Return the repeated landmarks under all motions except the motion `own`."""
-    first = RepeatedLandmarks.none(len(copies[own].in_a), len(copies[own].in_b))
-    return first.joined(each for k, each in enumerate(copies) if k != own)
+def repeated_under_others(copies: Sequence[RepeatedLandmarks], index: int) -> RepeatedLandmarks:
+    """Return the repeated landmarks under all motions except the motion `index`."""
+    first = RepeatedLandmarks.none(len(copies[index].in_a), len(copies[index].in_b))
+    return first.joined(each for k, each in enumerate(copies) if k != index)
 
 
 @kernel
-def count_neighbours(counted: np.ndarray, near: Grid) -> np.ndarray:
+def count_neighbours(counted: np.ndarray, grid: Grid) -> np.ndarray:
     """Count the `counted` (N,) landmarks near each counted one, including itself; shape (N,)."""
-    p, row_of = near.p, near.row
+    p, row_of = grid.p, grid.row
     n = np.zeros(len(counted), np.int64)
-    runs = np.empty((near.shape[1], 2), np.int64)
+    runs = np.empty((grid.shape[1], 2), np.int64)
     for k in range(len(p)):
         if not counted[row_of[k]]:
             continue
-        for run in range(ranges_within(p[k, 0], p[k, 1], _PLACE_M, near, runs)):
+        for run in range(ranges_within(p[k, 0], p[k, 1], _PLACE_M, grid, runs)):
             for m in range(runs[run, 0], runs[run, 1]):
                 dx, dy = p[m, 0] - p[k, 0], p[m, 1] - p[k, 1]
                 n[row_of[m]] += dx * dx + dy * dy <= _PLACE_M * _PLACE_M
     return n
 
 
-def mark_repeated(found: np.ndarray, n_near: np.ndarray, near: Grid) -> np.ndarray:
-    """Mark landmarks (N,) in neighbourhoods of which enough landmarks are `found` (N,) elsewhere.
+def mark_repeated(is_matched: np.ndarray, n_near: np.ndarray, grid: Grid) -> np.ndarray:
+    """Mark landmarks (N,) in neighbourhoods with enough landmarks that match elsewhere.
 
     `n_near` (N,) is the number of landmarks near each.
     """
-    hits = count_neighbours(found, near)
+    hits = count_neighbours(is_matched, grid)
     return (hits >= _LEAST) & (hits >= _LEAST_SHARE * n_near)
 
 
@@ -111,15 +111,15 @@ def similar_landmarks(landmarks: LandmarkMap) -> Correspondences:
     nearest, distance2, _ = nearest_descriptors(landmarks, landmarks, *gates)
     rows = np.arange(n)
     unlike = relative_distance(np.sqrt(np.maximum(distance2, 0.0)), landmarks.descriptor_kind)
-    kept = (nearest >= 0) & (nearest[nearest] == rows) & (unlike <= _UNLIKE)
-    return Correspondences(rows[kept], nearest[kept], unlike[kept])
+    is_similar = (nearest >= 0) & (nearest[nearest] == rows) & (unlike <= _UNLIKE)
+    return Correspondences(rows[is_similar], nearest[is_similar], unlike[is_similar])
 
 
 @kernel
-def longest_patch_side_m(p: Float, reach_m: float, least: int) -> float:
+def longest_patch_side_m(p: Float, reach_m: float, min_landmarks: int) -> float:
     """Return the longest side of the bounding boxes of patches of points (n, 2), 0 without any.
 
-    A patch is a connected component of points closer than `reach_m`, with at least `least` points.
+    A patch is a connected component of at least `min_landmarks` points closer than `reach_m`.
     """
     n = len(p)
     patch, queue, longest = np.full(n, -1), np.empty(n, np.int64), 0.0
@@ -140,7 +140,7 @@ def longest_patch_side_m(p: Float, reach_m: float, least: int) -> float:
                     patch[j] = start
                     queue[tail] = j
                     tail += 1
-        if tail >= least:
+        if tail >= min_landmarks:
             longest = max(longest, high[0] - low[0], high[1] - low[1])
     return longest
 
@@ -163,9 +163,9 @@ class SupportedMotion(NamedTuple):
 
 
 def distinct_motions(
-    pairs: Pairs, most: int, acceptance: Acceptance, refinement: Refinement
+    pairs: Pairs, max_motions: int, acceptance: Acceptance, refinement: Refinement
 ) -> list[SupportedMotion]:
-    """Find up to `most` distinct motions by cliques, each among the pairs that earlier ones leave.
+    """Find up to `max_motions` motions, each by a clique among the pairs that remain.
 
     Each motion is refined on all pairs and tested against chance.
     """
@@ -173,8 +173,8 @@ def distinct_motions(
     chance, method = acceptance.on(pairs), Clique()
     p_a, p_b = pairs.p_a[:, :2], pairs.p_b[:, :2]
     rows, widest_m = np.arange(len(pairs)), max(acceptance.gates_m)
-    tries = 2 * most  # refinement may move a motion onto an earlier one
-    while len(rows) >= _LEAST_PAIRS and len(motions) < most and tries > 0:
+    tries = 2 * max_motions  # refinement may move a motion onto an earlier one
+    while len(rows) >= _LEAST_PAIRS and len(motions) < max_motions and tries > 0:
         tries -= 1
         fit = method.find(pairs[rows], np.random.default_rng(0))  # the method is deterministic
         if isinstance(fit, Undetermined) or np.count_nonzero(fit.inlier) < MIN_PAIRS:
@@ -290,20 +290,22 @@ def other_unit(
 
 
 def self_motions(
-    landmarks: LandmarkMap, most: int, acceptance: Acceptance, refinement: Refinement
+    landmarks: LandmarkMap, max_motions: int, acceptance: Acceptance, refinement: Refinement
 ) -> tuple[Pairs, list[SupportedMotion]]:
     """Return the similar landmarks of a map and the motions that map parts onto similar parts."""
     pairs = Pairs(landmarks, landmarks, similar_landmarks(landmarks))
-    back = np.searchsorted(pairs.index_a, pairs.index_b)  # rows ascend, and each pair is both ways
+    reverse_row = np.searchsorted(
+        pairs.index_a, pairs.index_b
+    )  # rows ascend, and each pair is both ways
     motions = []
-    for each in distinct_motions(pairs, most, acceptance, refinement):
+    for each in distinct_motions(pairs, max_motions, acceptance, refinement):
         # under a motion that is its own inverse both orders of a pair agree: count one of them
-        again = each.inlier & each.inlier[back] & (pairs.index_a > pairs.index_b)
-        once = pairs[~again]
+        is_second = each.inlier & each.inlier[reverse_row] & (pairs.index_a > pairs.index_b)
+        remaining_pairs = pairs[~is_second]
         log10 = each.log10_false_alarms
-        if again.any():
-            refined = refinement.refine(once, each.T_a_b)
-            log10 = acceptance.verify(once, refined).log10_false_alarms
+        if is_second.any():
+            refined = refinement.refine(remaining_pairs, each.T_a_b)
+            log10 = acceptance.verify(remaining_pairs, refined).log10_false_alarms
         motions.append(each._replace(log10_false_alarms=log10))
     return pairs, motions
 
@@ -322,14 +324,14 @@ def explained_landmarks(
         gate_m: largest distance in the plane.
     """
     moved = transform_points(T_a_b, map_b.position_m[:, :2])
-    near = scipy.spatial.KDTree(map_a.position_m[:, :2]).sparse_distance_matrix(
+    close_pairs = scipy.spatial.KDTree(map_a.position_m[:, :2]).sparse_distance_matrix(
         scipy.spatial.KDTree(moved), gate_m, output_type="ndarray"
     )
-    row_a, row_b = near["i"], near["j"]
+    row_a, row_b = close_pairs["i"], close_pairs["j"]
     if map_a.descriptor is not None and map_b.descriptor is not None:
-        off = map_a.descriptor[row_a] - map_b.descriptor[row_b]
+        descriptor_difference = map_a.descriptor[row_a] - map_b.descriptor[row_b]
         unlike = euclidean_distance_at(_UNLIKE, map_a.descriptor_kind, map_b.descriptor_kind)
-        row_b = row_b[np.linalg.norm(off, axis=1) <= unlike]
+        row_b = row_b[np.linalg.norm(descriptor_difference, axis=1) <= unlike]
     explained = np.zeros(len(map_b), np.bool_)
     explained[row_b] = True
     return explained

@@ -175,11 +175,13 @@ def find_evidence(
     motions = [(BETWEEN, m) for m in distinct_motions(pairs, N_RIVALS, acceptance, refinement)]
     n_between, region_m = len(motions), parameters.region_m
     supporters = [pairs.p_a[motion.inlier] for _, motion in motions]
-    for side, own in zip("ab", (viewed_maps.a, viewed_maps.b), strict=True):
+    for side, viewed_map in zip("ab", (viewed_maps.a, viewed_maps.b), strict=True):
         key = self_motions, acceptance, refinement
-        if key not in own.cache:
-            own.cache[key] = self_motions(own.landmarks, N_SELF_MOTIONS, acceptance, refinement)
-        similar, onto_itself = own.cache[key]
+        if key not in viewed_map.cache:
+            viewed_map.cache[key] = self_motions(
+                viewed_map.landmarks, N_SELF_MOTIONS, acceptance, refinement
+            )
+        similar, onto_itself = viewed_map.cache[key]
         for motion in onto_itself:
             motions.append((side, motion))
             supporters.append(similar.p_a[motion.inlier])
@@ -189,30 +191,32 @@ def find_evidence(
                 side_m = longest_patch_side_m(p, _PATCH_REACH_M, _LEAST_OF_PATCH)
                 region_m = max(region_m, side_m)
     # regions under each motion, with the structure that other motions explain counted apart
-    copies = [viewed_maps.copies(of, motion.T_a_b) for of, motion in motions]
+    copies = [viewed_maps.copies(mapped_side, motion.T_a_b) for mapped_side, motion in motions]
     regions = [
         viewed_maps.regions(
-            of,
+            mapped_side,
             motion.T_a_b,
             RegionGrid.about(supporters[k], region_m),
             repeated_under_others(copies, k),
         )
-        for k, (of, motion) in enumerate(motions)
+        for k, (mapped_side, motion) in enumerate(motions)
     ]
     shares = _twin_shares(regions[:n_between], regions[n_between:])
     found = tuple(
         RivalMotion(
-            of,
+            mapped_side,
             motion.T_a_b,
             motion.log10_false_alarms,
             int(np.count_nonzero(motion.inlier)),
-            own.n_confirmed,
-            own.n_contradicted,
-            len(own),
-            own.log10_evidence(shares) if of == BETWEEN else math.nan,
+            viewed_map.n_confirmed,
+            viewed_map.n_contradicted,
+            len(viewed_map),
+            viewed_map.log10_evidence(shares) if mapped_side == BETWEEN else math.nan,
             repeated,
         )
-        for (of, motion), own, repeated in zip(motions, regions, copies, strict=True)
+        for (mapped_side, motion), viewed_map, repeated in zip(
+            motions, regions, copies, strict=True
+        )
     )
     return PairEvidence(found, shares, region_m)
 
@@ -224,10 +228,13 @@ def _twin_shares(rivals: list[Regions], selves: list[Regions]) -> TwinShares:
     contradicted regions is therefore left out. A motion of a map onto itself was searched for where
     the map holds a structure twice, and says nothing of other regions.
     """
-    wrong = sorted(rivals, key=lambda r: r.n_contradicted - r.n_confirmed)[1:]
-    own = [_TWINS_BEFORE, *(regions.count_confirmed(OWN) for regions in wrong)]
-    copied = [_COPIES_BEFORE, *(regions.count_confirmed(COPIED) for regions in [*wrong, *selves])]
-    shares = (np.sum(counts, axis=0) for counts in (own, copied))
+    other_rivals = sorted(rivals, key=lambda r: r.n_contradicted - r.n_confirmed)[1:]
+    n_confirmed = [_TWINS_BEFORE, *(regions.count_confirmed(OWN) for regions in other_rivals)]
+    copied = [
+        _COPIES_BEFORE,
+        *(regions.count_confirmed(COPIED) for regions in [*other_rivals, *selves]),
+    ]
+    shares = (np.sum(counts, axis=0) for counts in (n_confirmed, copied))
     return TwinShares(*(float(confirmed / n) for confirmed, n in shares))
 
 
@@ -492,8 +499,8 @@ class PairVerifier:
             around = self.regions(alignment, evidence, max(extent_m, evidence.region_m))
             return around.log10_evidence(evidence.shares)
         unconfirmed = len(regions) > 1 and ratio < DECISIVE
-        small = np.ptp(self._bulk(alignment)[1], axis=0).max() < least_m
-        return passed if unconfirmed or small or self._is_one_wall(alignment) else math.inf
+        is_small = np.ptp(self._bulk(alignment)[1], axis=0).max() < least_m
+        return passed if unconfirmed or is_small or self._is_one_wall(alignment) else math.inf
 
     def _doubt(
         self,
@@ -512,10 +519,10 @@ class PairVerifier:
         if rival is not None and rival.log10_evidence > ratio - math.log10(settings.most_against):
             return f"{{told}}; so do {self._named(rival)}"
         smaller = min(len(self._pairs.map_a), len(self._pairs.map_b))
-        most = np.count_nonzero(alignment.inlier) > smaller / 2
-        if most and extent_m < settings.place_m:
-            what = f"the maps show little else than this place of {extent_m:.2g} m"
-            return f"{what}; what lies around it tells whether it is another's like"
+        is_majority = np.count_nonzero(alignment.inlier) > smaller / 2
+        if is_majority and extent_m < settings.place_m:
+            doubt_text = f"the maps show little else than this place of {extent_m:.2g} m"
+            return f"{doubt_text}; what lies around it tells whether it is another's like"
         if math.log10(settings.least_ratio) <= log10_ratio_passed:
             return ""
         if rival is not None:
@@ -527,11 +534,11 @@ class PairVerifier:
             return f"{{told}}, too few beside {regions.n_contradicted} that are missing from one"
         least_m = _TOUCHED * evidence.region_m
         if extent_m < least_m:
-            what = f"all that agrees lies within {least_m:.2g} m"
-            return f"{what} and could be a copy; too few regions around confirm it"
+            doubt_text = f"all that agrees lies within {least_m:.2g} m"
+            return f"{doubt_text} and could be a copy; too few regions around confirm it"
         if np.ptp(self._bulk(alignment)[1], axis=0).max() < least_m:
-            what = f"nearly all that agrees lies within {least_m:.2g} m"
-            return f"{{told}}, too few if {what} and could be a copy"
+            doubt_text = f"nearly all that agrees lies within {least_m:.2g} m"
+            return f"{{told}}, too few if {doubt_text} and could be a copy"
         if self._is_one_wall(alignment):
             return "{told}, too few if all that agrees lies on one wall and could be a picture"
         return "{told}, too few to confirm it"
@@ -558,8 +565,8 @@ class PairVerifier:
         used = self._pairs[alignment.inlier]
         p_a, p_b = used.p_a[:, :2], used.p_b[:, :2]
         away_m = np.linalg.norm(p_b - np.median(p_b, axis=0), axis=1)
-        near = away_m <= np.quantile(away_m, _BULK)
-        return p_a[near], p_b[near]
+        is_in_bulk = away_m <= np.quantile(away_m, _BULK)
+        return p_a[is_in_bulk], p_b[is_in_bulk]
 
     def _is_one_wall(self, alignment: Alignment) -> bool:
         """Return True if most supporters lie on one line, as those of a picture on a wall do.

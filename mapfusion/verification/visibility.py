@@ -135,9 +135,9 @@ class ViewingHistory(NamedTuple):
         square = (x - mid_x[:, None]) ** 2 + (y - mid_y[:, None]) ** 2
         mean = np.arctan2(poses.sin.sum(axis=1), poses.cos.sum(axis=1))
         turned = np.abs(wrap(theta - mean[:, None])).max(axis=1)
-        least = np.cos(np.minimum(aside_rad + turned + ROUNDING, np.pi))
+        min_cosine = np.cos(np.minimum(aside_rad + turned + ROUNDING, np.pi))
         radius_m = np.sqrt(square.max(axis=1))
-        blocks = PoseBlocks(mid_x, mid_y, radius_m, np.cos(mean), np.sin(mean), least, reach_m)
+        blocks = PoseBlocks(mid_x, mid_y, radius_m, np.cos(mean), np.sin(mean), min_cosine, reach_m)
         limits = field.bearing_rad, field.range_m, field.height_m
         return cls(blocks, poses, BearingSectors.of(field, n_parts), reach, *limits)
 
@@ -210,12 +210,12 @@ class ObservedLandmarks(NamedTuple):
 _WALL_RADIUS_M, _LEAST_OF_WALL, _WALL_THICKNESS = 0.5, 5, 0.3
 
 
-def wall_directions(near: Grid) -> Float:
+def wall_directions(grid: Grid) -> Float:
     """Return unit vectors along the walls that contain N landmarks, shape (N, 2); 0 without a wall.
 
     The direction is the principal axis of the landmarks around each landmark.
     """
-    n, xx, xy, yy = _second_moments(near)
+    n, xx, xy, yy = _second_moments(grid)
     mean, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)  # eigenvalues are mean + half, - half
     straight = (n >= _LEAST_OF_WALL) & (mean - half <= _WALL_THICKNESS**2 * (mean + half))
     angle = np.arctan2(2 * xy, xx - yy) / 2
@@ -223,16 +223,16 @@ def wall_directions(near: Grid) -> Float:
 
 
 @kernel
-def _second_moments(near: Grid) -> tuple[np.ndarray, Float, Float, Float]:
+def _second_moments(grid: Grid) -> tuple[np.ndarray, Float, Float, Float]:
     """Return the number and the second central moments (N,) of the landmarks around each one."""
-    p, row_of = near.p, near.row
+    p, row_of = grid.p, grid.row
     n = np.zeros(len(p), np.int64)
     xx, xy, yy = np.zeros(len(p)), np.zeros(len(p)), np.zeros(len(p))
-    runs = np.empty((near.shape[1], 2), np.int64)
+    runs = np.empty((grid.shape[1], 2), np.int64)
     for k in range(len(p)):
         x = y = 0.0
         i = row_of[k]
-        for run in range(ranges_within(p[k, 0], p[k, 1], _WALL_RADIUS_M, near, runs)):
+        for run in range(ranges_within(p[k, 0], p[k, 1], _WALL_RADIUS_M, grid, runs)):
             for m in range(runs[run, 0], runs[run, 1]):
                 dx, dy = p[m, 0] - p[k, 0], p[m, 1] - p[k, 1]
                 if dx * dx + dy * dy <= _WALL_RADIUS_M * _WALL_RADIUS_M:
@@ -267,8 +267,10 @@ def classify_visibility(seen: ObservedLandmarks, history: ViewingHistory) -> np.
         r, ux, uy, levels = distance_m[i], direction[i, 0], direction[i, 1], np.int64(0)
         for step in range(len(height_m)):
             levels |= (height_m[step, 0] <= p[i, 2] <= height_m[step, 1]) << step
-        own = p[i, 0], p[i, 1], ux, uy, max(r / _MAY_RATIO, range_m[0]), r * _MAY_RATIO
-        _mark_possible_blocks(own, x, y, radius, cos, sin, least_cos, block_reach_m, possible)
+        view_sector = p[i, 0], p[i, 1], ux, uy, max(r / _MAY_RATIO, range_m[0]), r * _MAY_RATIO
+        _mark_possible_blocks(
+            view_sector, x, y, radius, cos, sin, least_cos, block_reach_m, possible
+        )
         must = may = 0
         for w in range(len(eights) // 8):
             word = packed(eights, w)
@@ -305,7 +307,7 @@ def classify_visibility(seen: ObservedLandmarks, history: ViewingHistory) -> np.
 
 @kernel
 def _mark_possible_blocks(
-    own: tuple[float, float, float, float, float, float],
+    sector: tuple[float, float, float, float, float, float],
     x: Float,
     y: Float,
     radius: Float,
@@ -317,22 +319,22 @@ def _mark_possible_blocks(
 ) -> None:
     """Mark the blocks (C,) that may contain a pose with the landmark in view.
 
-    `own` is the landmark's position, its viewing direction, and the smallest and largest distance
-    of a pose. A displacement by at most the block's radius changes each length below by at most
-    twice that radius. The loop has no branch and no other index, so that it is vectorised.
+    `sector` is the landmark's position, its viewing direction, and the smallest and largest
+    distance of a pose. A displacement by at most the block's radius changes each length below by at
+    most twice that radius. The loop has no branch and no other index, so that it is vectorised.
     """
-    at_x, at_y, ux, uy, nearest, farthest = own
+    at_x, at_y, ux, uy, nearest, farthest = sector
     for k in range(len(possible)):
         dx, dy = at_x - x[k], at_y - y[k]
         away = math.sqrt(dx * dx + dy * dy)
-        off = radius[k] + ROUNDING * away
-        along, ahead = dx * ux + dy * uy, cos[k] * dx + sin[k] * dy
+        tolerance = radius[k] + ROUNDING * away
+        along, dot_direction = dx * ux + dy * uy, cos[k] * dx + sin[k] * dy
         possible[k] = (
-            (away + off >= nearest)
-            & (away - off <= farthest)
-            & (away - off <= reach_m[k])
-            & (along + 2 * off >= _MAY_COS * away)
-            & (ahead + 2 * off >= least_cos[k] * away)
+            (away + tolerance >= nearest)
+            & (away - tolerance <= farthest)
+            & (away - tolerance <= reach_m[k])
+            & (along + 2 * tolerance >= _MAY_COS * away)
+            & (dot_direction + 2 * tolerance >= least_cos[k] * away)
         )
 
 
@@ -365,8 +367,8 @@ def _flag_poses(
         square, along = dx * dx + dy * dy, dx * ux + dy * uy
         away = math.sqrt(square)
         facing2, seen2 = (dx * wall_y - dy * wall_x) ** 2, own_facing2 * square
-        ahead, left = cos[c, k] * dx + sin[c, k] * dy, cos[c, k] * dy - sin[c, k] * dx
-        slope = left / max(ahead, _LEAST_AHEAD)
+        x_robot, y_robot = cos[c, k] * dx + sin[c, k] * dy, cos[c, k] * dy - sin[c, k] * dx
+        slope = y_robot / max(x_robot, _LEAST_AHEAD)
         cell = np.uint64(min(max((slope - first) * per_slope, 0.0), CELLS - 1.0))
         part = np.uint64(part_of[cell])
         unsure = part == np.uint64(columns - 1)
@@ -378,7 +380,7 @@ def _flag_poses(
             & (along * along >= _MAY_COS2 * square)
             & (seen2 <= _MAY_RATIO2 * facing2)
             & (facing2 <= _MAY_RATIO2 * seen2)
-            & ((ahead > 0) | unsure)
+            & ((x_robot > 0) | unsure)
             & (nearest <= away)
             & (away <= farthest)
             & (((levels >> step) & 1) == 1)

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import ERROR_COLUMNS
+from experiments.evaluation.alignment_criteria import ERROR_COLUMNS
 
 Tables = dict[str, pd.DataFrame]
 ITERATIONS = (25, 50, 75, 100)

@@ -4,9 +4,9 @@ import numpy as np
 
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import AlignedPair, MergeParameters
 from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap

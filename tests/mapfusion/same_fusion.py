@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry import se2
 from mapfusion.geometry.se2 import transform_points
 

@@ -49,8 +49,8 @@ from mapfusion.files import (
     points_from,
     schema,
 )
-from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import AlignedPair, FusedMap, MergeParameters, make_fuser
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.fusion.merge import ConnectedMaps, connect
 from mapfusion.geometry.numerics import Float
 from mapfusion.landmark_map import LandmarkMap, read_map, write_map

@@ -17,7 +17,7 @@ from matplotlib.ticker import (
     PercentFormatter,
 )
 
-from experiments.evaluation.criteria import ANSWERABLE_PAIRS, ORACLE
+from experiments.evaluation.alignment_criteria import ANSWERABLE_PAIRS, ORACLE
 from experiments.evaluation.map_errors import FILTERED, FUSED, SMOOTHED
 from experiments.evaluation.tables import UNKNOWN
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, of_pair

@@ -13,7 +13,7 @@ import pandas as pd
 import pyarrow as pa
 from PIL import Image
 
-from experiments.evaluation.criteria import methods_in
+from experiments.evaluation.alignment_criteria import methods_in
 from experiments.evaluation.tables import ALL, read, read_scenario, read_world, table_path
 from experiments.reports.figures.style import aligner_styles
 from mapfusion.align.alignment import Status

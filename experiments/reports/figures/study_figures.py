@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
-from experiments.evaluation.criteria import MERGEABLE_PAIRS
+from experiments.evaluation.alignment_criteria import MERGEABLE_PAIRS
 from experiments.evaluation.tables import UNKNOWN
 from experiments.reports.figures import style
 from experiments.reports.figures.result_tables import NothingToDraw

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogFormatter
 
-from experiments.evaluation.criteria import ORACLE
+from experiments.evaluation.alignment_criteria import ORACLE
 from experiments.evaluation.map_errors import FILTERED, SMOOTHED
 from mapfusion.fusion.fusers import REFERENCE
 from mapfusion.geometry.numerics import Float

@@ -12,7 +12,7 @@ import plotly.graph_objects as go
 from matplotlib.colors import to_hex, to_rgb
 from plotly.subplots import make_subplots
 
-from experiments.evaluation.criteria import MAP_PAIR
+from experiments.evaluation.alignment_criteria import MAP_PAIR
 from experiments.reports.figures.style import BLACK, BLUE, ORANGE
 from experiments.studies.method_comparison import success_rates
 from experiments.studies.statistics import error_bands, scarce_spans, time_bands

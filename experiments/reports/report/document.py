@@ -14,8 +14,8 @@ import pandas as pd
 from PIL import Image
 from ruamel.yaml import YAML
 
-from experiments.evaluation import criteria, metrics, tables
-from experiments.evaluation.criteria import (
+from experiments.evaluation import alignment_criteria, metrics, tables
+from experiments.evaluation.alignment_criteria import (
     methods_in,
     path_rms,
     setting_columns,
@@ -416,7 +416,7 @@ def templates() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= {"text": layout, "criteria": criteria, "shown": tables.SHOWN}
+    environment.globals |= {"text": layout, "criteria": alignment_criteria, "shown": tables.SHOWN}
     environment.globals["few_worlds"] = FEW_RUNS  # runs of one world are not independent
     environment.globals |= {
         "gross_m": GROSS_M,

@@ -8,7 +8,7 @@ import pandas as pd
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from experiments.evaluation.criteria import MERGEABLE_PAIRS, RICH_PAIRS
+from experiments.evaluation.alignment_criteria import MERGEABLE_PAIRS, RICH_PAIRS
 from experiments.pipeline.tables import write_rows
 from experiments.reports.export import write_text
 from experiments.reports.layout import Column, interval, number, print_frame, print_lines

@@ -23,9 +23,9 @@ from experiments.evaluation.truth import EvaluatedRobot, MapPair, join_map_pairs
 from experiments.pipeline.stages.align import estimate_row, unpacked
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import AlignedPair, FusedMap, Fusion, MergeParameters
 from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.geometry.numerics import Float

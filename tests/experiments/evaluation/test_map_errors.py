@@ -35,7 +35,7 @@ from experiments.reports.report.document import write_report
 from experiments.reports.run_screen import print_result
 from experiments.scenario.loading import load_scenario
 from mapfusion.align.alignment import Alignment, Status, degenerate
-from mapfusion.fusion.aligned_landmarks import ABSENT
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap

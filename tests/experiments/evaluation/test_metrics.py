@@ -13,7 +13,7 @@ import pytest
 
 from experiments.evaluation import metrics
 from experiments.evaluation import tables as result_tables
-from experiments.evaluation.criteria import is_false_merge
+from experiments.evaluation.alignment_criteria import is_false_merge
 from experiments.evaluation.loop_closures import WINDOW_FRAMES
 from experiments.evaluation.metrics import (
     ALIGNER_METRICS,

@@ -11,7 +11,7 @@ from evo.core import metrics as evo_metrics
 from evo.core.trajectory import PosePath3D
 from scipy.optimize import least_squares
 
-from experiments.evaluation.criteria import edge_precision, edge_recall, path_rms
+from experiments.evaluation.alignment_criteria import edge_precision, edge_recall, path_rms
 from experiments.evaluation.fused_landmarks import FusedTeam
 from experiments.evaluation.path_errors import (
     SOURCES,

@@ -10,8 +10,8 @@ from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from mapfusion.align.alignment import Alignment, Status
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import AlignedPair
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from tests.helpers.by_pictures import Mapped, mapped_by_pictures

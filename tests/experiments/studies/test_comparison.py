@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.evaluation.criteria import ERROR_COLUMNS
+from experiments.evaluation.alignment_criteria import ERROR_COLUMNS
 from experiments.studies.comparison import (
     BETTER,
     NOISE,

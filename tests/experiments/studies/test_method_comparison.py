@@ -8,7 +8,7 @@ import pytest
 import scipy.stats
 from scipy.stats import binomtest
 
-from experiments.evaluation.criteria import (
+from experiments.evaluation.alignment_criteria import (
     RICH_PAIRS,
     RIGHT_WITHIN_M,
     RIGHT_WITHIN_RAD,

@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import setting_columns
+from experiments.evaluation.alignment_criteria import setting_columns
 from experiments.studies import run_tables
 from experiments.studies.run_tables import find_runs
 from mapfusion.errors import InputError

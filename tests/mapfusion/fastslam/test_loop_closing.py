@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.landmarks import slots_near
+from mapfusion.fastslam.landmark_arrays import slots_near
 from mapfusion.fastslam.loop_closing import (
     KNOT_SPACING,
     DriftModel,

@@ -3,7 +3,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 from mapfusion.fastslam.filter import FastSlamParameters
-from mapfusion.fastslam.landmarks import Estimates
+from mapfusion.fastslam.landmark_arrays import Estimates
 from mapfusion.fastslam.measurement import (
     MapObservations,
     innovation,

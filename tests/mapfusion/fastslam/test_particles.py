@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.landmarks import BLOCK, FREE, allocate, slots_near
+from mapfusion.fastslam.landmark_arrays import BLOCK, FREE, allocate, slots_near
 from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
 from mapfusion.fastslam.particles import ParticleMaps, PathHistory
 from mapfusion.fastslam.resampling import MEMORY

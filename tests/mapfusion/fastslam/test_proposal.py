@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
-from mapfusion.fastslam.landmarks import LANES, Slots
+from mapfusion.fastslam.landmark_arrays import LANES, Slots
 from mapfusion.fastslam.measurement import MapObservations, observations_in_map
 from mapfusion.fastslam.motion import MotionNoise
 from mapfusion.fastslam.particles import ParticleMaps

@@ -7,10 +7,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.batch import Batch, JointlySmoothed, smooth_jointly
 from mapfusion.fusion.fusers import FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.fusion.merge import connect
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, compose, rotation, wrap

@@ -10,11 +10,11 @@ from scipy.stats import chi2
 from mapfusion.align.clique import Clique
 from mapfusion.align.correspondences import match
 from mapfusion.camera import CalibrationError
-from mapfusion.fusion.aligned_landmarks import ABSENT
 from mapfusion.fusion.fusers import AlignedPair, FusedMap, MergeParameters
 from mapfusion.fusion.joint import JointFuser
 from mapfusion.fusion.joint_estimate import JointMap, estimate_jointly
 from mapfusion.fusion.kalman import KalmanDrift
+from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import LandmarkMap

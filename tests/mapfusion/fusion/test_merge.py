@@ -6,9 +6,9 @@ from scipy.stats import chi2
 
 from mapfusion.align.alignment import degenerate
 from mapfusion.align.correspondences import Correspondences
-from mapfusion.fusion.aligned_landmarks import ABSENT, one_to_one
 from mapfusion.fusion.fusers import AlignedPair, MergeParameters
 from mapfusion.fusion.kalman import Kalman, KalmanDrift
+from mapfusion.fusion.landmark_association import ABSENT, one_to_one
 from mapfusion.fusion.merge import merge
 from mapfusion.geometry import se2
 from tests.mapfusion.robots_of_one_world import DRIFT_M, Robots

@@ -9,7 +9,7 @@ from experiments.pipeline.stages.pipeline import build_pipeline, memory_bytes, n
 from experiments.scenario.loading import load_scenario
 from experiments.scenario.settings import Simulation
 from mapfusion.errors import InputError
-from mapfusion.fastslam.landmarks import allocate
+from mapfusion.fastslam.landmark_arrays import allocate
 from mapfusion.robot_log import Observations, RobotLog, write_log
 from tests.helpers.tiny_scenario import assert_refused, command
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from experiments.evaluation import tables
-from experiments.evaluation.criteria import ANSWERABLE_PAIRS
+from experiments.evaluation.alignment_criteria import ANSWERABLE_PAIRS
 from experiments.reports.figures.error_figures import (
     draw_aligner_time,
     draw_rotation_error,

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.evaluation.criteria import summarise_alignments
+from experiments.evaluation.alignment_criteria import summarise_alignments
 from experiments.reports.figures.style import aligner_styles
 from experiments.reports.report.charts import (
     MIN_CONTRAST,

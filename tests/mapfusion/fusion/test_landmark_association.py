@@ -1,4 +1,4 @@
-"""Tests of `mapfusion.fusion.aligned_landmarks`."""
+"""Tests of `mapfusion.fusion.landmark_association`."""
 
 import itertools
 
@@ -7,14 +7,14 @@ import pytest
 from scipy.stats import chi2
 
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.fusion.aligned_landmarks import (
+from mapfusion.fusion.kalman import kalman_update
+from mapfusion.fusion.landmark_association import (
     ABSENT,
     AlignedLandmarks,
     AssociationTest,
     CandidatePairs,
     cluster_landmarks,
 )
-from mapfusion.fusion.kalman import kalman_update
 from mapfusion.tables import NO_LABEL
 
 SIZES = [12, 9, 11]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mapfusion.fastslam.filter import FastSlam
-from mapfusion.fastslam.landmarks import FREE, ActiveTracks
+from mapfusion.fastslam.landmark_arrays import FREE, ActiveTracks
 from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
 from mapfusion.fastslam.particles import ParticleMaps
 from mapfusion.robot_log import Observations

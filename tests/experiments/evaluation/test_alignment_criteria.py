@@ -1,4 +1,4 @@
-"""Tests of `experiments.evaluation.criteria`."""
+"""Tests of `experiments.evaluation.alignment_criteria`."""
 
 import math
 from pathlib import Path
@@ -6,8 +6,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from experiments.evaluation import criteria, tables
-from experiments.evaluation.criteria import nothing_merged, summarise_alignments
+from experiments.evaluation import alignment_criteria, tables
+from experiments.evaluation.alignment_criteria import nothing_merged, summarise_alignments
 from experiments.evaluation.metrics import USED_TABLES, CheckedScenario, check_all, load_checked
 from mapfusion.errors import InputError
 from tests.helpers.made_up_runs import complete, many_errors
@@ -15,7 +15,12 @@ from tests.helpers.tiny_scenario import TINY, command
 
 
 @pytest.mark.parametrize(
-    ("chosen", "least"), [(criteria.answerable, 3), (criteria.mergeable, 20), (criteria.rich, 30)]
+    ("chosen", "least"),
+    [
+        (alignment_criteria.answerable, 3),
+        (alignment_criteria.mergeable, 20),
+        (alignment_criteria.rich, 30),
+    ],
 )
 def test_so_many_true_pairs_are_enough(chosen, least: int) -> None:
     rows = pd.DataFrame({"n_true": [least - 1, least, least + 1]})
@@ -24,7 +29,7 @@ def test_so_many_true_pairs_are_enough(chosen, least: int) -> None:
 
 def test_three_common_landmarks_are_common_ground() -> None:
     rows = pd.DataFrame({"n_common": [0, 2, 3, 4]})
-    assert criteria.has_common_ground(rows).tolist() == [False, False, True, True]
+    assert alignment_criteria.has_common_ground(rows).tolist() == [False, False, True, True]
 
 
 def test_the_end_is_that_of_each_robot_pair_of_each_run() -> None:
@@ -33,10 +38,10 @@ def test_the_end_is_that_of_each_robot_pair_of_each_run() -> None:
     ends = [("x", "R1", "R2", 40), ("x", "R1", "R3", 90), ("y", "R1", "R2", 60)]
     earlier = [(*end[:3], end[3] - 10) for end in ends]
     rows = pd.DataFrame([*earlier, *ends, ends[1]], columns=pd.Index(columns))
-    found = criteria.at_last_iteration(rows)
+    found = alignment_criteria.at_last_iteration(rows)
     assert [*found.itertuples(index=False, name=None)] == [*ends, ends[1]]
     alone = rows[rows["run_id"] == "x"].drop(columns="run_id")  # a result's own table
-    assert criteria.at_last_iteration(alone)["iteration"].tolist() == [40, 90, 90]
+    assert alignment_criteria.at_last_iteration(alone)["iteration"].tolist() == [40, 90, 90]
 
 
 @pytest.mark.parametrize("wrong", [{"translation_error_m": 0.6}, {"rotation_error_rad": -0.2}])

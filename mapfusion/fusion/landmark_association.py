@@ -138,9 +138,9 @@ class AlignedLandmarks:
         columns = dict[str, Any]()
         for name, values in vars(self).items():
             if isinstance(values, np.ndarray):
-                both = values.copy()
-                both[rows] = getattr(fused, name)
-                columns[name] = np.concatenate([both, getattr(unmatched, name)])
+                joined = values.copy()
+                joined[rows] = getattr(fused, name)
+                columns[name] = np.concatenate([joined, getattr(unmatched, name)])
         return AlignedLandmarks(**columns, kind=self.kind)
 
     def landmark_map(self, planar: bool, name: str) -> LandmarkMap:
@@ -214,10 +214,10 @@ class AssociationTest:
         )
         radius = np.sqrt(bound * (variance_a + variance_b.max()))
         tree = scipy.spatial.KDTree(b.position_m[:, :2])
-        found = tree.query_ball_point(a.position_m[:, :2], radius, return_sorted=True)
-        lengths = [len(rows) for rows in found]
+        neighbours = tree.query_ball_point(a.position_m[:, :2], radius, return_sorted=True)
+        lengths = [len(rows) for rows in neighbours]
         i = np.repeat(np.arange(len(a)), lengths)
-        j = np.fromiter(itertools.chain.from_iterable(found), np.int64, sum(lengths))
+        j = np.fromiter(itertools.chain.from_iterable(neighbours), np.int64, sum(lengths))
 
         drift_m2 = a.drift_m2[i] + b.drift_m2[j]
         (x_a, y_a), (x_b, y_b) = a.position_m[:, :2].T, b.position_m[:, :2].T
@@ -245,14 +245,14 @@ def one_to_one(
     """Select pairs in the order of their dissimilarity so that each landmark occurs once."""
     taken_i: set[int] = set()
     taken_j: set[int] = set()
-    kept = []
+    matches = []
     rows = np.argsort(dissimilarity, kind="stable")
     for row, at_i, at_j in zip(rows, i[rows].tolist(), j[rows].tolist(), strict=True):
         if at_i not in taken_i and at_j not in taken_j:
             taken_i.add(at_i)
             taken_j.add(at_j)
-            kept.append(row)
-    return i[kept], j[kept]
+            matches.append(row)
+    return i[matches], j[matches]
 
 
 class CandidatePairs(NamedTuple):
@@ -292,18 +292,18 @@ def cluster_landmarks(pairs: list[CandidatePairs], sizes: list[int]) -> np.ndarr
     members = {int(i): {int(of_map[i]): int(i)} for i in range(first[-1])}
     root = np.arange(first[-1])
     empty = [np.empty(0, np.int64)]
-    one = np.concatenate([first[pair.a] + pair.row_a for pair in pairs] or empty)
+    first_landmark = np.concatenate([first[pair.a] + pair.row_a for pair in pairs] or empty)
     other = np.concatenate([first[pair.b] + pair.row_b for pair in pairs] or empty)
     dissimilarity = np.concatenate([pair.dissimilarity for pair in pairs] or empty)
     for row in np.argsort(dissimilarity, kind="stable"):
-        i, j = int(root[one[row]]), int(root[other[row]])
+        i, j = int(root[first_landmark[row]]), int(root[other[row]])
         if i == j or members[i].keys() & members[j].keys():
             continue
         root[list(members[j].values())] = i
         members[i] |= members.pop(j)
     points = np.full((len(members), len(sizes)), ABSENT)
-    for row, own in enumerate(members.values()):
-        for k, i in own.items():
+    for row, cluster in enumerate(members.values()):
+        for k, i in cluster.items():
             points[row, k] = i - first[k]
     several = np.count_nonzero(points != ABSENT, axis=1) > 1
     return np.concatenate([points[several], points[~several]])
