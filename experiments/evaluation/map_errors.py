@@ -52,14 +52,15 @@ from experiments.pipeline.stages.smooth import (
     RobotFolders,
     folders_of_both,
     read_endings,
+    read_path_covariance,
     read_smoothed,
     read_smoothed_path,
     smoothed_owners,
 )
-from experiments.pipeline.tables import MOTION
+from experiments.pipeline.tables import COVARIANCE, MOTION
 from mapfusion.align.alignment import Pairs
 from mapfusion.align.refinement import Oracle
-from mapfusion.files import POSE_FIELDS, named_columns
+from mapfusion.files import POSE_FIELDS, covariance_columns, named_columns
 from mapfusion.fusion.fusers import FusedMap, Fusion
 from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry import se2
@@ -191,6 +192,7 @@ class SmoothedRobot:
         maps: smoothed maps; only the last one has its joint covariance.
         points_world_m: true points of each map, shape (N, 3), NaN where unknown.
         paths: smoothed paths until each iteration k, shape (k + 1, 3).
+        path_covariance: covariances of their poses, shape (k + 1, 3, 3).
         ending: convergence of the smoother at the last iteration.
         not_smoothed: reasons by iteration where smoothing failed.
     """
@@ -200,6 +202,7 @@ class SmoothedRobot:
     maps: dict[int, LandmarkMap]
     points_world_m: dict[int, Float]
     paths: dict[int, Float]
+    path_covariance: dict[int, Float]
     ending: dict[str, Any]
     not_smoothed: Mapping[int, str] = field(default_factory=dict)
 
@@ -265,16 +268,17 @@ def load_smoothed(
     reasons = dict(zip(endings["iteration"].tolist(), endings["not_smoothed"], strict=True))
     not_smoothed = {k: str(why) for k, why in reasons.items() if why}
     ending = {str(name): value for name, value in endings.to_dict("records")[-1].items()}
-    path, paths = final_path(folders.slam), read_smoothed_path(smooth)
-    return SmoothedRobot(robot, path, maps, points, paths, ending, not_smoothed)
+    paths = final_path(folders.slam), maps, points, read_smoothed_path(smooth)
+    return SmoothedRobot(robot, *paths, read_path_covariance(smooth), ending, not_smoothed)
 
 
 def smoothed_path_rows(smoothed: Sequence[SmoothedRobot]) -> pd.DataFrame:
     """Return the rows of the table `smoothed_paths`."""
     rows = [
-        pd.DataFrame(named_columns(POSE_FIELDS, path)).assign(
-            robot=each.robot.name, iteration=k, frame=np.arange(len(path))
-        )
+        pd.DataFrame(
+            named_columns(POSE_FIELDS, path)
+            | covariance_columns(COVARIANCE, each.path_covariance[k])
+        ).assign(robot=each.robot.name, iteration=k, frame=np.arange(len(path)))
         for each in smoothed
         for k, path in each.paths.items()
     ]

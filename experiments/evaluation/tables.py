@@ -41,7 +41,7 @@ _OTHER_TYPES = {
     "fused_history": dict.fromkeys(_PLAN, pa.float32()),
     "true_pairs": {"true_pair": pa.binary()},
 }
-_VERSIONS = {"errors": 6}  # of the others: 1
+_VERSIONS = {"errors": 6, "smoothed_paths": 2}  # of the others: 1
 UNKNOWN = -1  # a count that needs the truth, without truth
 _POINT = " ".join(POSITION_FIELDS + COVARIANCE_FIELDS)
 _COLUMNS = {
@@ -94,7 +94,8 @@ _COLUMNS = {
     # outside the gate of their landmark). iteration: frame of a jump, else -1.
     "findings": "robot check iteration finding",
     # Smoothed paths in the frame of the robot's map, until each iteration with a fusion.
-    "smoothed_paths": "robot iteration frame x_m y_m theta_rad",
+    "smoothed_paths": """robot iteration frame x_m y_m theta_rad
+        cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt""",
     # Particles at the stored iterations, in the frame of the robot's map.
     "clouds": "robot iteration particle x_m y_m theta_rad log_weight",
     # Last maps of the robots with true points, each in its own frame.
@@ -233,7 +234,7 @@ MEANING = {
     "n_contradicted": "number of these regions that are missing from one map",
     "acceptance_reason": "why the verdict does not accept",
     "drift_sigma_m": "s_drift: standard deviation of residuals beyond the stated covariances",
-    "cov_xx": "variance of tx (m2), of the refined T_a_b",
+    "cov_xx": "variance of tx (m2), of the refined T_a_b; smoothed_paths: of the pose",
     "cov_xy": "covariance of tx and ty (m2)",
     "cov_xt": "covariance of tx and theta (m rad)",
     "cov_yy": "variance of ty (m2)",

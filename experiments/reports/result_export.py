@@ -21,7 +21,7 @@ from experiments.reports.export import write_text
 from experiments.reports.figures.result_tables import Pair, ResultTables, of_pair, read_png
 from experiments.scenario.world_settings import NAME_PATTERN
 from mapfusion.datasets.kitti import kitti_text
-from mapfusion.datasets.text_files import tum_text
+from mapfusion.datasets.text_files import tum_covariance_text, tum_text
 from mapfusion.errors import InputError, not_installed
 from mapfusion.exchange import G2oGraph
 from mapfusion.fastslam.motion import MotionNoise
@@ -37,7 +37,7 @@ from mapfusion.viewing import viewing_paths
 _LEAST_SIGMA = np.array([1e-4, 1e-4, 1e-4])  # m, m, rad
 _SOURCES = ("final", "online", "odometry", "truth")
 _MOTION = ["tx_m", "ty_m", "theta_rad"]
-_FUSED = "fused"
+_FUSED, _SMOOTHED = "fused", "smoothed"
 _RERUN = "rerun"
 _POINT_M, _LINE_M, _PARTICLE_M = 0.02, 0.004, 0.01  # radii
 _FEATURE_PX = 2.0
@@ -69,12 +69,15 @@ def export_result(result: Path, kind: str, folder: Path | None = None) -> list[P
 
 
 def _tum_files(data: ResultTables) -> Iterator[tuple[str, str]]:
-    """Yield one file for each robot and path, with the times of the log."""
+    """Yield one file for each robot and path, with the times of the log, and covariances."""
     if not data.has("frame_times"):
         raise InputError(f"{data.folder}: holds no times of frames; run it again")
     for robot, source, frame, path in _paths(data):
-        time_s = data.of_robot("frame_times", robot)["time_s"].to_numpy()
+        time_s = data.of_robot("frame_times", robot)["time_s"].to_numpy()[: len(path)]
         yield f"{robot}.{source}.tum", tum_text(time_s, path, f"{robot}, {source}: {frame}")
+        if source == _SMOOTHED:
+            covariances = tum_covariance_text(time_s, *data.smoothed_path_of(robot))
+            yield f"{robot}.{source}.cov", covariances
 
 
 def _kitti_files(data: ResultTables) -> Iterator[tuple[str, str]]:
@@ -88,6 +91,7 @@ def _paths(data: ResultTables) -> Iterator[tuple[str, str, str, Float]]:
     """Yield robot, path, description of its frame, and poses (T, 3) in that frame."""
     for robot in data.robots:
         paths = {source: _path(data, robot, source) for source in _SOURCES}
+        paths[_SMOOTHED] = data.smoothed_path_of(robot)[0]
         placed, start = _placed(data, robot), data.start_pose(robot)
         frames = dict.fromkeys(paths, f"in {robot}'s own frame")
         if placed is not None:

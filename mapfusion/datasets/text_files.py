@@ -15,6 +15,7 @@ import numpy as np
 from mapfusion.errors import InputError
 from mapfusion.geometry import se3
 from mapfusion.geometry.numerics import Float, require_finite, require_shape
+from mapfusion.geometry.se2 import rotation_about_z
 
 NS = 1_000_000_000  # nanoseconds in a second
 _LATEST_NS = 2**62  # the year 2116, from 1970; the sum of two times fits 64 bits
@@ -250,6 +251,34 @@ def tum_text(time_s: Float, T_frame_robot: Float, comment: str) -> str:
             qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
             lines.append(f"{pose_time_s} {float(x)} {float(y)} 0 0 0 {qz} {qw}")
     return "\n".join([f"# {comment}", _COLUMNS, *lines, ""])
+
+
+# Standard deviations that are added in each direction of a pose in space (m or rad). A planar pose
+# has no errors of height, roll and pitch, and the first pose of a path has none at all, but a
+# scorer inverts the covariances.
+_LEAST_SIGMA = 1e-4
+_IN_PLAN = [0, 1, 5]  # x, y and yaw among the six directions of a pose in space
+
+
+def tum_covariance_text(time_s: Float, T_frame_robot: Float, covariance: Float) -> str:
+    """Return covariances of planar poses as a sidecar of a TUM file, in the layout of smfeval.
+
+    Each line has a time and the lower triangle of the covariance of a perturbation T Exp(xi) in the
+    frame of the robot; xi has the translation first.
+
+    Args:
+        time_s: times, shape (T,).
+        T_frame_robot: poses, shape (T, 3).
+        covariance: covariances of x, y and theta in the frame of the path, shape (T, 3, 3).
+    """
+    require_shape("covariance", covariance, (len(time_s), 3, 3))
+    to_robot = np.swapaxes(rotation_about_z(T_frame_robot[:, 2]), 1, 2)
+    in_space = np.tile(_LEAST_SIGMA**2 * np.eye(6), (len(time_s), 1, 1))
+    block = np.ix_(range(len(time_s)), _IN_PLAN, _IN_PLAN)
+    in_space[block] += to_robot @ covariance @ np.swapaxes(to_robot, 1, 2)
+    rows = np.column_stack([time_s, in_space[:, *np.tril_indices(6)]])
+    head = ["#%TANGENT_CONVENTION right_perturbation", "#%TANGENT_ORDER translation_rotation"]
+    return "\n".join([*head, *(" ".join(map(str, row)) for row in rows.tolist()), ""])
 
 
 def read_tum(path: Path) -> TimedPoses:

@@ -15,7 +15,7 @@ from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import IDENTITY, between, compose
 from mapfusion.robot_log import NO_TRACK, Observations, RobotLog
-from mapfusion.smoother.elimination import pose_covariances, require_memory
+from mapfusion.smoother.elimination import require_memory
 from mapfusion.smoother.noise_estimation import UNIT_SCALES, optimize_with_noise
 from mapfusion.smoother.normal_equations import Estimate, initial_landmarks
 from mapfusion.smoother.optimizer import Problem, optimize
@@ -151,14 +151,11 @@ def smooth_jointly(
         state, scales = optimize_with_noise(problem, start)
     else:
         state, scales = optimize(problem, start), UNIT_SCALES
-    covariance = np.zeros((len(starts), 3, 3))
-    covariance[1:] = pose_covariances(obs, state.equations, state.solution, starts[1:])
     names = point[obs.row[obs.starts[:-1]]]
     paths = tuple(np.split(state.estimate.path, starts[1:]))
     smoothed = Smoothed.of(problem, state, point, scales)
-    if smoothed.second_order is not None:
-        covariance += smoothed.second_order.pose_covariances(starts)
-    return JointlySmoothed(smoothed, names, state.estimate.path[starts], covariance, paths)
+    T_first_robot, covariance = state.estimate.path[starts], smoothed.path_covariance[starts]
+    return JointlySmoothed(smoothed, names, T_first_robot, covariance, paths)
 
 
 def _concatenate(logs: Sequence[RobotLog]) -> RobotLog:

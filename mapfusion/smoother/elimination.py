@@ -239,6 +239,8 @@ _FACTORS, _WIDE, _SQUARE = 4.0, 5.0, 6.0
 _BLOCK, _BLOCKS = 9, 12  # entries of a 3 by 3 block; blocks per pose, observation and track
 _CONDENSED = 6.0  # arrays of the map's shared directions
 _BAND = 5  # below the diagonal of a chain of poses of three coordinates
+# Number of poses whose covariances are computed at the same time, to limit the memory.
+_POSES_AT_ONCE = 8
 
 
 class Solution(NamedTuple):
@@ -331,20 +333,28 @@ def shared_errors(
 
 
 def pose_covariances(
-    obs: OrderedObservations, equations: NormalEquations, solution: Solution, frames: np.ndarray
+    obs: OrderedObservations, equations: NormalEquations, solution: Solution
 ) -> Float:
-    """Return the covariances (n, 3, 3) of the poses of some frames (n,) after the first."""
-    n_unknown, n = len(equations.pose_block) - 1, len(frames)
-    chosen = np.zeros((n_unknown, 3, n, 3))
-    row = obs.pose_index[frames] if solution.landmarks_first else frames
-    chosen[row - 1, :, np.arange(n)] = np.eye(3)
-    right, correction = chosen.reshape(3 * n_unknown, 3 * n), 0.0
-    if not solution.landmarks_first:
-        # errors of the path for known points, and errors from the points
-        solved = scipy.linalg.cho_solve_banded((chain_factor(equations), True), right)
-        right, correction = pose_point_blocks(obs, equations)[0].T @ solved, right.T @ solved
-    root = solution.factor.solve(right)
-    return (root.T @ root + correction).reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+    """Return the covariances of all T poses, shape (T, 3, 3); that of the fixed first one is 0."""
+    n_poses = len(equations.pose_block)
+    covariance = np.zeros((n_poses, 3, 3))
+    if solution.landmarks_first:
+        factor, index = solution.factor, obs.pose_index[1:] - 1
+        covariance[1:] = factor.envelope.between(factor.inverse, index, index)
+        return covariance
+    # errors of the path for known points, and errors from the points
+    chain, (blocks, *_) = chain_factor(equations), pose_point_blocks(obs, equations)
+    for first in range(1, n_poses, _POSES_AT_ONCE):
+        poses = np.arange(first, min(first + _POSES_AT_ONCE, n_poses))
+        n = len(poses)
+        right = np.zeros((n_poses - 1, 3, n, 3))
+        right[poses - 1, :, np.arange(n)] = np.eye(3)
+        right = right.reshape(-1, 3 * n)
+        solved = scipy.linalg.cho_solve_banded((chain, True), right, check_finite=False)
+        root = solution.factor.solve(blocks.T @ solved)
+        blocks_of_poses = (root.T @ root + right.T @ solved).reshape(n, 3, n, 3)
+        covariance[poses] = blocks_of_poses[np.arange(n), :, np.arange(n)]
+    return covariance
 
 
 def _eliminate_landmarks_first(obs: OrderedObservations, equations: NormalEquations) -> Solution:

@@ -57,10 +57,9 @@ class SecondOrder(NamedTuple):
     path: Float
     point_m: Float
 
-    def pose_covariances(self, frames: np.ndarray) -> Float:
-        """Return the second-order covariances (n, 3, 3) of the poses of some frames (n,)."""
-        chosen = self.path[:, frames]
-        return np.einsum("sni,snj->nij", chosen, chosen)
+    def pose_covariances(self) -> Float:
+        """Return the second-order covariances of all poses, shape (T, 3, 3)."""
+        return np.einsum("sti,stj->tij", self.path, self.path)
 
 
 def second_order_errors(problem: Problem, state: OptimizerState) -> SecondOrder | None:

@@ -32,7 +32,7 @@ from mapfusion.geometry.se2 import IDENTITY, between, rotation
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Range, require_in_range
 from mapfusion.robot_log import STRAY_M, RobotLog
-from mapfusion.smoother.elimination import require_memory, shared_errors
+from mapfusion.smoother.elimination import pose_covariances, require_memory, shared_errors
 from mapfusion.smoother.noise_estimation import UNIT_SCALES, NoiseScales, optimize_with_noise
 from mapfusion.smoother.normal_equations import (
     Estimate,
@@ -288,7 +288,10 @@ class Smoothed:
         n_steps: number of Gauss-Newton steps.
         own_m2: see `common`, shape (L, 3, 3).
         common: Y (R, 3L): the landmarks' joint covariance is block diagonal of `own_m2` plus Y' Y.
-        second_order: second-order errors, which are part of `common`; None if negligible.
+        path_covariance: covariances of the poses, shape (T, 3, 3); that of the first one, which is
+            the frame of the map, is 0.
+        second_order: second-order errors, which are part of `common` and `path_covariance`; None
+            if negligible.
     """
 
     landmark: np.ndarray
@@ -302,6 +305,7 @@ class Smoothed:
     n_steps: int
     own_m2: Float
     common: SharedErrors
+    path_covariance: Float
     second_order: SecondOrder | None = None
 
     @classmethod
@@ -322,16 +326,18 @@ class Smoothed:
             scales: the estimated noise scales.
             steps_before: number of steps in earlier rounds.
         """
-        common = shared_errors(state.obs, state.equations, state.solution)
+        solved = state.obs, state.equations, state.solution
+        common, path_covariance = shared_errors(*solved), pose_covariances(*solved)
         information = scaled_information(problem.information, scales.odometry)
         further = second_order_errors(problem._replace(information=information), state)
         if further is not None:
             rows = further.point_m.reshape(len(further.point_m), -1)
             common = StackedErrors(common, KnownErrors(rows))
+            path_covariance += further.pose_covariances()
         of_noise = scales.observation, scales.odometry, information
         found = (state.estimate, state.obs, state.weights, state.tails, *of_noise)
         n_steps, own_m2 = steps_before + state.n_steps, state.solution.own_m2
-        return cls(landmark, *found, n_steps, own_m2, common, further)
+        return cls(landmark, *found, n_steps, own_m2, common, path_covariance, further)
 
     def joint_covariance(self) -> Float:
         """Return the dense joint covariance (3L, 3L), for small maps."""

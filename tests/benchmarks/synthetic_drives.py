@@ -16,8 +16,7 @@ import numpy as np
 
 from mapfusion.geometry.numerics import Float, one_blas_thread
 from mapfusion.geometry.se2 import compose, wrap
-from mapfusion.smoother.elimination import memory_bytes, pose_covariances
-from mapfusion.smoother.optimizer import Problem, linearize_and_solve
+from mapfusion.smoother.elimination import memory_bytes
 from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth
 from tests.helpers.synthetic_drives import SHAPES, Drive, drive
 
@@ -61,17 +60,7 @@ def nees(driven: Drive, found: Smoothed) -> Nees:
     frames = np.unique(np.linspace(1, len(driven.path) - 1, MOST_POSES).round().astype(int))
     off = (found.estimate.path - driven.path)[frames]
     off[:, 2] = wrap(off[:, 2])
-    return Nees(of_landmarks, _mean_square(off, _pose_covariances(driven, found, frames)))
-
-
-def _pose_covariances(driven: Drive, found: Smoothed, frames: np.ndarray) -> Float:
-    """Return (n, 3, 3) of the equations where the smoother ended."""
-    parameters, log = SmootherParameters(stray_m=STRAY_M), driven.log
-    problem = Problem(found.obs, log.odometry, found.odometry_information, parameters.offset_prior)
-    end = linearize_and_solve(problem, found.estimate, found.weights, found.tails)
-    covariance = pose_covariances(end.obs, end.equations, end.solution, frames)
-    further = found.second_order
-    return covariance if further is None else covariance + further.pose_covariances(frames)
+    return Nees(of_landmarks, _mean_square(off, found.path_covariance[frames]))
 
 
 def _mean_square(off: Float, covariance: Float) -> float:

@@ -6,7 +6,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from tests.mapfusion.fastslam.test_landmarks import test_each_track_s_end_widens_its_landmark_once
 
 from mapfusion.align.aligners import ALIGNERS, make_aligner
 from mapfusion.align.clique import full_set, larger_clique
@@ -36,6 +35,9 @@ from tests.mapfusion.align.test_nearest_neighbours import (
     test_finds_what_looking_at_all_finds,
 )
 from tests.mapfusion.fastslam.test_filter_twin import test_equals_the_filter_that_copies
+from tests.mapfusion.fastslam.test_landmark_arrays import (
+    test_each_track_s_end_widens_its_landmark_once,
+)
 from tests.mapfusion.fastslam.test_loop_closing import (
     test_evidence_is_the_slope_of_the_likelihood_at_the_pose_in_view,
     test_landmarks_of_all_particles_move_and_are_found_where_they_are_now,

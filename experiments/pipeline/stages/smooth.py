@@ -18,6 +18,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from experiments.pipeline.stage import Job, StageKind
 from experiments.pipeline.stages.slam import (
@@ -29,13 +30,15 @@ from experiments.pipeline.stages.slam import (
     log_as_filtered,
     noise_factor,
 )
-from experiments.pipeline.tables import INT, fields
+from experiments.pipeline.tables import COVARIANCE, INT, fields
 from mapfusion.attitude import Attitude, read_attitude
 from mapfusion.errors import DamagedFileError
 from mapfusion.files import (
     POSE_FIELDS,
     column,
     columns,
+    covariance_columns,
+    covariances_from,
     float_fields,
     named_columns,
     points_from,
@@ -53,7 +56,9 @@ from mapfusion.viewing import LogSightings
 # of observations and offsets (`observation_dof`, `offset_dof`), the estimated factor on the stated
 # covariances of observations (`observation_level`), and `not_smoothed`, the reason for a missing
 # path (else empty).
-PATH = schema("smooth.path", 2, [*fields(iteration=INT), *float_fields(POSE_FIELDS)])
+PATH = schema(
+    "smooth.path", 3, [*fields(iteration=INT), *float_fields((*POSE_FIELDS, *COVARIANCE))]
+)
 
 # Observations whose landmark differs from that of the filter.
 REASSIGNED = schema("smooth.parted", 1, fields(observation=INT, source_observation=INT))
@@ -110,7 +115,7 @@ def run(settings: SmoothSettings, job: Job) -> None:
     inputs = smoother_inputs(job, log, int(job.part), settings.noise_floor_m)
     settings_of_log = replace(settings, smoother=smoother)
     result = smooth_log(settings_of_log, *inputs, read_attitude(job.inputs["log"]))
-    landmarks, path, landmark, ended = result
+    landmarks, path, covariance, landmark, ended = result
     if landmarks is not None:
         write_map(_map_path(job.output, job.part), landmarks)
     _, filters, _ = inputs
@@ -118,6 +123,7 @@ def run(settings: SmoothSettings, job: Job) -> None:
     rows = {"observation": changed, "source_observation": landmark[changed]}
     write_table(_reassigned_path(job.output, job.part), rows, REASSIGNED)
     rows = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
+    rows |= covariance_columns(COVARIANCE, covariance)
     attributes = {name: str(value) for name, value in zip(_ENDED, ended, strict=True)}
     write_table(_path_path(job.output, job.part), rows, PATH, attributes)
 
@@ -156,8 +162,8 @@ def smooth_log(
     landmark: np.ndarray,
     path: Float,
     attitude: Attitude | None,
-) -> tuple[LandmarkMap | None, Float, np.ndarray, tuple[object, ...]]:
-    """Return map, path, landmark of each observation, and the values of `_ENDED`.
+) -> tuple[LandmarkMap | None, Float, Float, np.ndarray, tuple[object, ...]]:
+    """Return map, path, its covariances, landmark of each observation, and the values of `_ENDED`.
 
     If the log cannot be smoothed, the map is None and the path is empty.
     """
@@ -174,10 +180,12 @@ def smooth_log(
         outcome = (smoothed_log.n_steps, *smoothed_log.tails, smoothed_log.observation_scale, "")
         try:
             landmarks = smoothed_map(log, smoothed_log, attitude=attitude)
-            return landmarks, smoothed_log.estimate.path, smoothed_log.landmark, outcome
+            path, covariance = smoothed_log.estimate.path, smoothed_log.path_covariance
+            return landmarks, path, covariance, smoothed_log.landmark, outcome
         except np.linalg.LinAlgError:
             reason = "has a map whose covariance cannot be computed"
-    return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, reason)
+    nothing = np.empty((0, 3)), np.empty((0, 3, 3))
+    return None, *nothing, landmark, (0, np.nan, np.nan, np.nan, reason)
 
 
 def map_files(folder: Path, iteration: int) -> list[Path]:
@@ -217,12 +225,20 @@ def read_smoothed(folder: Path, only_last_joint: bool = False) -> dict[int, Land
 
 def read_smoothed_path(folder: Path) -> dict[int, Float]:
     """Read the smoothed path (k + 1, 3) up to each smoothed iteration k, in order."""
-    paths = {}
+    return {k: columns(table, POSE_FIELDS) for k, table in _path_tables(folder)}
+
+
+def read_path_covariance(folder: Path) -> dict[int, Float]:
+    """Read the covariances (k + 1, 3, 3) of the poses of `read_smoothed_path`."""
+    return {k: covariances_from(table, COVARIANCE) for k, table in _path_tables(folder)}
+
+
+def _path_tables(folder: Path) -> Iterator[tuple[int, pa.Table]]:
+    """Yield each smoothed iteration and its table PATH, in order."""
     for k in _iterations(folder):
         table, attributes = read_table(_path_path(folder, str(k)), PATH)
         if not attributes["not_smoothed"]:
-            paths[k] = columns(table, POSE_FIELDS)
-    return paths
+            yield k, table
 
 
 def smoothed_owners(smooth: Path, slam: Path, iteration: int, n_observations: int) -> np.ndarray:

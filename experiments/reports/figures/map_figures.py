@@ -97,9 +97,10 @@ def draw_two_maps(data: ResultTables) -> Figure:
         ellipses = {"edgecolors": colour, "linewidths": 0.4, "alpha": 0.6, "zorder": 2}
         add_ellipses(axes, position, covariance, rasterized=True, **ellipses)
         axes.plot(*path.T, color=GRAY, label="path of the best particle", zorder=3)
-        if len(smoothed := data.smoothed_path_of(robot)):
+        smoothed, _ = data.smoothed_path_of(robot)
+        if len(smoothed):
             line = {"color": BLACK, "linewidth": 0.5, "zorder": 4}
-            axes.plot(*smoothed[: k + 1].T, label="path of the smoother", **line)
+            axes.plot(*smoothed[: k + 1, :2].T, label="path of the smoother", **line)
         start = {"linestyle": "none", "marker": "o", "color": BLACK}
         axes.plot(0, 0, label="start pose, the map's frame", **start)
         mean = own.mean(axis=0) if len(own) else 0.0

@@ -15,10 +15,17 @@ from PIL import Image
 
 from experiments.evaluation.alignment_criteria import methods_in
 from experiments.evaluation.tables import ALL, read, read_scenario, read_world, table_path
+from experiments.pipeline.tables import covariances_of
 from experiments.reports.figures.style import aligner_styles
 from mapfusion.align.alignment import Status
 from mapfusion.errors import DamagedFileError, InputError
-from mapfusion.files import COVARIANCE_FIELDS, POSITION_FIELDS, points_from, require_file
+from mapfusion.files import (
+    COVARIANCE_FIELDS,
+    POSE_FIELDS,
+    POSITION_FIELDS,
+    points_from,
+    require_file,
+)
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import between, inverse, transform_covariances, transform_points
 from mapfusion.plotting import FUSED_COLOUR, ROBOT_COLOURS
@@ -214,12 +221,12 @@ class ResultTables:
         """Return the final path of the best particle in the robot's frame, shape (T, 2)."""
         return self.of_robot("paths", robot)[["final_x_m", "final_y_m"]].to_numpy()
 
-    def smoothed_path_of(self, robot: str) -> Float:
-        """Return the last smoothed path in the robot's frame, shape (T, 2), or (0, 2)."""
+    def smoothed_path_of(self, robot: str) -> tuple[Float, Float]:
+        """Return the last smoothed path in the robot's frame, (T, 3) or (0, 3), and covariances."""
         rows = self.rows("smoothed_paths")
         own = rows[rows["robot"] == robot]
         last = own[own["iteration"] == own["iteration"].max()].sort_values("frame")
-        return last[["x_m", "y_m"]].to_numpy()
+        return last[list(POSE_FIELDS)].to_numpy(np.float64), covariances_of(last)
 
     @property
     def fused_frame(self) -> str:

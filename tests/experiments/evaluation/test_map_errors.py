@@ -208,7 +208,7 @@ def test_over_the_filter_is_of_the_same_landmarks_in_the_filter_s_maps() -> None
     given = []
     for mapped, good in zip(rough, filters, strict=True):
         smoothed = SmoothedRobot(
-            mapped, np.zeros((1, 3)), good.maps, good.points_world_m, {}, {"not_smoothed": ""}
+            mapped, np.zeros((1, 3)), good.maps, good.points_world_m, {}, {}, {"not_smoothed": ""}
         )
         given.append(GivenMap.at(mapped, smoothed, K))
     row = EvaluatedFusion("joint", K, fused, given).row()
@@ -270,9 +270,9 @@ def smoothed_robot() -> SmoothedRobot:
     paths = {3: path[:4], ITERATION: path + np.array([0.01, 0.0, 0.0])}
     points = {3: POINTS[:10], ITERATION: POINTS}
     maps = {3: landmarks[np.arange(10)], ITERATION: landmarks}
-    return SmoothedRobot(
-        owner, path + np.array([0.0, 0.04, 0.0]), maps, points, paths, dict(ENDING)
-    )
+    covariances = {k: np.zeros((len(path), 3, 3)) for k, path in paths.items()}
+    filter_path = path + np.array([0.0, 0.04, 0.0])
+    return SmoothedRobot(owner, filter_path, maps, points, paths, covariances, dict(ENDING))
 
 
 def test_a_row_tells_of_the_last_map_and_the_whole_path() -> None:
@@ -329,7 +329,8 @@ def fails_at(monkeypatch: pytest.MonkeyPatch, places: list[tuple[str, int]]) -> 
     def fails(settings, log, landmark, path, attitude):
         if (log.robot, len(log) - 1) not in places:
             return works(settings, log, landmark, path, attitude)
-        return None, np.empty((0, 3)), landmark, (0, np.nan, np.nan, np.nan, "fails here")
+        nothing = np.empty((0, 3)), np.empty((0, 3, 3))
+        return None, *nothing, landmark, (0, np.nan, np.nan, np.nan, "fails here")
 
     monkeypatch.setattr(smooth, "smooth_log", fails)
 

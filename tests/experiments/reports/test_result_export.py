@@ -1,5 +1,6 @@
 """Tests of the export of results."""
 
+import json
 import math
 import sys
 from collections import defaultdict
@@ -14,12 +15,14 @@ import pytest
 from evo.core.geometry import umeyama_alignment
 from evo.core.metrics import APE, PoseRelation
 from evo.tools.file_interface import read_kitti_poses_file, read_tum_trajectory_file
+from smfeval.cli.main import main as smfeval_main
 
 from experiments.evaluation import tables
 from experiments.pipeline.stages.align import alignment_of
 from experiments.reports import result_export
 from experiments.reports.figures.result_tables import ResultTables, of_pair
 from mapfusion.geometry import se2
+from mapfusion.geometry.numerics import chi_square_bound
 from mapfusion.landmark_map import read_map
 from tests.helpers.tiny_scenario import assert_refused, command, without_tables
 
@@ -99,12 +102,8 @@ def test_evo_says_of_the_files_what_the_table_says(
 ) -> None:
     """Fitted in the plane: in space it may turn a path that is nearly straight over."""
     folder = exported(capsys, trio_result, "tum", tmp_path / "out")
-    told = (
-        ResultTables(trio_result)
-        .table("path_statistics")
-        .query("quantity == 'ate_m' and source != 'smoothed'")
-    )
-    assert len(told) == 9
+    told = ResultTables(trio_result).table("path_statistics").query("quantity == 'ate_m'")
+    assert len(told) == 12
     for row in told.to_dict("records"):
         truth, path = (
             read_tum_trajectory_file(folder / f"{row['robot']}.{which}.tum")
@@ -117,6 +116,38 @@ def test_evo_says_of_the_files_what_the_table_says(
         ape = APE(PoseRelation.translation_part)
         ape.process_data((truth, path))
         assert ape.get_all_statistics()["rmse"] == pytest.approx(row["rmse"], rel=1e-6)
+
+
+def test_smfeval_scores_the_smoothed_path(
+    trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its NEES is that of the planar positions, to first order in the error of the heading."""
+    folder = exported(capsys, trio_result, "tum", tmp_path / "out")
+    data = ResultTables(trio_result)
+    for robot in ROBOTS:
+        path, covariance = data.smoothed_path_of(robot)
+        error = path - poses_of(data.of_robot("paths", robot), "truth")
+        in_file = covariance[:, :2, :2] + 1e-8 * np.eye(2)  # 0.1 mm, see mapfusion docs export
+        nees = nees_of(error[:, :2], in_file)
+        files = (folder / f"{robot}.{name}" for name in ("smoothed.tum", "truth.tum"))
+        options = ("--cov", folder / f"{robot}.smoothed.cov", "--align", "none", "--json")
+        frames = ("--est-body-frame", "robot", "--ref-body-frame", "robot")
+        assert score_of("nees", *files, *options, *frames) == 0
+        verdict = json.loads(capsys.readouterr().out)
+        assert verdict["n"] == len(path)
+        assert verdict["median_nees"] == pytest.approx(np.median(nees), rel=0.01)
+        # the file has the bound of three directions, of which the height has no error
+        gate = chi_square_bound(0.9, 3)
+        assert verdict["coverage"] == pytest.approx(np.mean(nees <= gate), abs=1.5 / len(path))
+
+
+def score_of(*words: object) -> int:
+    """Call smfeval's command line."""
+    return smfeval_main([str(word) for word in words])
+
+
+def nees_of(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
 
 
 def test_poses_that_are_not_known_are_left_out(

@@ -120,8 +120,7 @@ def test_steps_end_where_more_of_them_would(monkeypatch: pytest.MonkeyPatch) -> 
     end, at_end = settled_from(log, reckoned)
     monkeypatch.undo()
     again, told_again = settled_from(log, end.estimate.path)
-    frames = np.arange(1, len(log))
-    covariance = pose_covariances(end.obs, end.equations, end.solution, frames)
+    covariance = pose_covariances(end.obs, end.equations, end.solution)[1:]
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     for each, its in ((found, told), (again, told_again)):
         assert its.observation == pytest.approx(at_end.observation, rel=3e-3)

@@ -69,7 +69,7 @@ def test_mean_squares_are_those_of_chains_that_are_composed() -> None:
     true_m2 = np.mean((pose[:, 0] - end_m) ** 2)
     linear_m2 = np.sum(sigma[:, 0] ** 2)
     assert true_m2 > 3 * linear_m2
-    added_m2 = found.pose_covariances(np.array([N_STEPS]))[0, 0, 0]
+    added_m2 = found.pose_covariances()[N_STEPS, 0, 0]
     assert added_m2 == pytest.approx(true_m2 - linear_m2, rel=0.3)
     of_landmark_m2 = np.sum(found.point_m[:, -1, 0] ** 2)
     assert of_landmark_m2 == pytest.approx(added_m2, rel=0.2)
