@@ -58,15 +58,19 @@ class Refinement:
     Gauss-Newton step of the motion and a Fisher scoring step of s_drift. Oscillating steps of
     s_drift are halved.
 
+    Precise maps have an s_drift below `least_drift_m`. A second pass, from the result of the first,
+    then judges the pairs by the s_drift of the first pass. With the larger bound a false pair in
+    the gate would count as true, and would move the motion if its landmarks are precise.
+
     A result that rests on one pair is refused: without the pair of highest leverage the motion must
     stay within the gate.
 
     Attributes:
         gate_m: largest distance in the plane of a pair under the estimate. Drift displaces true
             pairs of two maps by 0.1 to 0.3 m, and the estimate has an error as well.
-        least_drift_m: smallest s_drift for the probability that a pair is true. Drift is common to
-            neighbours; without this bound a part of a map that is displaced by 0.1 m would count as
-            false, and the result would depend on the initial estimate.
+        least_drift_m: smallest s_drift for the probability that a pair is true, in the first pass.
+            Drift is common to neighbours; without this bound a part of a map that is displaced by
+            0.1 m would count as false, and the result would depend on the initial estimate.
         max_rounds: largest number of rounds; an estimate that has not converged is refused.
         height: test of compatible heights (not for planar maps).
     """
@@ -105,9 +109,13 @@ class Refinement:
         rows = pairs.of_one_height(self.height)
         planar = pairs[rows].in_plan()
         limits = (gate_m, self.least_drift_m, self.max_rounds)
-        solved, moved_m, T_a_b, covariance, variance, truth, left_out = maximise_likelihood(
-            planar, T_a_b, *limits
-        )
+        found = maximise_likelihood(planar, T_a_b, *limits)
+        if found[0] and (drift_m := math.sqrt(found[4])) < self.least_drift_m:
+            second_limits = (gate_m, drift_m, self.max_rounds)
+            second = maximise_likelihood(planar, found[2], *second_limits)
+            if second[0]:
+                found, limits = second, second_limits
+        solved, moved_m, T_a_b, covariance, variance, truth, left_out = found
         if not solved:
             reason = f"the pairs within {self.gate_m:g} m of the estimate determine no motion"
             return undetermined(reason, len(pairs), started_s)

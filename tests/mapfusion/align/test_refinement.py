@@ -232,6 +232,22 @@ def test_a_part_that_moved_as_one_is_not_taken_for_false():
     assert not all(np.all(answer.inlier) for answer in answers)
 
 
+def test_a_false_pair_inside_the_gate_does_not_move_precise_maps():
+    """The two sides of a thin wall look alike; a few landmarks are far more precise than others."""
+    pair, (map_a, map_b, c) = offered(np.random.default_rng(11), 50, 1.0, 0.0, 0.02)
+    p_b, covariance_m2 = map_b.position_m.copy(), map_b.covariance_m2.copy()
+    p_b[:5] = se2.transform_points(se2.inverse(pair.T_a_b), map_a.position_m[:5])
+    covariance_m2[:5] /= 100
+    p_b[0, :2] += [0.2, 0.0]
+    map_b = replace(map_b, position_m=p_b, covariance_m2=covariance_m2)
+    pairs = Pairs(map_a, map_b, c)
+    found = Refinement().refine(pairs, pair.T_a_b)
+    without = Refinement().refine(pairs[np.arange(1, 50)], pair.T_a_b)
+    assert not found.inlier[0]
+    assert np.count_nonzero(found.inlier) > 45
+    assert error(found.T_a_b, without.T_a_b) == pytest.approx((0, 0), abs=1e-3)
+
+
 def test_drift_is_at_most_what_false_pairs_over_the_gate_would_look_like():
     """Uniform residuals over the gate fit any s_drift; its limit is a third of the gate."""
     rng = np.random.default_rng(10)
