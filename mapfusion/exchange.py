@@ -1,4 +1,4 @@
-"""Point clouds (PLY) and pose graphs (g2o) of other programs: write them, read maps from them.
+"""Point clouds (PLY) and pose graphs (g2o) of other programs: write and read them.
 
 PLY: Turk (1994), "The PLY polygon file format". A vertex is a landmark, and its further properties
 have the names of the columns of a map.
@@ -26,7 +26,7 @@ from mapfusion.files import (
     named_columns,
 )
 from mapfusion.geometry.numerics import Float, require_shape
-from mapfusion.geometry.se2 import rotation
+from mapfusion.geometry.se2 import rotation, rotation_about_z
 
 _UPPER_3, _UPPER_2 = np.triu_indices(3), np.triu_indices(2)
 _PLANAR, _NAME = "planar", "map "  # comments of a PLY file: heights mean nothing; name of the map
@@ -235,6 +235,110 @@ def read_g2o(path: Path, what: str) -> pa.Table:
         columns = {key: each for key, each in columns.items() if "z" not in key}
     metadata = {"mapfusion.name": name} if name else None
     return pa.table(columns).replace_schema_metadata(metadata)
+
+
+# Keys of GTSAM's symbols have the letter of the robot in the highest byte.
+_LETTER_BITS = 56
+_N_INFORMATION = {3: 6, 6: 21}  # numbers of an upper triangle
+# Poses in space are reduced to the plane. A motion that tilts further is no motion on a floor.
+_MAX_TILT_RAD = math.radians(10)
+
+
+class PlanarPoseGraph(NamedTuple):
+    """Poses of several robots and measured motions between them, in the plane.
+
+    Attributes:
+        robot: name of the robot of each of the n poses.
+        key: key of each pose in its file.
+        pairs: rows of the poses i and j of each motion, shape (E, 2).
+        T_i_j: measured motions, shape (E, 3).
+        covariance: their covariances in the frame of i, shape (E, 3, 3).
+        n_left_out: number of motions from or to poses that no file has.
+    """
+
+    robot: tuple[str, ...]
+    key: tuple[int, ...]
+    pairs: np.ndarray
+    T_i_j: Float
+    covariance: Float
+    n_left_out: int
+
+
+def read_pose_graph(paths: Sequence[Path]) -> PlanarPoseGraph:
+    """Read one pose graph of several robots from g2o files, for example one file for each robot.
+
+    The robot of a pose is the letter of its key if this is a symbol of GTSAM. Otherwise it is the
+    first word of the last comment above, as `G2oGraph.add_comment` writes it. Motions in space are
+    reduced to x, y and yaw. The rotational part of their information is that of a rotation vector,
+    as GTSAM has it. A motion that several files contain counts once. Landmarks are left out.
+
+    Raises:
+        InputError: a file is missing or damaged, a pose belongs to no robot, or a motion tilts.
+    """
+    row, robots, motions = dict[int, int](), list[str](), dict[tuple[str, ...], Float]()
+    for path in paths:
+        if not path.is_file():
+            raise InputError(f"{path}: no such file or folder")
+        section, n_before = "", len(robots)
+        text = path.read_text(encoding="utf-8", errors="replace")
+        for number, line in enumerate(text.splitlines(), start=1):
+            words = line.split()
+            try:
+                if words and words[0].startswith("#"):
+                    section = line.removeprefix("#").strip().partition(",")[0]
+                elif words and words[0] in ("VERTEX_SE2", "VERTEX_SE3:QUAT"):
+                    key = int(words[1])
+                    letter = chr(key >> _LETTER_BITS) if key >> _LETTER_BITS else section
+                    if not letter or not letter.isprintable():
+                        raise ValueError("the key of the pose names no robot")
+                    if key not in row:
+                        row[key] = len(robots)
+                        robots.append(letter)
+                elif words and words[0] in ("EDGE_SE2", "EDGE_SE3:QUAT"):
+                    motions.setdefault(tuple(words), _planar_motion(words, number))
+            except (ValueError, IndexError, np.linalg.LinAlgError) as error:
+                reason = f"line {number}: {str(error).removeprefix(f'line {number}: ')}"
+                raise InputError(
+                    f"{path}: not readable as a pose graph in g2o ({reason})"
+                ) from error
+        if len(robots) == n_before:
+            raise InputError(f"{path}: has no poses (VERTEX_SE2 or VERTEX_SE3:QUAT) of its own")
+    known = {words: T for words, T in motions.items() if {*map(int, words[1:3])} <= row.keys()}
+    pairs = [(row[int(words[1])], row[int(words[2])]) for words in known]
+    values = np.array([*known.values()]).reshape(-1, 4, 3)
+    return PlanarPoseGraph(
+        tuple(robots),
+        tuple(row),
+        np.array(pairs, dtype=np.int64).reshape(-1, 2),
+        values[:, 0],
+        values[:, 1:],
+        len(motions) - len(known),
+    )
+
+
+def _planar_motion(words: Sequence[str], line: int) -> Float:
+    """Return the motion (3,) of an edge and, below it, its covariance (3, 3) in the first frame."""
+    is_planar = words[0] == "EDGE_SE2"
+    n_pose, size = (3, 3) if is_planar else (7, 6)
+    numbers = _numbers(words[3:], n_pose + _N_INFORMATION[size], line)
+    information = np.zeros((size, size))
+    information[np.triu_indices(size)] = numbers[n_pose:]
+    information += np.triu(information, 1).T
+    if np.linalg.eigvalsh(information)[0] <= 0:
+        raise ValueError("the information of the motion is not positive definite")
+    covariance = np.linalg.inv(information)
+    T = numbers[:3]
+    if not is_planar:
+        qx, qy, qz, qw = numbers[3:7] / np.linalg.norm(numbers[3:7])
+        if 1 - 2 * (qx * qx + qy * qy) < math.cos(_MAX_TILT_RAD):
+            raise ValueError(
+                "the motion tilts by more than 10 degrees, but robots drive in a plane"
+            )
+        yaw_rad = math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+        T = np.array([numbers[0], numbers[1], yaw_rad])
+        covariance = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
+    turn = rotation_about_z(T[2])
+    return np.vstack([T, turn @ covariance @ turn.T])
 
 
 def _numbers(words: Sequence[str], count: int, line: int) -> Float:
