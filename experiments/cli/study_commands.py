@@ -489,3 +489,53 @@ def calibrate(
     export.publish_json("calibrate", made, as_json)
     if not as_json:
         study_screen.print_calibration(found, written)
+
+
+@studies.command()
+def team(
+    graphs: Annotated[
+        list[Path],
+        typer.Argument(metavar="GRAPH...", help="Pose graphs (.g2o), or a folder of the robots'."),
+    ],
+    *,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="CSV file: motions between robots.")
+    ] = None,
+    stated_noise: Annotated[
+        bool,
+        typer.Option(
+            "--stated-noise",
+            help="Take the noise as stated; by default the robots' own loops tell it.",
+        ),
+    ] = False,
+    as_json: options.AsJson = False,
+) -> None:
+    """Judge motions between robots in pose graphs: `mapfusion study team FOLDER`.
+
+    Motions that contradict the others are refused. Exit code 1 if no two robots are connected. See
+    `mapfusion docs export`.
+    """
+    from experiments.reports import export
+    from experiments.reports.team_screen import (
+        motions_frame,
+        print_team,
+        read_graph_files,
+        team_document,
+    )
+    from mapfusion.fusion.team_pose_graph import judge_pose_graph
+
+    if output is not None and output.suffix != ".csv":
+        raise InputError(f"-o {output}: ends in {output.suffix or 'nothing'}, expected .csv")
+    graph = read_graph_files(graphs)
+    try:
+        judged = judge_pose_graph(graph, estimate_noise=not stated_noise)
+    except ValueError as error:
+        raise InputError(f"{graphs[0]}: {error}") from error
+    if output is not None:
+        export.write_text(output, motions_frame(judged).to_csv(index=False))
+    export.publish_json("team", team_document(judged), as_json)
+    if not as_json:
+        print_team(judged)
+    if judged.component.max() + 1 == len(judged.robots):
+        options.print_to_stderr("no two robots are connected")
+        raise typer.Exit(options.EXIT_FAILED)

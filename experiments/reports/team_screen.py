@@ -1,4 +1,4 @@
-"""Result of `mapfusion team`: the motions between the robots of a pose graph, and their status."""
+"""Results of the study `team`: motions between the robots of a pose graph, and their status."""
 
 from collections.abc import Sequence
 from pathlib import Path

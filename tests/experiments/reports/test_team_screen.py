@@ -1,4 +1,4 @@
-"""Tests of `mapfusion team`."""
+"""Tests of `mapfusion study team`."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ def test_an_exported_graph_is_judged_as_the_run_did(
     trio_result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command(capsys, "export", trio_result, "--format", "g2o", "-o", tmp_path)
-    reply = command(capsys, "team", tmp_path / "team.g2o", "--json")
+    reply = command(capsys, "study", "team", tmp_path / "team.g2o", "--json")
     assert reply.code == 0, reply.err
     found = json.loads(reply.out)
     edges = ResultTables(trio_result).rows("team_edges")
@@ -35,7 +35,7 @@ def test_a_folder_of_robots_is_one_graph(
     folder.mkdir()
     robots = write_grid(folder, 2, seed=1, wrong=1)
     (folder / "fullGraph.g2o").write_text("the graph with other keys")
-    reply = command(capsys, "team", folder, "-o", tmp_path / "motions.csv")
+    reply = command(capsys, "study", "team", folder, "-o", tmp_path / "motions.csv")
     assert reply.code == 0, reply.err
     rows = pd.read_csv(tmp_path / "motions.csv")
     assert set(rows["robot_a"]) | set(rows["robot_b"]) == set(robots)
@@ -50,14 +50,16 @@ def test_a_team_that_nothing_connects_is_code_1(
 ) -> None:
     path = tmp_path / "two.g2o"
     path.write_text("# R1,\nVERTEX_SE2 0 0 0 0\n# R2,\nVERTEX_SE2 1 0 0 0\n")
-    reply = command(capsys, "team", path)
+    reply = command(capsys, "study", "team", path)
     assert reply.code == 1
     assert "no two robots are connected" in reply.err
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert_refused(command(capsys, "team", tmp_path), str(tmp_path), "holds no .g2o files")
-    assert_refused(command(capsys, "team", tmp_path / "none.g2o"), "no such file")
+    assert_refused(command(capsys, "study", "team", tmp_path), str(tmp_path), "holds no .g2o files")
+    assert_refused(command(capsys, "study", "team", tmp_path / "none.g2o"), "no such file")
     write_grid(tmp_path, 2, seed=0)
-    assert_refused(command(capsys, "team", tmp_path / "0.g2o"), "two robots or more")
-    assert_refused(command(capsys, "team", tmp_path, "-o", tmp_path / "m.txt"), "expected .csv")
+    assert_refused(command(capsys, "study", "team", tmp_path / "0.g2o"), "two robots or more")
+    assert_refused(
+        command(capsys, "study", "team", tmp_path, "-o", tmp_path / "m.txt"), "expected .csv"
+    )
