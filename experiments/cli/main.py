@@ -3,6 +3,7 @@
 import io
 import os
 import re
+import signal
 import sys
 import warnings
 from typing import Annotated, Any
@@ -66,6 +67,7 @@ def main() -> None:
     # be set before BLAS is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; an unknown name would fail the import
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends a command as Ctrl-C does
     _repair_thread_counts()
     _show_warnings_in_one_line()
     try:

@@ -26,7 +26,7 @@ _SHARE_AT_START = 0.15
 # How a command may end that was killed in a way; with 0 where it was just done.
 _CODES = {
     "everything": {-9, 0},
-    "terminated": {-15, 0},
+    "terminated": {130, -15, 0},  # -15 before the command has begun
     "interrupted": {130, 0},
     "worker": {2, 0},
 }

@@ -27,15 +27,21 @@ sys.addaudithook(stand_still)
 
 
 def interrupted(
-    arguments: list[object], folder: Path, before_file: str, ready: Callable[[], bool]
+    arguments: list[object],
+    folder: Path,
+    before_file: str,
+    ready: Callable[[], bool],
+    by_terminal: bool = True,
 ) -> subprocess.CompletedProcess[str]:
-    """Start `mapfusion ARGUMENTS`, and press Ctrl-C when it would put a file in place.
+    """Start `mapfusion ARGUMENTS`, and end it when it would put a file in place.
 
     Args:
         arguments: of the command.
         folder: an empty one, for what makes it stand still.
         before_file: how the file's name ends; each process that has finished one stands still.
         ready: what must have come true as well, by the work of other processes.
+        by_terminal: press Ctrl-C, which all processes get; else terminate its own process, as
+            `kill` and `timeout` do.
     """
     mark = folder / "stands_still"
     text = _STAND_STILL.format(name=before_file, mark=str(mark))
@@ -52,6 +58,9 @@ def interrupted(
     there = wait_until(lambda: (mark.exists() and ready()) or process.poll() is not None)
     assert there, "it never came to stand still"
     assert process.poll() is None, process.communicate()
-    os.killpg(process.pid, signal.SIGINT)
+    if by_terminal:
+        os.killpg(process.pid, signal.SIGINT)
+    else:
+        process.terminate()
     out, err = process.communicate(timeout=PATIENCE_S)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)

@@ -119,8 +119,9 @@ def test_ctrl_c_before_the_command_starts(
     assert len(reply.err.splitlines()) == 1
 
 
+@pytest.mark.parametrize("by_terminal", [True, False])
 def test_interrupted_run_goes_on_and_gives_the_same_tables(
-    tiny: Simulation, tiny_path: Path, tiny_result: Path, tmp_path: Path
+    tiny: Simulation, tiny_path: Path, tiny_result: Path, tmp_path: Path, by_terminal: bool
 ) -> None:
     def rendered() -> list[Path]:
         return list(results.rglob("features/*/done_*.json"))
@@ -128,7 +129,9 @@ def test_interrupted_run_goes_on_and_gives_the_same_tables(
     results, held = tmp_path / "results", tmp_path / "held"
     held.mkdir()
     command_line = ["run", tiny_path, "--jobs=2", f"--results={results}"]
-    ended = interrupted(command_line, held, "features_000020.parquet", lambda: bool(rendered()))
+    ended = interrupted(
+        command_line, held, "features_000020.parquet", lambda: bool(rendered()), by_terminal
+    )
     assert ended.returncode == 130
     assert "Traceback" not in ended.stderr
     complaints = [line for line in ended.stderr.splitlines() if line.startswith("mapfusion: ")]
