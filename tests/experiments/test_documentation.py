@@ -1,8 +1,11 @@
-"""The documentation site: its index, its reference, and every block of code in the tutorials."""
+"""The documentation site: its index, its reference, and its blocks of code."""
 
 import importlib.util
+import inspect
+import json
 import re
 import shlex
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -14,10 +17,14 @@ import typer
 from ruamel.yaml import YAML
 from typer.main import get_command
 
+import mapfusion
 from experiments.cli.main import app
 from experiments.evaluation import tables
-from experiments.scenario.loading import setting_keys
+from experiments.scenario.loading import load_scenario, setting_keys
 from mapfusion.align.rigid_motion import fit_rigid
+from mapfusion.datasets.camera_calibration import parse_lens
+from mapfusion.fusion.fusers import GROUP as FUSER_GROUP
+from mapfusion.fusion.fusers import make_fuser
 from mapfusion.geometry import se2
 from mapfusion.landmark_map import read_map
 from tests.helpers.tiny_scenario import TINY, command
@@ -186,3 +193,99 @@ def test_the_gate_of_a_ci_is_a_valid_scenario(
     reply = command(capsys, "run", path, "--dry-run", "--results", tmp_path)
     assert reply.code == 0, reply.err
     assert [next(iter(step)) for step in YAML(typ="safe").load(steps)] == ["run", "run", "uses"]
+
+
+def with_fragment(base: dict, fragment: dict) -> dict:
+    """Return a scenario in which a page's block replaces values; lists and worlds as a whole."""
+    merged = dict(base)
+    for key, value in fragment.items():
+        both = isinstance(value, dict) and isinstance(base.get(key), dict) and key != "world"
+        merged[key] = with_fragment(base[key], value) if both else value
+    return merged
+
+
+@pytest.mark.parametrize("page", ["plugins", "refusal", "scenarios", "speed"])
+def test_yaml_blocks_are_valid_scenarios(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    example = Path(__file__).parents[1] / "plugin_example" / "mapfusion_best_share.py"
+    code = example.read_text(encoding="utf-8").replace("BestShare", "Nearest")
+    (tmp_path / "mine.py").write_text(code, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    yaml = YAML(typ="safe")
+    for k, block in enumerate(blocks(page, "yaml")):
+        # the page's package is not installed here
+        fragment = yaml.load(block.replace("method: best_share", "method: mine.py:Nearest"))
+        base = yaml.load(TINY)
+        if "generate" in fragment:  # in place of the world and its robots
+            base = {name: base[name] for name in ("schema_version", "name", "drive")}
+        path = tmp_path / f"{page}_{k}.yaml"
+        yaml.dump(with_fragment(base, fragment), path)
+        load_scenario(path)
+
+
+def test_maps_as_the_page_of_formats_makes_them_are_aligned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(compile(blocks("formats", "python")[0], "formats", "exec"), {})
+    reply = command(capsys, "align", "north.parquet", "south.parquet", "--json")
+    assert reply.code == 0, reply.err
+    found = next(row for row in json.loads(reply.out)["aligners"] if row["aligner"] == "ransac")
+    motion = found["refined"]
+    expected = {"tx_m": 2.0, "ty_m": -1.0, "theta_rad": 0.4}
+    assert {name: motion[name] for name in expected} == pytest.approx(expected, abs=0.03)
+
+
+def test_classes_of_the_page_of_plug_ins_work(tmp_path: Path) -> None:
+    of_aligner, of_descriptor = blocks("plugins", "python")
+    example = Path(__file__).parents[1] / "plugin_example" / "mapfusion_best_share.py"
+    assert of_aligner in example.read_text(encoding="utf-8")
+    names: dict = {}
+    exec(compile(of_descriptor, "plugins", "exec"), names)
+    image = np.random.default_rng(0).integers(0, 256, (40, 60), dtype=np.uint8)
+    described = names["Brightness"]().describe(image, np.array([[30.0, 20.0]]), np.ones(1))
+    assert described.shape == (1, 16)
+    assert described[0, 0] == image[20 - 8, 30 - 8]
+    project = tomllib.loads(blocks("plugins", "toml")[0])
+    assert project["project"]["entry-points"] == {
+        "mapfusion.aligners": {"best_share": "mapfusion_best_share:BestShare"}
+    }
+
+
+def test_the_fuser_of_the_page_of_fusers_has_the_interface() -> None:
+    names: dict = {}
+    exec(compile(blocks("fusers", "python")[0], "fusers", "exec"), names)
+    expected = inspect.signature(make_fuser("kalman").fuse)
+    assert list(inspect.signature(names["Mine"]().fuse).parameters) == list(expected.parameters)
+    project = tomllib.loads(blocks("fusers", "toml")[0])
+    assert list(project["project"]["entry-points"]) == [FUSER_GROUP]
+
+
+def test_the_page_of_recordings_reads_pictures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.yaml").write_text(TINY, encoding="utf-8")
+    arguments = ("--set", "drive.frames=3", "--results", "results")
+    reply = command(capsys, "record", "tiny.yaml", "--format", "kitti", "-o", "k", *arguments)
+    assert reply.code == 0, reply.err
+    sequence = next(path.parent for path in (tmp_path / "k").rglob("calib.txt"))
+    code = blocks("recordings", "python")[0].replace("dataset/sequences/00", str(sequence))
+    names: dict = {"mapfusion": mapfusion, "Path": Path}
+    exec(compile(code, "recordings", "exec"), names)
+    assert names["left"].shape == names["right"].shape
+    lens = parse_lens("page", YAML(typ="safe").load(blocks("recordings", "yaml")[0])["cam0"])
+    assert lens.focal_px == (535.4, 539.2)
+
+
+def test_the_page_of_statistics_reads_runs(
+    tiny_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "quick-0").symlink_to(tiny_result)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {"Path": Path}
+    code = blocks("statistics", "python")[0].replace(', Path("results/quick-1")', "")  # one run
+    exec(compile(code, "statistics", "exec"), names)
+    assert "oracle" in set(names["errors"]["aligner"])
