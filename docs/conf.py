@@ -27,7 +27,10 @@ sys.path.insert(0, str(DOCS.parent))
 
 import mapfusion  # noqa: E402
 from experiments.cli.main import app as command_line  # noqa: E402
+from experiments.pipeline.stage import use_kernel_cache  # noqa: E402
 from experiments.scenario.loading import schema_text  # noqa: E402
+
+use_kernel_cache()  # for the examples: kernels in the source tree may be of an earlier version
 
 project = "mapfusion"
 author = "the mapfusion authors"
