@@ -239,6 +239,19 @@ def mean_change(changes: Float) -> BetterTest:
     return BetterTest(mean, mean - half, mean + half, p)
 
 
+def signed_rank(changes: Float) -> float:
+    """Return p of Wilcoxon's signed-rank test that independent changes have a median of 0.
+
+    Changes may be infinite. Fewer than two changes, and changes that are all 0, give NaN.
+    """
+    from scipy.stats import wilcoxon  # a slow import
+
+    if len(changes) < 2 or not np.any(changes):
+        return np.nan
+    clipped = np.clip(changes, -LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
+    return float(wilcoxon(clipped, zero_method="zsplit").pvalue)
+
+
 def holm(p_values: Float) -> Float:
     """Return adjusted p values (Holm 1979), which control the family-wise error rate.
 

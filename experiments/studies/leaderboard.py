@@ -10,8 +10,9 @@ Fusers. The last maps of each run are aligned with their true correspondences, s
 alone is judged. One fuser beats another if the RMS errors of its landmarks are smaller.
 
 The rank of a method is one more than the number of methods that beat it. Methods of equal rank are
-tied; the smaller error is listed first. A difference counts if Student's t test over runs finds it
-at 5 %, corrected for the number of pairs by Holm's method. Times are over those of a reference
+tied; the smaller error is listed first. A difference counts if a test over runs finds it at 5 %,
+corrected for the number of pairs by Holm's method: Student's t test for aligners, Wilcoxon's
+signed-rank test for fusers, whose errors may be infinite. Times are over those of a reference
 method on the same maps in the same process, called directly afterwards.
 """
 
@@ -64,6 +65,7 @@ from experiments.scenario.settings import DEFAULT_ALIGNERS, AlignerEntry
 from experiments.scenario.suite import chosen_aligners
 from experiments.studies.intervals import (
     SIGNIFICANCE,
+    BetterTest,
     Interval,
     change_of_each_run,
     clusters_of,
@@ -72,6 +74,7 @@ from experiments.studies.intervals import (
     log_ratio,
     mean_change,
     median_interval,
+    signed_rank,
     wilson,
 )
 from experiments.studies.method_comparison import STAGES, compare_methods, oracle_ratios
@@ -500,27 +503,22 @@ def _more_right(right: pd.DataFrame, aligners: Sequence[str]) -> set[tuple[str, 
         return set()
     by_task = right.pivot_table(index=["run_id", "task"], columns="aligner", values="right")
     run_id, n_runs = by_task.index.get_level_values("run_id"), right["run_id"].nunique()
-    changes = {
-        (a, b): change_of_each_run((by_task[b] - by_task[a]).to_numpy(), run_id, n_runs, mean=True)
-        for a, b in combinations(aligners, 2)
-    }
-    return _better(changes)
+    pairs, tests = list(combinations(aligners, 2)), list[BetterTest]()
+    for a, b in pairs:
+        change = (by_task[b] - by_task[a]).to_numpy()
+        tests.append(mean_change(change_of_each_run(change, run_id, n_runs, mean=True)))
+    return _significant(pairs, np.array([test.p for test in tests]), [t.change for t in tests])
 
 
-def _better(changes: Mapping[tuple[str, str], Float]) -> set[tuple[str, str]]:
-    """Return the pairs (better, worse) of methods that differ significantly.
+def _significant(
+    pairs: Sequence[tuple[str, str]], p_values: Float, changes: Sequence[float]
+) -> set[tuple[str, str]]:
+    """Return the pairs (better, worse) whose change is significant; it is negative if a is better.
 
-    Args:
-        changes: of each pair of methods the changes of all runs, negative where the first is
-            better.
+    The p values are corrected by Holm's method.
     """
-    tests = [mean_change(change) for change in changes.values()]
-    significant = holm(np.array([test.p for test in tests])) < SIGNIFICANCE
-    return {
-        (a, b) if test.change < 0 else (b, a)
-        for (a, b), test, known in zip(changes, tests, significant, strict=True)
-        if known
-    }
+    rows = zip(pairs, holm(p_values) < SIGNIFICANCE, changes, strict=True)
+    return {(a, b) if change < 0 else (b, a) for (a, b), known, change in rows if known}
 
 
 def _smaller_errors(maps: pd.DataFrame, rng: np.random.Generator) -> set[tuple[str, str]]:
@@ -560,12 +558,10 @@ def rank_fusers(fusions: pd.DataFrame) -> pd.DataFrame:
     error = fusions.assign(error=fusions["landmark_rmse_m"].fillna(np.inf))
     by_run = error.pivot_table(index="run_id", columns="fuser", values="error", sort=False)
     fusers = list(dict.fromkeys(fusions["fuser"]))
-    beats = _better(
-        {
-            (a, b): log_ratio(by_run[a].to_numpy(), by_run[b].to_numpy())
-            for a, b in combinations(fusers, 2)
-        }
-    )
+    pairs = list(combinations(fusers, 2))
+    changes = [log_ratio(by_run[a].to_numpy(), by_run[b].to_numpy()) for a, b in pairs]
+    p = np.array([signed_rank(change) for change in changes])
+    beats = _significant(pairs, p, [float(np.median(change)) for change in changes])
     ranked = []
     for fuser in fusers:
         own = error[error["fuser"] == fuser]

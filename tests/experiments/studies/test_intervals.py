@@ -21,6 +21,7 @@ from experiments.studies.intervals import (
     log_ratio,
     mean_change,
     percentile_interval,
+    signed_rank,
     weighted_mean_interval,
     wilson,
 )
@@ -215,3 +216,13 @@ def test_a_run_has_one_change_and_a_single_run_those_of_its_maps() -> None:
     assert change_of_each_run(changes, runs, 2).tolist() == [2.0, 5.0]
     assert change_of_each_run(changes, runs, 2, mean=True).tolist() == [4.0, 5.0]
     assert change_of_each_run(changes, ["x"] * 4, 1).tolist() == changes.tolist()
+
+
+def test_signed_ranks_hold_with_infinite_changes() -> None:
+    """Each of n changes of one sign: p of the sign test; and infinite ones do not hide the rest."""
+    same = np.log(np.linspace(1.1, 1.6, 10))
+    assert signed_rank(same) == pytest.approx(2 / 2**10)
+    assert signed_rank(np.r_[same, np.inf]) == pytest.approx(2 / 2**11)
+    assert signed_rank(np.r_[same, -same]) > 0.9
+    assert np.isnan(signed_rank(np.zeros(5)))
+    assert np.isnan(signed_rank(np.ones(1)))
