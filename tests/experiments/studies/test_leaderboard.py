@@ -1,5 +1,6 @@
 """The frozen task set, and the ranking of aligners and fusers on it."""
 
+import hashlib
 import json
 import re
 import shutil
@@ -388,3 +389,18 @@ def test_each_known_method_is_ranked_once() -> None:
     assert len(names) == len(set(names))
     assert "batch" not in fusers
     assert leaderboard.REFERENCE_FUSER in fusers
+
+
+def test_the_published_ranking_is_that_of_its_own_errors() -> None:
+    """Tables, provenance and card in the repository belong together and to this code."""
+    folder = Path(__file__).parents[3] / "results" / "reference" / "leaderboard"
+    card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    files = {each["name"]: each["sha256"] for each in card["distribution"]}
+    lines = "".join(f"{files[name]}  {name}\n" for name in sorted(files))
+    provenance = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
+    digest = hashlib.sha256(lines.encode()).hexdigest()
+    assert provenance["task_set"] == {"version": card["version"], "sha256": digest}
+    for name, rank in (("aligners", rank_aligners), ("fusers", rank_fusers)):
+        errors = {"aligners": "alignments", "fusers": "fusions"}[name]
+        found = rank(pd.read_parquet(folder / f"{errors}.parquet"))
+        pd.testing.assert_frame_equal(found, pd.read_csv(folder / f"{name}.csv"), rtol=1e-6)
