@@ -205,16 +205,11 @@ def camera_pose(camera: StereoCamera, T_world_robot: ArrayLike, y_m: float) -> F
         T_world_robot: robot pose, shape (3,), or (4, 4) for a tilted body.
         y_m: offset of the camera to the left of the centre of the pair.
     """
-    return body_pose(T_world_robot) @ _mounting(camera, y_m)
+    T_robot_camera = pose(camera.camera_axes, camera.p_robot_eye(y_m))
+    return body_pose(T_world_robot) @ T_robot_camera
 
 
 def body_pose(T_world_robot: ArrayLike) -> Float:
     """Return T_world_robot (4, 4) of a body at a pose (3,), or (4, 4) if it tilts."""
     T = np.asarray(T_world_robot, dtype=np.float64)
     return T if T.shape == (4, 4) else from_planar(T)
-
-
-@functools.lru_cache(maxsize=4)
-def _mounting(camera: StereoCamera, y_m: float) -> Float:
-    """Return T_robot_camera (4, 4)."""
-    return pose(camera.camera_axes, camera.p_robot_eye(y_m))

@@ -160,7 +160,7 @@ class World:
         """
         p, client = self.bullet, self.client
         corners_m = read_corners(folder / CORNERS)
-        with silence():
+        with silence(), tempfile.TemporaryDirectory() as temporary:
             for i in range(len(corners_m)):
                 mesh, picture = face_files(folder, i)
                 require_file(mesh, "mesh")  # PyBullet would not name a missing file
@@ -168,28 +168,20 @@ class World:
                     p.GEOM_MESH, fileName=name_in_text(str(mesh)), physicsClientId=client
                 )
                 body = p.createMultiBody(0, baseVisualShapeIndex=shape, physicsClientId=client)
-                texture = self._load_texture(picture)
+                image = read_picture(picture)
+                if self.renderer != "tiny":
+                    # The EGL plug-in passes rows of 3 bytes per texel to OpenGL, which expects rows
+                    # aligned to 4 bytes. A texture with another width would be sheared.
+                    width = -(-image.shape[1] // GL_ROW_TEXELS) * GL_ROW_TEXELS
+                    image = cv2.resize(image, (width, len(image)), interpolation=cv2.INTER_LINEAR)
+                    picture = Path(temporary) / f"{i}.bmp"
+                    if not cv2.imwrite(str(picture), image):
+                        raise OSError(f"{picture}: could not be written")
+                texture = p.loadTexture(name_in_text(str(picture)), physicsClientId=client)
                 p.changeVisualShape(body, -1, textureUniqueId=texture, physicsClientId=client)
                 self._faces.append(body)
         self._shown = np.ones(len(corners_m), dtype=bool)
         return corners_m
-
-    def _load_texture(self, picture: Path) -> int:
-        """Load a texture; for EGL its width is made a multiple of four.
-
-        The EGL plug-in passes rows of 3 bytes per texel to OpenGL, which expects rows that are
-        aligned to 4 bytes. A texture of another width would be sheared.
-        """
-        p, client = self.bullet, self.client
-        image = read_picture(picture)
-        if self.renderer == "tiny":
-            return p.loadTexture(name_in_text(str(picture)), physicsClientId=client)
-        size = (-(-image.shape[1] // GL_ROW_TEXELS) * GL_ROW_TEXELS, image.shape[0])
-        with tempfile.TemporaryDirectory() as folder:
-            fitting = str(Path(folder) / "texture.bmp")
-            if not cv2.imwrite(fitting, cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)):
-                raise OSError(f"{fitting}: could not be written")
-            return p.loadTexture(fitting, physicsClientId=client)
 
     def show_faces(self, shown: np.ndarray) -> None:
         """Show the painted faces selected by a mask (F,) and hide the others."""

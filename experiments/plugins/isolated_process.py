@@ -274,7 +274,14 @@ class IsolatedProcess:
         except TimeoutError:
             failure = TimedOutError(f"gave no answer within {limit_s:g} s")
         except (EOFError, OSError):
-            failure = ProcessFailedError(self._why_disconnected())
+            try:
+                code = self._process.wait(_END_LIMIT_S)
+                # signals without a name in Python: real-time signals
+                names = {-known.value: known.name for known in signal.Signals}
+                cause = f"exit code {code}" if code >= 0 else names.get(code, f"signal {-code}")
+                failure = ProcessFailedError(f"ended its process with {cause}")
+            except subprocess.TimeoutExpired:
+                failure = ProcessFailedError("closed the connection to its process")
         except Exception as error:
             failure = ProcessFailedError(f"sent an invalid answer: {one_line(str(error))}")
         except BaseException:  # Ctrl-C
@@ -282,16 +289,6 @@ class IsolatedProcess:
             raise
         self.end()
         raise failure
-
-    def _why_disconnected(self) -> str:
-        try:
-            code = self._process.wait(_END_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            return "closed the connection to its process"
-        if code >= 0:
-            return f"ended its process with exit code {code}"
-        names = {each.value: each.name for each in signal.Signals}  # not of all real-time signals
-        return f"ended its process with {names.get(-code, f'signal {-code}')}"
 
     def _memory_bytes(self) -> int:
         """Return the resident memory of the process, 0 if the system does not tell."""

@@ -3,7 +3,7 @@
 import math
 import platform
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,27 @@ def run_statistics(
     skipped: list[str] = []
     if output is not None:
         write_tables(output, summary.tables)
-        skipped += _draw_over_runs(summary, output / "figures")
+        # Each configuration with several runs has its figures, in a folder of its own if there are
+        # several configurations.
+        drawn = {
+            "-".join([labels.pop("scenario"), *(f"{key}={labels[key]}" for key in labels)]): medians
+            for labels, medians in configurations(summary.run_medians)
+            if labels["scenario"] != ALL_SCENARIOS
+        }
+        for name, medians in drawn.items():
+            runs, timings = medians["run_id"].unique(), summary.timings
+            if len(runs) < 2:
+                skipped.append(f"{name}: one run alone; `mapfusion report --figures` draws it")
+                continue
+            if len(timings):
+                timings = timings[timings["run_id"].isin(runs)]
+            folder = output / "figures"
+            if len(drawn) > 1:  # settings may contain any character, but file names may not
+                folder /= re.sub(r"[^\w.=-]", "_", name)[:120]
+            data = ResultTables(folder, {"errors": medians, "aligner_timings": timings})
+            for figure in _FIGURES:
+                lines = draw_figure(data, figure, folder).skipped
+                skipped += [f"{name}, {line}" for line in lines]
     if as_json:
         contents = {"n_runs": summary.n_runs, "n_configurations": summary.n_configurations}
         contents |= {"missing_tables": summary.missing, "failed_runs": summary.failed}
@@ -84,30 +104,6 @@ def run_statistics(
             "statistics", contents | {"written": output, "tables": summary.tables}, is_printed=True
         )
     return summary, skipped
-
-
-def _draw_over_runs(summary: Summary, folder: Path) -> Iterator[str]:
-    """Draw the figures over several runs of each scenario and setting; yield those not drawn.
-
-    The pictures of several configurations go to one folder each in `folder`.
-    """
-    drawn = {
-        "-".join([labels.pop("scenario"), *(f"{key}={labels[key]}" for key in labels)]): medians
-        for labels, medians in configurations(summary.run_medians)
-        if labels["scenario"] != ALL_SCENARIOS
-    }
-    for name, medians in drawn.items():
-        runs, timings = medians["run_id"].unique(), summary.timings
-        if len(runs) < 2:
-            yield f"{name}: one run alone; `mapfusion report --figures` draws it"
-            continue
-        if len(timings):
-            timings = timings[timings["run_id"].isin(runs)]
-        # Settings may hold anything; file names may not.
-        target = folder if len(drawn) == 1 else folder / re.sub(r"[^\w.=-]", "_", name)[:120]
-        data = ResultTables(target, {"errors": medians, "aligner_timings": timings})
-        for figure in _FIGURES:
-            yield from (f"{name}, {line}" for line in draw_figure(data, figure, target).skipped)
 
 
 SCHEMA_VERSION = 1

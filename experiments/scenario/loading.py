@@ -364,6 +364,16 @@ def _parts(name: str) -> Location:
     return tuple(int(part) if part.isdecimal() else part for part in name.split("."))
 
 
+# Types of values in the terms of JSON schemas.
+_TYPES: dict[type, str] = {
+    type(None): "null",
+    bool: "boolean",
+    int: "integer",
+    float: "number",
+    str: "string",
+    list: "array",
+    dict: "object",
+}
 _KINDS = {
     "boolean": "true or false",
     "integer": "an integer",
@@ -385,7 +395,9 @@ def _unfit(
     allowed = {option["type"] for option in options if "type" in option}
     if not allowed or not all("type" in option for option in options):
         return
-    if _kind_of(value) not in allowed | ({"integer"} if "number" in allowed else set()):
+    is_whole = isinstance(value, float) and value.is_integer()
+    kind = "integer" if is_whole else _TYPES[type(value)]
+    if kind not in allowed | ({"integer"} if "number" in allowed else set()):
         wanted = " or ".join(_KINDS[each] for each in _KINDS if each in allowed)
         shown = json.dumps(value) if isinstance(value, bool | None) else reprlib.repr(value)
         yield Problem(location, f"is {shown}, expected {wanted}")
@@ -405,17 +417,6 @@ def _unfit(
             each = option.get("prefixItems", [option.get("items", {})] * len(value))
             for i, (own, below) in enumerate(zip(each, value, strict=False)):
                 yield from _unfit(root, own, below, (*location, i))
-
-
-def _kind_of(value: Any) -> str:
-    """Return the type of a value in the terms of JSON schemas."""
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return "boolean"
-    if isinstance(value, int) or (isinstance(value, float) and value.is_integer()):
-        return "integer"
-    return {float: "number", str: "string", list: "array", dict: "object"}[type(value)]
 
 
 def _options(root: dict[str, Any], node: dict[str, Any]) -> Iterator[dict[str, Any]]:

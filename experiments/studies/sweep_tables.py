@@ -187,35 +187,35 @@ class JoinedTables:
         Raises:
             InputError: the folder holds something else, or a sweep over other settings.
         """
-        self.dataset, self._path = dataset, dataset.folder / "sweep.json"
-        self.run_ids = list(self._described().runs)
+        folder, keys = dataset.folder, dataset.keys
+        self.dataset, self._path = dataset, folder / "sweep.json"
+        self.run_ids = list[str]()
+        if self._path.exists():
+            try:
+                stored = _Description.model_validate(
+                    read_json(self._path, "description of a sweep")
+                )
+            except ValidationError as error:
+                raise InputError(f"{self._path}: damaged or no description of a sweep") from error
+            if stored.schema_version != SWEEP_SCHEMA_VERSION:
+                version = f"schema_version is {stored.schema_version}"
+                reads = f"this program adds to {SWEEP_SCHEMA_VERSION} alone"
+                raise InputError(f"{self._path}: {version}, {reads}; give it another --output")
+            if stored.settings != keys:
+                was, now = (", ".join(names) or "seeds alone" for names in (stored.settings, keys))
+                raise InputError(
+                    f"{folder}: is a sweep over {was}, this one is over {now}; "
+                    "tables of both would not fit together, give this one another --output"
+                )
+            self.run_ids += stored.runs
+        elif folder.exists() and any(folder.iterdir()):
+            what = "is no folder of a sweep (no sweep.json); give another --output"
+            raise InputError(f"{folder}: {what}")
         self._place = {run_id: place for place, run_id in enumerate(self.run_ids)}
         self._waiting = defaultdict[int, dict[str, Mapping[str, pa.Table]]](dict)  # by number, run
         self.waiting_bytes = 0
         self._made_from: dict[int, dict[str, int]] = {}  # hash of `_MADE_FROM` by number, run
         self._damaged: set[int] = set()
-
-    def _described(self) -> _Description:
-        folder, path, keys = self.dataset.folder, self._path, self.dataset.keys
-        if not path.exists():
-            if folder.exists() and any(folder.iterdir()):
-                what = "is no folder of a sweep (no sweep.json); give another --output"
-                raise InputError(f"{folder}: {what}")
-            return _Description(schema_version=SWEEP_SCHEMA_VERSION, settings=keys)
-        try:
-            found = _Description.model_validate(read_json(path, "description of a sweep"))
-        except ValidationError as error:
-            raise InputError(f"{path}: damaged or no description of a sweep") from error
-        if found.schema_version != SWEEP_SCHEMA_VERSION:
-            reads = f"this program adds to {SWEEP_SCHEMA_VERSION} alone; give it another --output"
-            raise InputError(f"{path}: schema_version is {found.schema_version}, {reads}")
-        if found.settings != keys:
-            was, now = (", ".join(names) or "seeds alone" for names in (found.settings, keys))
-            raise InputError(
-                f"{folder}: is a sweep over {was}, this one is over {now}; "
-                "tables of both would not fit together, give this one another --output"
-            )
-        return found
 
     def ask_for(self, runs: Sequence[SweepRun]) -> None:
         """Add runs to the folder, behind those that were asked for before."""

@@ -26,7 +26,6 @@ from mapfusion.plotting import (
     ACCEPTED_COLOUR,
     LEVEL_TEXT,
     ROBOT_COLOURS,
-    Part,
     Plan,
     bounds,
     plot_plans,
@@ -105,6 +104,23 @@ def _contents(
         for each in compared
         for other in each.other_motions
     ]
+    rows = []
+    for alignment in alignments:
+        refined = alignment.registered.refined
+        known = bool(np.isfinite(alignment.T_a_b).all())
+        sigma = sigma_text(refined.covariance, refined.lower_bound).removeprefix("sigma ")
+        row = {
+            "maps": f"{alignment.map_a.name}, {alignment.map_b.name}",
+            "aligner": alignment.aligner,
+            "accepted": alignment.accepted,
+            "verdict": str(alignment.status).replace("_", " "),
+            "motion": _kept_together(motion_text(alignment.T_a_b)) if known else "–",
+            "sigma": _kept_together(sigma) if known else "–",
+            "pairs": f"{np.count_nonzero(alignment.inlier)} of {len(alignment.inlier)}",
+            "chance": alignment.registered.verdict.log10_false_alarms,
+            "reason": alignment.reason,
+        }
+        rows.append(row)
     sources = {f"map {k}": str(path) for k, path in enumerate(paths, start=1)}
     return {
         "title": ", ".join(f"{each.name}: {len(each)} landmarks" for each in maps),
@@ -112,26 +128,10 @@ def _contents(
         "advice": text,
         "command": command,
         "charts": {"map": plans_figure(plans)},
-        "alignments": [_row(each) for each in alignments],
+        "alignments": rows,
         "lower_bound": any(each.registered.refined.lower_bound for each in alignments),
         "rivals": rivals,
         "provenance": {**sources, "seed": seed, "mapfusion": mapfusion.__version__},
-    }
-
-
-def _row(found: MapAlignment) -> dict[str, Any]:
-    refined, known = found.registered.refined, bool(np.isfinite(found.T_a_b).all())
-    sigma = sigma_text(refined.covariance, refined.lower_bound)
-    return {
-        "maps": f"{found.map_a.name}, {found.map_b.name}",
-        "aligner": found.aligner,
-        "accepted": found.accepted,
-        "verdict": str(found.status).replace("_", " "),
-        "motion": _kept_together(motion_text(found.T_a_b)) if known else "–",
-        "sigma": _kept_together(sigma.removeprefix("sigma ")) if known else "–",
-        "pairs": f"{np.count_nonzero(found.inlier)} of {len(found.inlier)}",
-        "chance": found.registered.verdict.log10_false_alarms,
-        "reason": found.reason,
     }
 
 
@@ -144,14 +144,14 @@ def plans_figure(plans: Sequence[Plan]) -> go.Figure:
     """Return a figure of Plotly with a menu that selects one of the plans."""
     traces, plan_of = list[Attributes](), list[int]()
     for k, plan in enumerate(plans):
-        own = [*_links(plan), *(trace for part in plan.parts for trace in _landmarks(part))]
-        traces += [trace | {"visible": k == 0} for trace in own]
-        plan_of += [k] * len(own)
+        plan_traces = _traces(plan)
+        traces += [trace | {"visible": k == 0} for trace in plan_traces]
+        plan_of += [k] * len(plan_traces)
     views = [bounds(plan) for plan in plans]
     choices = []
     for k, (plan, (low, high)) in enumerate(zip(plans, views, strict=True)):
         view = {"xaxis.range": [low[0], high[0]], "yaxis.range": [low[1], high[1]]}
-        shown = {"visible": [own == k for own in plan_of]}
+        shown = {"visible": [plan_number == k for plan_number in plan_of]}
         label = escaped(plan.title.replace("\n", " "))
         choices.append({"label": label, "method": "update", "args": [shown, view]})
     low, high = views[0]
@@ -168,8 +168,8 @@ def plans_figure(plans: Sequence[Plan]) -> go.Figure:
     )
 
 
-def _links(plan: Plan) -> list[Attributes]:
-    """Return the traces of the correspondences of a plan."""
+def _traces(plan: Plan) -> list[Attributes]:
+    """Return the traces of a plan: correspondences, then ellipses and points of each part."""
     kinds = (
         ("rejected", plan.rejected, {"color": NEUTRAL, "width": 0.8, "dash": "dot"}),
         ("supporting", plan.accepted, {"color": ACCEPTED_COLOUR, "width": 1.6}),
@@ -187,21 +187,18 @@ def _links(plan: Plan) -> list[Attributes]:
             ring = {"size": _RING_PX, "symbol": "circle-open", "color": ACCEPTED_COLOUR}
             look = {"type": "scatter", "mode": "markers", "marker": ring, "hoverinfo": "skip"}
             traces.append(look | about | {"showlegend": False} | _xy(ends.mean(axis=1)))
+    for part in plan.parts:
+        style = chart_style({"color": part.colour, "linestyle": "-", "marker": part.marker})
+        name, colour = escaped(part.name), style["hex"]
+        ellipses = {"type": "scatter", "mode": "lines", "fill": "toself", "hoverinfo": "skip"}
+        ellipses |= {"fillcolor": faint(colour, 0.25), "line": SMOOTH | {"color": colour}}
+        ellipses |= {"name": f"{LEVEL_TEXT} ellipses, {name}"}
+        points = {"type": "scatter", "mode": "markers", "name": name}
+        points |= {"marker": {"size": _POINT_PX, "color": colour, "symbol": style["marker"]}}
+        points["hovertemplate"] = f"{name}<br>%{{x:.3f}}, %{{y:.3f}}<extra></extra>"
+        outline = ellipse_polygons(part.position_m, part.covariance_m2)
+        traces += [ellipses | _xy(outline), points | _xy(part.position_m)]
     return traces
-
-
-def _landmarks(part: Part) -> list[Attributes]:
-    """Return the traces of the ellipses and of the points of a part of a plan."""
-    shown = chart_style({"color": part.colour, "linestyle": "-", "marker": part.marker})
-    name, colour = escaped(part.name), shown["hex"]
-    ellipses = {"type": "scatter", "mode": "lines", "fill": "toself", "hoverinfo": "skip"}
-    ellipses |= {"fillcolor": faint(colour, 0.25), "line": SMOOTH | {"color": colour}}
-    ellipses |= {"name": f"{LEVEL_TEXT} ellipses, {name}"}
-    points = {"type": "scatter", "mode": "markers", "name": name}
-    points |= {"marker": {"size": _POINT_PX, "color": colour, "symbol": shown["marker"]}}
-    points["hovertemplate"] = f"{name}<br>%{{x:.3f}}, %{{y:.3f}}<extra></extra>"
-    outline = ellipse_polygons(part.position_m, part.covariance_m2)
-    return [ellipses | _xy(outline), points | _xy(part.position_m)]
 
 
 def _xy(points: Float) -> Attributes:
