@@ -249,7 +249,8 @@ def signed_rank(changes: Float) -> float:
     if len(changes) < 2 or not np.any(changes):
         return np.nan
     clipped = np.clip(changes, -LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
-    return float(wilcoxon(clipped, zero_method="zsplit").pvalue)
+    found: Any = wilcoxon(clipped, zero_method="zsplit")
+    return float(found.pvalue)
 
 
 def holm(p_values: Float) -> Float:
