@@ -30,14 +30,9 @@ import numpy as np
 
 from mapfusion.align.alignment import Alignment, Pairs
 from mapfusion.align.mahalanobis_gate import DRIFT_FLOOR_M
-from mapfusion.align.rigid_motion import (
-    motion_covariance,
-    motion_jacobian,
-    residual_covariances,
-    residuals,
-)
+from mapfusion.align.rigid_motion import motion_covariance, residual_covariances, residuals
 from mapfusion.geometry.numerics import Float, chi_square_bound, kernel
-from mapfusion.geometry.se2 import rotation
+from mapfusion.geometry.se2 import motion_jacobian, rotation
 
 _TOLERANCE = 1e-9  # relative step of s_drift^2 that ends the search
 _MAX_STEPS = 100  # a dozen are the rule

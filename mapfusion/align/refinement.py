@@ -28,9 +28,16 @@ from mapfusion.align.mahalanobis_gate import (
     is_outlier_to_others,
     why_rests_on_one_pair,
 )
-from mapfusion.align.rigid_motion import fit_rigid, motion_jacobian, residual_covariances
+from mapfusion.align.rigid_motion import fit_rigid, residual_covariances
 from mapfusion.geometry.numerics import Float, invert, kernel, require_shape
-from mapfusion.geometry.se2 import add_turned, lever, residual, transform_points, wrap
+from mapfusion.geometry.se2 import (
+    add_turned,
+    lever,
+    motion_jacobian,
+    residual,
+    transform_points,
+    wrap,
+)
 from mapfusion.parameters import Range, require_in_range
 
 # A gate of three standard deviations contains 99 % of planar residuals. A larger s_drift could not

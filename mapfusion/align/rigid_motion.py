@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from mapfusion.geometry.numerics import Float, kernel, source_of
-from mapfusion.geometry.se2 import add_turned, lever, residual, rotation
+from mapfusion.geometry.se2 import add_turned, lever, residual
 
 _ALL = slice(None)  # index of all pairs, for kernels that run as NumPy functions
 
@@ -117,13 +117,3 @@ def motion_covariance(gain: Float, covariance_m2: Float) -> Float:
     terms = along_x[:, :, None] * x[:, None, :] + along_y[:, :, None] * y[:, None, :]
     total = np.cumsum(terms, axis=0)[-1]
     return np.tril(total) + np.tril(total, -1).T
-
-
-def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:
-    """Return d(T_a_b p_b) / d(tx, ty, theta) in the plane, shape (N, 2, 3)."""
-    turned = p_b[:, :2] @ rotation(T_a_b[2]).T
-    jacobian = np.zeros((len(p_b), 2, 3))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-    jacobian[:, 0, 2] = -turned[:, 1]
-    jacobian[:, 1, 2] = turned[:, 0]
-    return jacobian

@@ -38,7 +38,7 @@ from mapfusion.fastslam.particles import ParticleMaps, PathHistory
 from mapfusion.fastslam.proposal import Proposal, informed_disturbance, with_odometry_noise
 from mapfusion.fastslam.resampling import effective_sample_size, normalised, systematic_ancestors
 from mapfusion.geometry.numerics import Float, chi_square_bound, require_finite, require_shape
-from mapfusion.geometry.se2 import compose
+from mapfusion.geometry.se2 import IDENTITY, compose, motion_jacobian
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.parameters import Probability, Range, require_in_range
 from mapfusion.robot_log import FILTERED_STRAY_M, Observations
@@ -122,6 +122,36 @@ class StepResult:
     log_evidence: float
 
 
+@dataclass(frozen=True)
+class PriorMap:
+    """Map and path of T frames from which a filter goes on.
+
+    The errors of the map are drift, a small motion of the plane that depends on the frame that last
+    showed a landmark, plus an independent error of each landmark. A landmark that other robots
+    observed has a frame of theirs. Such frames are numbered by negative numbers.
+
+    Attributes:
+        landmarks: N landmarks with the covariances of their independent errors.
+        source: numbers that identify the landmarks, shape (N,).
+        last_frame: last frame that showed each landmark, shape (N,).
+        path: poses of the robot, shape (T, 3).
+        associations: source of the landmark of each observation so far, -1 for none, shape (n,).
+        frame_starts: index of the first observation of each frame, and n, shape (T + 1,).
+        knots: frames of the drift, ascending and before T - 1, shape (K,).
+        drift_covariance: covariance of the drift at the knots and in frame T - 1, shape
+            (3K + 3, 3K + 3).
+    """
+
+    landmarks: LandmarkMap
+    source: np.ndarray
+    last_frame: np.ndarray
+    path: Float
+    associations: np.ndarray
+    frame_starts: np.ndarray
+    knots: np.ndarray
+    drift_covariance: Float
+
+
 class FastSlam:
     """FastSLAM filter for a stream of frames.
 
@@ -153,7 +183,7 @@ class FastSlam:
         self._n_observations = 0
         self._slot_of_label: dict[int, int] = {}
         self._descriptor_kind: DescriptorKind | None = None
-        self._has_labels = False
+        self._has_labels = self._has_tracks = False
         self._history = PathHistory() if keep_history else None
         self._drift_model = DriftModel()
 
@@ -233,6 +263,7 @@ class FastSlam:
             if self._descriptor_kind is None:
                 self._descriptor_kind = observations.descriptor_kind
             self._has_labels |= observations.label is not None
+            self._has_tracks |= observations.track is not None
         maps.slots.last_frame[np.concatenate([changed, created])] = self._drift_model.frame
         pairs = np.stack([rows, created], axis=1)
         self._tracked.update(observations.track, chosen, pairs, maps.slots)
@@ -269,11 +300,47 @@ class FastSlam:
             self._best = int(np.searchsorted(ancestors, self._best))
         return result
 
-    def best_map(self, min_count: int = 3) -> LandmarkMap:
-        """Return the heaviest particle's landmarks seen at least `min_count` times, by age."""
+    def restart(self, prior: PriorMap) -> None:
+        """Replace maps and paths of all particles by one map and one path.
+
+        The filter must have processed the frames of the path, with the same observations.
+        """
+        n_particles = self.parameters.n_particles
+        landmarks, last = prior.landmarks, len(prior.path) - 1
+        self._maps = ParticleMaps(n_particles, self.parameters.gate)
+        slot_indices = self._maps.add_common(landmarks, prior.source, prior.last_frame)
+        self._drift_model = DriftModel.at_knots(last, prior.knots, prior.drift_covariance)
+        self._poses = np.tile(prior.path[-1], (n_particles, 1))
+        self._log_weights = np.full(n_particles, -np.log(n_particles))
+        self._tracked, self._best = ActiveTracks(), 0
+        if self._descriptor_kind is None:
+            self._descriptor_kind = landmarks.descriptor_kind
+        if landmarks.label is not None:
+            known = zip(landmarks.label.tolist(), slot_indices.tolist(), strict=True)
+            self._slot_of_label = {label: slot for label, slot in known if label != NO_LABEL}
+        if self._history is not None:
+            sources = np.split(prior.associations, prior.frame_starts[1:-1])
+            self._history = PathHistory.of_path(prior.path, sources, n_particles)
+
+    def best_map(self, min_count: int = 3, with_drift: bool = False) -> LandmarkMap:
+        """Return the heaviest particle's landmarks seen at least `min_count` times, by age.
+
+        Args:
+            min_count: smallest number of observations of a landmark.
+            with_drift: return marginal covariances of the landmarks. The filter's are conditional
+                on the path, and of the point that the landmark's present or next track shows.
+        """
         slot_indices, estimates = self._maps.landmarks_of(self._best, min_count)
         slots = self._maps.slots
         covariance = estimates.covariance_m2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        if with_drift and len(slot_indices):
+            drift = self._drift_model.covariances(slots.last_frame[slot_indices])
+            by_drift = motion_jacobian(IDENTITY, estimates.mean_m)
+            covariance[:, :2, :2] += by_drift @ drift @ np.swapaxes(by_drift, 1, 2)
+            if self._has_tracks:
+                is_tracked = np.isin(slot_indices, self._tracked.slots)
+                offset_m2 = np.where(is_tracked, 1.0, -1.0) * self._stray_m2 / 2
+                covariance[:, range(3), range(3)] += offset_m2[:, None]
         return LandmarkMap(
             position_m=estimates.mean_m,
             covariance_m2=covariance,

@@ -183,6 +183,11 @@ class ActiveTracks:
     def __init__(self) -> None:
         self._track = self._slot = self._source = np.empty(0, dtype=np.int64)
 
+    @property
+    def slots(self) -> np.ndarray:
+        """Slots (n,) of these tracks."""
+        return self._slot
+
     def slots_of_ended_tracks(self, track: np.ndarray | None, slots: Slots) -> np.ndarray:
         """Return the landmarks whose track is not continued in a frame.
 

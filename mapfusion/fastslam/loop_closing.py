@@ -54,6 +54,30 @@ class DriftModel:
         self._covariance = np.zeros((6, 6))  # of the first knot and the present frame
         self._pending = np.zeros(6)  # mean of the drift that has not yet been corrected
 
+    @classmethod
+    def at_knots(cls, frame: int, knots: np.ndarray, covariance: Float) -> "DriftModel":
+        """Return the model of a known drift.
+
+        Args:
+            frame: the present frame.
+            knots: (K,) frames of the knots, ascending, all before the present frame.
+            covariance: (3K + 3, 3K + 3) covariance of the drift at the knots and at present.
+        """
+        model = cls()
+        model.frame, model._knots, model._covariance = frame, knots, covariance
+        model._pending = np.zeros(len(covariance))
+        return model
+
+    def covariances(self, frame: np.ndarray) -> Float:
+        """Return the covariances (n, 3, 3) of the drift at frames (n,)."""
+        knot, share = self._between(frame)
+        weight = np.zeros((len(frame), len(self._knots) + 1))
+        each = np.arange(len(frame))
+        weight[each, knot], weight[each, knot + 1] = 1 - share, share
+        n = len(self._knots) + 1
+        blocks = self._covariance.reshape(n, 3, n, 3)
+        return np.einsum("nk,kilj,nl->nij", weight, blocks, weight, optimize=True)
+
     def add_frame(self, covariance: Float) -> None:
         """Add a frame, in which the drift grows with a covariance (3, 3)."""
         if self.frame - self._knots[-1] >= self._spacing:

@@ -8,6 +8,7 @@ landmarks in view.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from mapfusion.fastslam.measurement import NEW, MapObservations
 from mapfusion.fastslam.resampling import MEMORY, Genealogy
 from mapfusion.geometry.numerics import Float, kernel
 from mapfusion.geometry.se2 import compose
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import Observations
 
 _ALONG_AXES = np.array([0, 3, 5])  # of the upper entries of a covariance
@@ -147,10 +149,8 @@ class ParticleMaps:
         slots.generation[created] = self._genealogy.generation
         slots.source[created] = first_source + rows
         if observations.descriptor is not None:
-            length = observations.descriptor.shape[1]
-            if slots.descriptor.shape[1] != length:  # the first descriptors
-                descriptors = np.full((len(slots.label), length), np.nan, dtype=np.float32)
-                slots = self.slots = slots._replace(descriptor=descriptors)
+            self._describe(observations.descriptor.shape[1])
+            slots = self.slots
             slots.descriptor[created] = observations.descriptor[rows]
         if observations.label is not None:
             slots.label[created] = observations.label[rows]
@@ -163,6 +163,44 @@ class ParticleMaps:
         self.n_landmarks += np.count_nonzero(new, axis=0)
         self.update_boxes(created)
         return created, rows
+
+    def add_common(
+        self, landmarks: LandmarkMap, source: np.ndarray, last_frame: np.ndarray
+    ) -> np.ndarray:
+        """Add landmarks that all particles share.
+
+        Args:
+            landmarks: N landmarks.
+            source: (N,) numbers that identify the landmarks.
+            last_frame: (N,) last frame that showed each landmark.
+
+        Returns:
+            (N,) their slots.
+        """
+        n = len(landmarks)
+        slot_indices = self._used_slots.take(n)
+        self.slots = grow(self.slots, self._used_slots.n_ever, 0)
+        if landmarks.descriptor is not None:
+            self._describe(landmarks.descriptor.shape[1])
+            self.slots.descriptor[slot_indices] = landmarks.descriptor
+        slots = self.slots
+        slots.generation[slot_indices] = COMMON
+        slots.common.mean_m[slot_indices, 0] = landmarks.position_m
+        upper = landmarks.covariance_m2[:, *np.triu_indices(3)]
+        slots.common.covariance_m2[slot_indices, 0] = upper
+        slots.common.count[slot_indices, 0] = landmarks.count
+        slots.source[slot_indices], slots.last_frame[slot_indices] = source, last_frame
+        if landmarks.label is not None:
+            slots.label[slot_indices] = landmarks.label
+        self.n_landmarks += n
+        self.update_boxes(slot_indices)
+        return slot_indices
+
+    def _describe(self, length: int) -> None:
+        """Make room for descriptors of a length, if there is none yet."""
+        if self.slots.descriptor.shape[1] != length:
+            descriptor = np.full((len(self.slots.label), length), np.nan, dtype=np.float32)
+            self.slots = self.slots._replace(descriptor=descriptor)
 
     def resample(self, ancestors: np.ndarray) -> None:
         """Replace the particles by children of `ancestors` (M,), and update some rows.
@@ -324,6 +362,25 @@ class PathHistory:
         self._correction = np.empty((0, 3))  # correction of each step, for the first steps
         self._n_pruned = 0
         self._next_pruning = _PRUNING_INTERVAL
+
+    @classmethod
+    def of_path(
+        cls, T_map_robot: Float, sources: Sequence[np.ndarray], n_particles: int
+    ) -> "PathHistory":
+        """Return the history of particles that share their past.
+
+        Args:
+            T_map_robot: (steps, 3) their path.
+            sources: (K,) sources of the observations of each step.
+            n_particles: number of present particles.
+        """
+        history, n = cls(), len(T_map_robot)
+        history._poses = list(T_map_robot[:, None])
+        history._sources = [source[:, None].astype(np.int32) for source in sources]
+        history._ancestors = [np.zeros(1, dtype=np.int32) for _ in range(n - 1)]
+        history._ancestors.append(np.zeros(n_particles, dtype=np.int32))
+        history._n_pruned, history._next_pruning = n, n + _PRUNING_INTERVAL
+        return history
 
     def add(self, T_map_robot: Float, source: np.ndarray) -> None:
         """Add a step: poses (M, 3) before resampling, and sources (K, M) of the observations."""

@@ -21,12 +21,17 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from mapfusion.align.rigid_motion import motion_jacobian
 from mapfusion.camera import EXACT, N_OF_CAMERA, CalibrationError
 from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float, inverses
-from mapfusion.geometry.se2 import inverse, rotation_about_z, transform_points, wrap
+from mapfusion.geometry.se2 import (
+    inverse,
+    motion_jacobian,
+    rotation_about_z,
+    transform_points,
+    wrap,
+)
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.smoother.robust_loss import MOST_DOF, fit_dof, information_share, student_weights
 

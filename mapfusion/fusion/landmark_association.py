@@ -9,10 +9,9 @@ import numpy as np
 import scipy
 
 from mapfusion.align.correspondences import HeightGate
-from mapfusion.align.rigid_motion import motion_jacobian
 from mapfusion.descriptors import USURF, DescriptorKind, merged_kind, relative_distance
 from mapfusion.geometry.numerics import Float, chi_square_bound, with_rows
-from mapfusion.geometry.se2 import transform_covariances, transform_points
+from mapfusion.geometry.se2 import motion_jacobian, transform_covariances, transform_points
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.tables import NO_LABEL
 

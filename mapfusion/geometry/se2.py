@@ -99,6 +99,16 @@ def motion_sigma(covariance: Float) -> tuple[Float, Float]:
     return np.sqrt(m2), np.sqrt(covariance[..., 2, 2])
 
 
+def motion_jacobian(T_a_b: Float, p_b: Float) -> Float:
+    """Return d(T_a_b p_b) / d(tx, ty, theta) in the plane, shape (N, 2, 3)."""
+    turned = p_b[:, :2] @ rotation(T_a_b[2]).T
+    jacobian = np.zeros((len(p_b), 2, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+    jacobian[:, 0, 2] = -turned[:, 1]
+    jacobian[:, 1, 2] = turned[:, 0]
+    return jacobian
+
+
 @kernel
 def moved_point(T_a_b: Float, cos: float, sin: float, x: float, y: float) -> tuple[float, float]:
     """Return T p of the point (x, y); `cos` and `sin` are those of theta."""

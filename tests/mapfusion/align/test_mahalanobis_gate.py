@@ -21,13 +21,9 @@ from mapfusion.align.mahalanobis_gate import (
     spread_area_m2,
 )
 from mapfusion.align.refinement import Refinement
-from mapfusion.align.rigid_motion import (
-    fit_rigid,
-    fit_weighted,
-    motion_jacobian,
-    residual_covariances,
-)
+from mapfusion.align.rigid_motion import fit_rigid, fit_weighted, residual_covariances
 from mapfusion.geometry import se2
+from mapfusion.geometry.se2 import motion_jacobian
 from mapfusion.landmark_map import LandmarkMap
 from tests.mapfusion.align.map_pairs import blurred, error, given_pairs, stretched
 from tests.mapfusion.align.slow_twins import slow_squares

@@ -10,8 +10,9 @@ from mapfusion.align.alignment import Pairs, Status
 from mapfusion.align.covariance import drift_step
 from mapfusion.align.mahalanobis_gate import PlanarPairs
 from mapfusion.align.refinement import Refinement, maximise_likelihood
-from mapfusion.align.rigid_motion import motion_jacobian, residual_covariances, residuals
+from mapfusion.align.rigid_motion import residual_covariances, residuals
 from mapfusion.geometry import se2
+from mapfusion.geometry.se2 import motion_jacobian
 from tests.mapfusion.align.map_pairs import error, given_pairs, stretched
 
 

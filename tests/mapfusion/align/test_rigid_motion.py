@@ -8,11 +8,11 @@ from mapfusion.align.rigid_motion import (
     fit_weighted,
     least_squares_gain,
     motion_covariance,
-    motion_jacobian,
     residual_covariances,
     residuals,
 )
 from mapfusion.geometry import se2
+from mapfusion.geometry.se2 import motion_jacobian
 from tests.mapfusion.align.map_pairs import covariances, error, motion
 
 

@@ -24,9 +24,9 @@ from mapfusion.align.rigid_motion import (
     fit_rigid,
     least_squares_gain,
     motion_covariance,
-    motion_jacobian,
     residual_covariances,
 )
+from mapfusion.geometry.se2 import motion_jacobian
 from mapfusion.verification.false_alarms import Acceptance, Verdict
 from mapfusion.verification.registration import (
     PairRegistration,

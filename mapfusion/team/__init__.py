@@ -1,0 +1,1 @@
+"""Robots that exchange their maps while they drive."""

@@ -1,0 +1,331 @@
+"""Robot of a team: filters its log, exchanges maps and goes on in the joint map.
+
+A robot sends the smoothed map of its own log. So no information reaches a robot twice, whatever
+is exchanged how often. At each exchange the robot aligns all maps that it has, verifies the
+alignments, and fuses the maps that the accepted alignments connect with its own. Its filter then
+goes on in the fused map (`adoption`).
+
+An alignment is on trial until it is accepted at a second exchange, when the robots have seen more.
+A map is dropped when its alignment is not accepted at two exchanges in succession.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from mapfusion.align.alignment import Alignment
+from mapfusion.align.correspondences import Correspondences, MatchParameters, match
+from mapfusion.attitude import Attitude
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.mapping import Frame, run_log
+from mapfusion.fusion.fusers import AlignedPair, FusedMap, Fuser, MergeParameters, name_order
+from mapfusion.fusion.landmark_association import ABSENT
+from mapfusion.fusion.merge import merge
+from mapfusion.geometry.numerics import Float, generator
+from mapfusion.geometry.se2 import rms_distance_m
+from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import RobotLog, first_frames
+from mapfusion.smoother.smooth import Smoothed, SmootherParameters, smooth, smoothed_map
+from mapfusion.team.adoption import ADOPTED, TimedMap, prior_of
+from mapfusion.team.map_message import CompactMap, MapMessage
+from mapfusion.verification.registration import Registration
+from mapfusion.verification.rivals import DISTINCT_M
+
+
+class Event(NamedTuple):
+    """Change of what a robot has adopted.
+
+    Attributes:
+        iteration: number of the frame.
+        robot: name of the robot.
+        other: name of the robot whose map it is.
+        kind: `on trial`, `adopted`, `kept` (not accepted this time) or `dropped`.
+        T_robot_other: pose of the other map in that of the robot, shape (3,); NaN if unknown.
+        covariance: covariance of this pose, shape (3, 3).
+        reason: reason of the verdict; empty if there is none.
+    """
+
+    iteration: int
+    robot: str
+    other: str
+    kind: str
+    T_robot_other: Float
+    covariance: Float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Merging:
+    """Methods by which the robots of a team merge their maps.
+
+    Attributes:
+        registration: aligner, refinement and verdict.
+        matching: parameters of the matching.
+        fuser: fuses smoothed maps.
+        parameters: parameters of the fusion.
+    """
+
+    registration: Registration
+    fuser: Fuser
+    matching: MatchParameters = field(default_factory=MatchParameters)
+    parameters: MergeParameters = field(default_factory=MergeParameters)
+
+
+@dataclass(frozen=True)
+class RobotInput:
+    """Log of a robot with the settings of its filter and smoother.
+
+    Attributes:
+        log: the log, without errors that a check of logs corrects.
+        filter: settings of the filter.
+        smoother: settings of the smoother.
+        min_count: number of observations that a landmark of the map needs.
+        odometry_covariance: covariance of visual odometry, shape (T, 3, 3); None for wheels.
+        attitude: attitude that levelled the observations; None for a level robot.
+    """
+
+    log: RobotLog
+    filter: FastSlamParameters
+    smoother: SmootherParameters
+    min_count: int = 3
+    odometry_covariance: Float | None = None
+    attitude: Attitude | None = None
+
+
+class _Aligned(NamedTuple):
+    """Verified alignment of two maps, with the numbers of these maps.
+
+    `is_confirmed` is true if an alignment of earlier maps was accepted, too, and agrees.
+    """
+
+    versions: tuple[int, int]
+    alignment: Alignment
+    correspondences: Correspondences
+    log10_false_alarms: float
+    is_confirmed: bool
+
+
+class Origin(NamedTuple):
+    """Observation that created a landmark.
+
+    Attributes:
+        robot: name of the robot.
+        row: row of its log.
+    """
+
+    robot: str
+    row: int
+
+
+class TeamRobot:
+    """Robot of a team.
+
+    Args:
+        given: its log and settings.
+        merging: methods of the team.
+        seed: seed of the filter and the aligner; an independent robot of this seed has the same
+            random numbers.
+    """
+
+    def __init__(self, given: RobotInput, merging: Merging, seed: int) -> None:
+        self.given, self.name = given, given.log.robot
+        self._merging, self._seed = merging, seed
+        rng = generator(seed, "slam", self.name)
+        covariance = given.odometry_covariance
+        self._frames: Iterator[Frame] = run_log(
+            given.log, given.filter, rng, (), given.min_count, covariance, given.attitude
+        )
+        self.frame: Frame | None = None
+        self.own: TimedMap | None = None
+        self.fused: FusedMap | None = None
+        self.adopted: tuple[str, ...] = ()
+        self.origins: dict[int, Origin] = {}
+        self._version = 0
+        self._smoothed: Smoothed | None = None
+        self._compact: CompactMap | None = None
+        self._received: dict[str, tuple[int, CompactMap]] = {}
+        self._timed: dict[str, tuple[int, TimedMap]] = {}
+        self._acknowledged: dict[str, tuple[int, CompactMap]] = {}
+        self._sent: dict[str, dict[int, CompactMap]] = {}
+        self._aligned: dict[tuple[str, str], _Aligned] = {}
+        self._missed: set[str] = set()
+
+    @property
+    def iteration(self) -> int:
+        """Number of the last frame; -1 before the first."""
+        return -1 if self.frame is None else self.frame.iteration
+
+    @property
+    def filter(self) -> FastSlam:
+        """The filter after the last frame."""
+        assert self.frame is not None
+        return self.frame.slam
+
+    @property
+    def has_ended(self) -> bool:
+        """True if the log has no more frames."""
+        return self.iteration == len(self.given.log) - 1
+
+    def step(self) -> Frame:
+        """Filter the next frame of the log."""
+        self.frame = next(self._frames)
+        return self.frame
+
+    def smooth(self) -> None:
+        """Smooth the log so far; without a solution the robot keeps the map that it has."""
+        given = self.given
+        log = first_frames(given.log, self.iteration + 1)
+        landmark = _as_rows(self.filter.best_associations())
+        try:
+            smoothed = smooth(log, landmark, self.filter.best_path(), given.smoother)
+            landmarks = smoothed_map(log, smoothed, attitude=given.attitude)
+        except np.linalg.LinAlgError:
+            return
+        if not len(landmarks):
+            return
+        self._smoothed, self._version = smoothed, self._version + 1
+        self.own = TimedMap.of(log, smoothed, landmarks)
+        self._compact = CompactMap.of(self.own)
+
+    def message_to(self, receiver: str) -> MapMessage | None:
+        """Return a message with what the receiver lacks; None without a map."""
+        if self._compact is None:
+            return None
+        version, known = self._acknowledged.get(receiver, (0, None))
+        message = MapMessage.between(known, self._compact, (version, self._version))
+        self._sent.setdefault(receiver, {})[self._version] = message.applied_to(known)
+        return message.with_receipts({name: n for name, (n, _) in self._received.items()})
+
+    def receive(self, sender: str, message: MapMessage) -> None:
+        """Take a message; one that builds on a map which the robot lacks is ignored."""
+        receipt = message.received.get(self.name, 0)
+        sent = self._sent.get(sender, {})
+        if receipt in sent:
+            self._acknowledged[sender] = receipt, sent[receipt]
+            self._sent[sender] = {n: each for n, each in sent.items() if n > receipt}
+        version, known = self._received.get(sender, (0, None))
+        if message.version <= version or message.base > version:
+            return
+        base = known if message.base else None
+        self._received[sender] = message.version, message.applied_to(base)
+
+    def merge(self) -> list[Event]:
+        """Align and fuse the maps that the robot has; go on in the fused map."""
+        if self.own is None:
+            return []
+        names = [self.name, *sorted(self._received, key=name_order)]
+        maps = [self.own, *(self._timed_map(name) for name in names[1:])]
+        versions = [self._version, *(self._received[name][0] for name in names[1:])]
+        pairs = []
+        for a, b in itertools.combinations(range(len(maps)), 2):
+            both, of_both = (names[a], names[b]), (versions[a], versions[b])
+            if both not in self._aligned or self._aligned[both].versions != of_both:
+                given = maps[a].landmarks, maps[b].landmarks
+                self._aligned[both] = self._align(both, given, of_both)
+            known = self._aligned[both]
+            if known.alignment.ok and known.is_confirmed:
+                rest = known.alignment, known.correspondences, known.log10_false_alarms
+                pairs.append(AlignedPair(a, b, *rest))
+        component = None
+        if any(pair.a == 0 for pair in pairs):
+            landmarks = [each.landmarks for each in maps]
+            merging = self._merging
+            fusion = merge(landmarks, pairs, merging.parameters, merging.fuser)
+            component = next((each for each in fusion.fused if each.members[0] == 0), None)
+        members = (0,) if component is None else tuple(component.members.tolist())
+        found = {names[k] for k in members[1:]}
+        missing = set(self.adopted) - found
+        events = self._events(found, missing)
+        if missing - self._missed:  # the filter stays in the map that it has
+            self._missed |= missing
+            return events
+        self._missed = set()
+        if not found and not missing:
+            return events
+        if component is None:
+            component = _alone(self.own.landmarks)
+        self._adopt(component, names, maps)
+        self.adopted = tuple(sorted(found, key=name_order))
+        return events
+
+    def _timed_map(self, name: str) -> TimedMap:
+        """Return the last map from another robot."""
+        version, compact = self._received[name]
+        if name not in self._timed or self._timed[name][0] != version:
+            self._timed[name] = version, compact.timed()
+        return self._timed[name][1]
+
+    def _align(
+        self,
+        names: tuple[str, str],
+        maps: tuple[LandmarkMap, LandmarkMap],
+        versions: tuple[int, int],
+    ) -> _Aligned:
+        """Align two maps and verify the alignment."""
+        merging, before = self._merging, self._aligned.get(names)
+        pairs = match(*maps, merging.matching)
+        rng = generator(self._seed, "team", self.name, *names, self.iteration)
+        registered = merging.registration.register(*maps, pairs, rng)
+        alignment = registered.applied
+        agrees = False
+        if before is not None and before.alignment.ok and alignment.ok:
+            p_b = maps[1].position_m[:, :2]
+            distance_m = rms_distance_m(alignment.T_a_b, before.alignment.T_a_b, p_b)
+            agrees = distance_m < DISTINCT_M
+        log10 = registered.verdict.log10_false_alarms
+        return _Aligned(versions, alignment, pairs, log10, agrees)
+
+    def _events(self, found: set[str], missing: set[str]) -> list[Event]:
+        """Return what changes at this exchange."""
+        kinds = dict.fromkeys(found - set(self.adopted), "adopted")
+        kinds |= {name: "dropped" if name in self._missed else "kept" for name in missing}
+        for a, b in self._aligned:
+            known = self._aligned[a, b]
+            is_new = b not in kinds and b not in self.adopted
+            if a == self.name and is_new and known.alignment.ok and not known.is_confirmed:
+                kinds[b] = "on trial"
+        events = []
+        for name in sorted(kinds, key=name_order):
+            alignment = self._aligned[self.name, name].alignment
+            motion = alignment.T_a_b, alignment.covariance
+            made = self.iteration, self.name, name, kinds[name], *motion, alignment.reason
+            events.append(Event(*made))
+        return events
+
+    def _adopt(self, fused: FusedMap, names: Sequence[str], maps: Sequence[TimedMap]) -> None:
+        """Go on in a fused map."""
+        assert self._smoothed is not None
+        given, log = self.given, first_frames(self.given.log, self.iteration + 1)
+        offset_m2 = 0.0 if log.observations.track is None else given.filter.stray_m**2
+        prior = prior_of(fused, maps, self._smoothed, log, offset_m2)
+        self.filter.restart(prior)
+        self.fused, self.origins = fused, {}
+        for row, source in enumerate(prior.source.tolist()):
+            if source >= ADOPTED:
+                k = int(np.flatnonzero(fused.parents[row] != ABSENT)[0])
+                parent = fused.parents[row, k]
+                own_row = int(maps[k].landmarks.source_observation[parent])
+                self.origins[source] = Origin(names[k], own_row)
+
+
+def _as_rows(source: np.ndarray) -> np.ndarray:
+    """Return sources (N,) of landmarks, those of adopted ones replaced by own observations.
+
+    A landmark is named by the row of the first observation of it in the robot's own log.
+    """
+    rows = np.flatnonzero(source >= ADOPTED)
+    names, first, inverse = np.unique(source[rows], return_index=True, return_inverse=True)
+    renamed = source.copy()
+    if len(names):
+        renamed[rows] = rows[first][inverse]
+    return renamed
+
+
+def _alone(landmarks: LandmarkMap) -> FusedMap:
+    """Return a robot's own map as if it were fused."""
+    parents = np.arange(len(landmarks))[:, None]
+    zeros = np.zeros((1, 3)), np.zeros((1, 3, 3)), np.zeros(1)
+    return FusedMap(landmarks, parents, *zeros, 0.0, ())
