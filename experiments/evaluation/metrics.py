@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.evaluation import alignment_criteria, tables
+from experiments.evaluation.adoption import false_adoptions
 from experiments.evaluation.alignment_criteria import (
     ORACLE,
     NothingMerged,
@@ -46,7 +47,7 @@ from mapfusion.errors import InputError
 # The four methods of the paper, algorithm 1 in both readings, as the default list names them.
 PAPER_ALIGNERS = ("ransac", "svd", "svd-solved", "icp", "impicp")
 USED_TABLES = ("robots", "errors", "fusion", "map_fits", "fused_motions", "team", "team_pairs")
-USED_TABLES += ("smoother", "fusers", "sightings", "smoothed_errors")
+USED_TABLES += ("smoother", "fusers", "sightings", "smoothed_errors", "adoptions", "team_members")
 MERGED_ROBOTS = "team.merged_robots"
 WITHOUT_TRUTH = (MERGED_ROBOTS,)  # metrics that need no truth
 
@@ -175,6 +176,50 @@ def fused_landmark_rmse_m(tables: Tables) -> float:
 def _merged_robots(tables: Tables, variant: str) -> float:
     """Return the number of robots whose maps were merged, median over seeds."""
     return tables["fused_motions"].groupby("seed")[variant].agg(merged_robots).median()
+
+
+def _adopting(tables: Tables) -> pd.DataFrame:
+    """Return the last row of `team_members` of each robot that adopted a map."""
+    rows = tables["team_members"].sort_values("iteration").groupby(["seed", "robot"]).tail(1)
+    adopted = tables["adoptions"].query("event == 'adopted'")[["seed", "robot"]].drop_duplicates()
+    return rows.merge(adopted, on=["seed", "robot"])
+
+
+@metric(**{"adoption.robots": "size", "adoption.first_iteration": "min"})
+def _adoptions(tables: Tables, variant: str) -> float:
+    """Return the number of robots that adopted maps or the first iteration, median over seeds."""
+    if tables["team_members"].empty:
+        return np.nan
+    adopted = tables["adoptions"].query("event == 'adopted'")
+    if variant == "size":
+        n_robots = adopted.groupby("seed")["robot"].nunique()
+        return n_robots.reindex(tables["team_members"]["seed"].unique(), fill_value=0).median()
+    return adopted.groupby("seed")["iteration"].min().median()
+
+
+@metric(**{"adoption.false_adoptions": "all"})
+def _false_adoptions(tables: Tables, variant: str) -> float:
+    """Return the number of wrong maps that robots adopted and did not drop, over all seeds."""
+    if tables["team_members"].empty:
+        return np.nan
+    runs = tables["adoptions"].groupby("seed")
+    return float(sum(false_adoptions(rows) for _, rows in runs))
+
+
+@metric(**{"adoption.path_over_alone": "median", "adoption.path_over_alone_worst": "max"})
+def _path_over_alone(tables: Tables, variant: str) -> float:
+    """Return the path error since the merge over the independent robot's, over robots and seeds."""
+    rows = _adopting(tables)
+    return (rows["merged_path_rmse_m"] / rows["alone_merged_path_rmse_m"]).agg(variant)
+
+
+_ADOPTED = ("landmark_rmse_m", "nees_per_dof", "coverage_95", "shared_share", "sent_kb")
+
+
+@metric(**{f"adoption.{name}": name for name in _ADOPTED})
+def _adopted_column(tables: Tables, variant: str) -> float:
+    """Return a column of the last rows of `team_members`, median over adopting robots and seeds."""
+    return _adopting(tables)[variant].median()
 
 
 @metric(**{"team.ate_rmse_m": "rmse"})

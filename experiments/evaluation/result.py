@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.evaluation import fused_landmarks, tables
+from experiments.evaluation import adoption, fused_landmarks, tables
+from experiments.evaluation.adoption import TeamMember
 from experiments.evaluation.evaluated_run import TABLES_PART, EvaluatedRun, finding_rows
 from experiments.evaluation.fused_landmarks import (
     FusedTeam,
@@ -40,7 +41,7 @@ from experiments.evaluation.path_errors import (
     team_rows,
 )
 from experiments.evaluation.tables import RESULT_SCHEMA_VERSION, require_tables
-from experiments.evaluation.truth import EvaluatedRobot
+from experiments.evaluation.truth import EvaluatedRobot, truth_or_unknown
 from experiments.pipeline.stage import library_versions
 from experiments.pipeline.stages import slam
 from experiments.pipeline.stages.fuse import fused_map_files
@@ -166,6 +167,23 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
     def landmark_nees() -> list[dict[str, Any]]:
         return fused_landmarks.landmark_nees_rows(team, settings.true_pair_radius_m)
 
+    @cache
+    def members() -> list[TeamMember]:
+        stages = run.pipeline.robots if run.pipeline.team is not None else ()
+        return [
+            TeamMember(
+                each.name,
+                truth_or_unknown(run.store.path(each.log), run.logs[each.name]),
+                run.store.path(each.slam),
+                read_smoothed_path(run.store.path(each.smooth)),
+            )
+            for each in stages
+        ]
+
+    def of_team(rows: Callable[[Path, Sequence[TeamMember]], Any]) -> TableMaker:
+        stage = run.pipeline.team
+        return list if stage is None else lambda: rows(run.store.path(stage), members())
+
     of_pairs = ("errors", *ALIGNED, "fusion", "smoothed_errors", "smoothed_estimates")
     makers: dict[str, TableMaker] = {name: partial(run.pair_table, name) for name in of_pairs}
     makers |= {
@@ -178,6 +196,9 @@ def table_makers(run: EvaluatedRun, team: FusedTeam) -> dict[str, TableMaker]:
         "fused": lambda: fused_landmarks.fused_rows(team),
         "fused_motions": lambda: fused_landmarks.fused_motion_rows(team),
         "fused_map": fused_map,
+        "adoptions": of_team(adoption.event_rows),
+        "team_members": of_team(adoption.member_rows),
+        "messages": of_team(adoption.message_rows),
     }
     with_truth: dict[str, TableMaker] = {
         "fusers": lambda: [fusion.row() for fusion in fusions()],

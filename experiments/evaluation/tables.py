@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 # Columns that are not floats.
 _NAMES = {
     tables.TEXT: """acceptance_reason aligner check delta_unit fallback finding fuser landmarks
-        left_out map name not_smoothed place quantity reason refined_reason refined_status robot
-        robot_a robot_b source stage status verdict""",
+        event left_out map name not_smoothed other place quantity reason receiver refined_reason
+        refined_status robot robot_a robot_b sender source stage status verdict""",
     tables.INT: """component count degrees_of_freedom frame iteration landmark landmark_a landmark_b
-        n n_common n_confirmed n_contradicted n_correspondences n_inliers n_landmarks n_parents
+        n n_adopted n_bytes n_common n_confirmed n_contradicted n_correspondences n_inliers n_landmarks n_parents
         n_new n_observed n_returned n_robots n_steps n_team n_tracked n_true particle repetition""",
-    tables.BOOL: "accepted lower_bound resampled true_pair",
+    tables.BOOL: "accepted lost lower_bound resampled true_pair",
 }
 # Columns of a floor plan, for figures: single precision takes half the space.
 _PLAN = ("x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
@@ -143,6 +143,22 @@ _COLUMNS = {
     # source: as in `path_statistics`; a fuser of smoothed maps moves smoothed paths. n: number of
     # poses.
     "team": "component source n_robots n_team n rmse mean median std min max sse",
+    # What robots that exchange maps while they drive (`team` in the scenario) adopt. event: on trial
+    # (accepted once), adopted, kept (adopted, but not accepted at this exchange) or dropped. The
+    # motion is the pose of the other robot's map in that of the robot.
+    "adoptions": """robot iteration other event tx_m ty_m theta_rad
+        cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt translation_error_m rotation_error_rad reason""",
+    # One row per (robot, iteration) of these robots. alone_: filter of the independent robot.
+    # merged_: poses since the first adoption. landmark_rmse_m to coverage_95: landmarks that another
+    # robot observed first, in the frame of the robot's map, without gross ones, which are counted.
+    # shared_share: share of the observations since then that were assigned to landmarks that other
+    # robots mapped, too.
+    "team_members": """robot iteration path_rmse_m alone_path_rmse_m merged_path_rmse_m
+        alone_merged_path_rmse_m smoothed_path_rmse_m n_landmarks n_adopted landmark_rmse_m
+        gross_share nees_per_dof coverage_95 shared_share sent_kb""",
+    # Messages of these robots. n_landmarks: landmarks in the message; n_new: those that the
+    # receiver does not have. arrives_s: infinite for lost messages.
+    "messages": "iteration sender receiver n_bytes n_landmarks n_new arrives_s lost",
     # Motion of each robot's last map into the fused map. left_out: reason why a map is not in the
     # fused map (the motion is NaN), else empty. drift_sigma_m: standard deviation that was added to
     # the landmarks in x and y.
@@ -315,7 +331,7 @@ MEANING = {
     "n_robots": "robots in the fused map",
     "n_team": "robots of the run",
     # Smoother and findings
-    "path_rmse_m": "RMS position error of the smoothed path, without a fit",
+    "path_rmse_m": "RMS position error without a fit, of the smoothed path; team_members: filter's",
     "filter_path_rmse_m": "RMS position error of the filter's path",
     "filter_over_smoother": "ratio of the two",
     "filter_landmark_rmse_m": "RMS landmark error of the filter's map, after a rigid fit",
@@ -327,6 +343,21 @@ MEANING = {
     "not_smoothed": "why the log could not be smoothed, and which map stands in; else empty",
     "check": "what was checked: odometry, truth, jump, gate or direction",
     "finding": "what was found, in words",
+    # Robots that exchange maps
+    "other": "robot whose map it is",
+    "event": "on trial, adopted, kept or dropped",
+    "alone_path_rmse_m": "RMS position error of the independent robot's path",
+    "merged_path_rmse_m": "RMS position error of the poses since the first adoption",
+    "alone_merged_path_rmse_m": "the same of the independent robot",
+    "smoothed_path_rmse_m": "RMS position error of the smoothed path of the robot's own log",
+    "n_adopted": "landmarks that another robot observed first",
+    "shared_share": "share of observations of landmarks that other robots mapped, since adoption",
+    "sent_kb": "kilobytes that the robot has sent",
+    "sender": "robot that sends",
+    "receiver": "robot that receives",
+    "n_bytes": "size of the message",
+    "arrives_s": "time of arrival; infinite if lost",
+    "lost": "whether the message is lost",
     # Landmarks and fused maps
     "x_m": "position along x",
     "y_m": "position along y",

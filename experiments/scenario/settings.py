@@ -39,6 +39,7 @@ from mapfusion.fusion.fusers import USUAL, MergeParameters
 from mapfusion.parameters import Range
 from mapfusion.robot_log import TRUTH_TABLES
 from mapfusion.tables import table_path
+from mapfusion.team.link import LinkParameters
 from mapfusion.verification.false_alarms import Acceptance
 from mapfusion.verification.regions import EvidenceParameters
 from mapfusion.verification.verdict import Verifier
@@ -71,6 +72,20 @@ RUN_METRICS += (
     "team.rotation_rad",
     "team.edge_precision",
     "team.edge_recall",
+)
+# Metrics of robots that exchange maps while they drive.
+RUN_METRICS += tuple(
+    f"adoption.{name}"
+    for name in (
+        *(
+            "robots",
+            "first_iteration",
+            "false_adoptions",
+            "path_over_alone",
+            "path_over_alone_worst",
+        ),
+        *("landmark_rmse_m", "nees_per_dof", "coverage_95", "shared_share", "sent_kb"),
+    )
 )
 # Metrics of each fuser, after its name: columns of the table `fusers`.
 FUSER_METRICS = ("landmark_rmse_m", "gross_share", "fitted_rmse_m", "fitted_median_m")
@@ -230,6 +245,16 @@ class Evaluate(Section):
     timing_repeats: Annotated[int, Range(1, 1000, "repetitions")] = 5
 
 
+class Team(Section):
+    """Robots that exchange maps while they drive.
+
+    Attributes:
+        link: link between the robots.
+    """
+
+    link: LinkParameters = LinkParameters()
+
+
 class Bound(Section):
     """Range of a metric, including both ends.
 
@@ -334,6 +359,8 @@ class Scenario(Section):
         merge: fused map.
         fuse: fusers and their frames.
         evaluate: evaluation of aligners.
+        team: exchange of maps while the robots drive; the robots that merge go on in the joint map.
+            None: the robots stay alone.
         keep: data that is stored for figures.
         expect: bounds of metrics, which `mapfusion check` tests.
     """
@@ -349,6 +376,7 @@ class Scenario(Section):
     merge: Merge = Merge()
     fuse: Fuse = Fuse()
     evaluate: Evaluate = Evaluate()
+    team: Team | None = None
     keep: Keep = Keep()
     expect: dict[str, Bound] = Field(default_factory=dict)
 

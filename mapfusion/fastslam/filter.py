@@ -370,6 +370,14 @@ class FastSlam:
         """
         return self._kept_history().associations(self._best)
 
+    def last_associations(self) -> np.ndarray:
+        """Return `best_associations` of the observations of the last step, shape (K,).
+
+        Raises:
+            ValueError: `keep_history` is False.
+        """
+        return self._kept_history().last_associations(self._best)
+
     def _propose(
         self, odometry: Float, sigma: Float, observations: Observations, noise: Float
     ) -> tuple[Float, Float]:

@@ -433,6 +433,10 @@ class PathHistory:
         ]
         return np.concatenate([np.empty(0, dtype=np.int64), *ancestor_sources])
 
+    def last_associations(self, particle: int) -> np.ndarray:
+        """Return the source (K,) of each landmark in the last step, -1 for dropped observations."""
+        return self._sources[-1][:, self._ancestors[-1][particle]]
+
     @property
     def n_kept(self) -> int:
         """Number of stored particles, summed over all steps."""

@@ -11,7 +11,7 @@ A map is dropped when its alignment is not accepted at two exchanges in successi
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -143,6 +143,7 @@ class TeamRobot:
         self.fused: FusedMap | None = None
         self.adopted: tuple[str, ...] = ()
         self.origins: dict[int, Origin] = {}
+        self._shared = frozenset[int]()
         self._version = 0
         self._smoothed: Smoothed | None = None
         self._compact: CompactMap | None = None
@@ -169,6 +170,11 @@ class TeamRobot:
         """True if the log has no more frames."""
         return self.iteration == len(self.given.log) - 1
 
+    def n_shared_now(self) -> int:
+        """Return the number of observations in the last frame of landmarks that others mapped."""
+        sources = self.filter.last_associations()
+        return sum(source in self._shared for source in sources.tolist())
+
     def step(self) -> Frame:
         """Filter the next frame of the log."""
         self.frame = next(self._frames)
@@ -178,6 +184,9 @@ class TeamRobot:
         """Smooth the log so far; without a solution the robot keeps the map that it has."""
         given = self.given
         log = first_frames(given.log, self.iteration + 1)
+        if floor_m := given.filter.noise_floor_m:
+            wider_m2 = log.observations.covariance_m2 + floor_m**2 * np.eye(3)
+            log = replace(log, observations=replace(log.observations, covariance_m2=wider_m2))
         landmark = _as_rows(self.filter.best_associations())
         try:
             smoothed = smooth(log, landmark, self.filter.best_path(), given.smoother)
@@ -303,6 +312,8 @@ class TeamRobot:
         prior = prior_of(fused, maps, self._smoothed, log, offset_m2)
         self.filter.restart(prior)
         self.fused, self.origins = fused, {}
+        with_others = np.any(fused.parents[:, 1:] != ABSENT, axis=1)
+        self._shared = frozenset(prior.source[with_others].tolist())
         for row, source in enumerate(prior.source.tolist()):
             if source >= ADOPTED:
                 k = int(np.flatnonzero(fused.parents[row] != ABSENT)[0])

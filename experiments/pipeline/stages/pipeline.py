@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.pipeline.stage import RecordedLog, Stage, StageKind, in_dependency_order
-from experiments.pipeline.stages import align, drive, features, fuse, log, slam, smooth
+from experiments.pipeline.stages import align, drive, features, fuse, log, slam, smooth, team
 from experiments.pipeline.stages.drive import Walls
 from experiments.plugins.discovery import code_of_fuser, find_method, fingerprint
 from experiments.scenario.settings import (
@@ -109,6 +109,7 @@ class Pipeline:
     robots: tuple[RobotStages, ...]
     pairs: tuple[PairStages, ...]
     fusers: Mapping[str, Stage]  # by name; empty for a single robot
+    team: Stage | None  # robots that exchange maps while they drive
 
     @property
     def simulated(self) -> list[SimulatedRobotStages]:
@@ -128,7 +129,8 @@ class Pipeline:
         maps = [robot.smooth for robot in self.robots]
         both = ((pair.smoothed, pair.filtered) for pair in self.pairs)
         estimates = (each.estimates for pair in both for each in pair)
-        in_order = [*images, *logs, *filters, *maps, *self.fusers.values(), *estimates]
+        teams = [] if self.team is None else [self.team]
+        in_order = [*images, *logs, *filters, *teams, *maps, *self.fusers.values(), *estimates]
         return in_dependency_order(in_order)
 
 
@@ -153,7 +155,8 @@ def build_pipeline(scenario: AnyScenario) -> Pipeline:
         alignments = (_alignment(scenario, a, b, values) for values in (filtered, smoothed))
         pairs.append(PairStages(a, b, *alignments))
     fusers = _fusers(scenario, robots, pairs) if pairs else {}
-    return Pipeline(scenario, robots, tuple(pairs), fusers)
+    as_team = _team(scenario, robots) if pairs and scenario.team is not None else None
+    return Pipeline(scenario, robots, tuple(pairs), fusers, as_team)
 
 
 def _stage(kind: StageKind, *sections: Section, values: dict[str, Any], **more: Any) -> Stage:
@@ -398,6 +401,29 @@ def _fusers(
             loads=("mapfusion.fusion" if origin else target_of(name).partition(":")[0],),
         )
     return stages
+
+
+def _team(scenario: Scenario, robots: Sequence[RobotStages]) -> Stage:
+    """Return the stage of the robots that exchange maps; it uses the aligner of `merge`."""
+    assert scenario.team is not None
+    entries = scenario.align.aligners
+    entry = next(each for each in entries if each.name == scenario.merge.aligner)
+    method = find_method(entry.method)
+    before: dict[str, Stage | RecordedLog] = {}
+    for robot in robots:
+        before |= {f"log {robot.name}": robot.log, f"slam {robot.name}": robot.slam}
+    return _stage(
+        team.TEAM_STAGE,
+        *(scenario, scenario.slam, scenario.evaluate, scenario.align, scenario.team, entry),
+        values={
+            "robots": tuple(robot.name for robot in robots),
+            "smoother": smoother_parameters(scenario),
+            "merge": scenario.merge.parameters,
+            "origin": method.origin(),
+        },
+        before=before,
+        loads=(method.own_module,),
+    )
 
 
 _GB = 1e9
