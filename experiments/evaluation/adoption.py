@@ -108,7 +108,7 @@ def member_rows(folder: Path, members: Sequence[TeamMember]) -> list[dict[str, A
 
 
 def _path_errors(path: Float, truth: Float, merged_at: float, prefix: str) -> dict[str, float]:
-    """Return the RMS position errors of a path: of all poses, and of those since the first merge."""
+    """Return the RMS position errors of all poses and of those since the first merge."""
     error_m = np.linalg.norm(path[:, :2] - truth[: len(path), :2], axis=1)
     parts = {
         "path_rmse_m": error_m,

@@ -30,8 +30,9 @@ _NAMES = {
         event left_out map name not_smoothed other place quantity reason receiver refined_reason
         refined_status robot robot_a robot_b sender source stage status verdict""",
     tables.INT: """component count degrees_of_freedom frame iteration landmark landmark_a landmark_b
-        n n_adopted n_bytes n_common n_confirmed n_contradicted n_correspondences n_inliers n_landmarks n_parents
-        n_new n_observed n_returned n_robots n_steps n_team n_tracked n_true particle repetition""",
+        n n_adopted n_bytes n_common n_confirmed n_contradicted n_correspondences n_inliers
+        n_landmarks n_parents n_new n_observed n_returned n_robots n_steps n_team n_tracked n_true
+        particle repetition""",
     tables.BOOL: "accepted lost lower_bound resampled true_pair",
 }
 # Columns of a floor plan, for figures: single precision takes half the space.
@@ -143,14 +144,15 @@ _COLUMNS = {
     # source: as in `path_statistics`; a fuser of smoothed maps moves smoothed paths. n: number of
     # poses.
     "team": "component source n_robots n_team n rmse mean median std min max sse",
-    # What robots that exchange maps while they drive (`team` in the scenario) adopt. event: on trial
-    # (accepted once), adopted, kept (adopted, but not accepted at this exchange) or dropped. The
-    # motion is the pose of the other robot's map in that of the robot.
+    # What robots adopt that exchange maps while they drive (`team` in the scenario). event: on
+    # trial (accepted once), adopted, kept (adopted, but not accepted at this exchange) or dropped.
+    # The motion is the pose of the other robot's map in that of the robot.
     "adoptions": """robot iteration other event tx_m ty_m theta_rad
         cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt translation_error_m rotation_error_rad reason""",
     # One row per (robot, iteration) of these robots. alone_: filter of the independent robot.
-    # merged_: poses since the first adoption. landmark_rmse_m to coverage_95: landmarks that another
-    # robot observed first, in the frame of the robot's map, without gross ones, which are counted.
+    # merged_: poses since the first adoption. landmark_rmse_m to coverage_95: landmarks that
+    # another robot observed first, in the frame of the robot's map, without gross ones, which are
+    # counted.
     # shared_share: share of the observations since then that were assigned to landmarks that other
     # robots mapped, too.
     "team_members": """robot iteration path_rmse_m alone_path_rmse_m merged_path_rmse_m

@@ -12,6 +12,7 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.evaluation import tables
+from experiments.evaluation.adoption import ADOPTED
 from experiments.evaluation.alignment_criteria import (
     ANSWERABLE_PAIRS,
     ORACLE,
@@ -99,12 +100,33 @@ def edge_lines(edges: pd.DataFrame) -> Iterator[str]:
             yield f"alignments {place}: {listed(names)}"
 
 
+def adoption_lines(adoptions: pd.DataFrame, messages: pd.DataFrame) -> Iterator[str]:
+    """Describe by `adoptions` and `messages` what robots adopted while they drove."""
+    for row in adoptions.to_dict("records"):
+        why = f": {row['reason']}" if row["reason"] else ""
+        off = ""
+        if row["event"] == ADOPTED and not math.isnan(row["translation_error_m"]):
+            off = f", {metres(row['translation_error_m'])} off"
+        words = {"on trial": "has the map of {} on trial", "kept": "keeps the map of {} for now"}
+        text = words.get(row["event"], f"{row['event']} the map of {{}}").format(row["other"])
+        yield f"{row['iteration']:>5}  {row['robot']} {text}{off}{why}"
+    if len(messages):
+        lost, size = int(messages["lost"].sum()), messages["n_bytes"].sum() / 1e3
+        yield f"{len(messages)} messages with {size:.0f} kB, {lost} of them lost"
+
+
 _SEEDS_SHOWN = 3  # one by one, in a table of checks
 
 # Columns of the tables of a run
 _ALIGNERS = columns("", aligner="aligner")
 _ALIGNERS |= {name: (column.label, column.layout) for name, column in SHOWN.items()}
 _ALIGNERS |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time\nms")
+_MEMBERS = columns("", robot="robot")
+_MEMBERS |= columns(".4f", merged_path_rmse_m="path\nm", alone_merged_path_rmse_m="alone\nm")
+_MEMBERS |= columns(".2f", over_alone="path /\nalone") | columns("d", n_adopted="adopted\n")
+_MEMBERS |= columns(".4f", landmark_rmse_m="error\nm") | columns(".2f", nees_per_dof="NEES\n/ dof")
+_MEMBERS |= columns(".0%", coverage_95="in\n95 %", shared_share="shared\n")
+_MEMBERS |= columns(".0f", sent_kb="sent\nkB")
 _SMOOTHED = columns("", aligner="aligner")
 _SMOOTHED |= columns(".3f", filter_m="FastSLAM's\nm") | columns(".0%", filter_ok="\nok")
 _SMOOTHED |= columns(".3f", smoothed_m="smoothed\nm") | columns(".0%", smoothed_ok="\nok")
@@ -304,6 +326,16 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
         note = "errors of T_a_b, from the alignment of both maps and from all of the team\n"
         note += "their alignment: agreement with loops of the others; common: landmarks of both"
         print_frame(pairs.assign(pair=names), _TEAM_PAIRS, "Pairs of maps in the team", note)
+    members = table("team_members")
+    if len(members):
+        last = members.sort_values("iteration").groupby("robot", sort=False).tail(1)
+        last = last.assign(over_alone=last["merged_path_rmse_m"] / last["alone_merged_path_rmse_m"])
+        note = "path errors (RMS) since the first adoption, of the independent robot and smoothed\n"
+        note += "adopted: landmarks that another robot observed first, and their RMS error\n"
+        note += "shared: observations of landmarks that other robots mapped, too"
+        print_frame(last, _MEMBERS, "Robots that exchange maps while they drive", note)
+        lines = adoption_lines(table("adoptions"), table("messages"))
+        print_lines(f"  {line}" for line in lines)
     # Work of each stage, and of a run beside its stages
     times = tables.work_by_stage(table("timings"))
     times["share"] = times["seconds"] / times["seconds"].sum()

@@ -138,7 +138,7 @@ def run(settings: TeamSettings, job: Job) -> dict[str, float]:
     evaluated = set(evaluated_iterations(len(team.time_s), settings.every))
     frames: dict[str, list[pd.DataFrame]] = {"maps": [], "paths": []}
     lists: dict[str, list[dict[str, Any]]] = {"steps": [], "events": [], "messages": []}
-    seconds = dict.fromkeys(("alone", "joint"), 0.0)
+    seconds: dict[str, float] = {"alone": 0.0, "joint": 0.0}
     for k in range(len(team.time_s)):
         moment = team.step(k)
         for robot, frame, took_s in zip(team.robots, moment.frames, moment.seconds, strict=True):

@@ -123,6 +123,12 @@ _REGISTRY = {
         "Figure 12: true points inside the error ellipses against the ellipses' probability.",
         ("fuser_coverage",),
     ),
+    "fig13_team": _Figure(
+        "error_figures",
+        "draw_team",
+        "Figure 13: robots that exchange maps while they drive, compared with independent robots.",
+        ("adoptions", "team_members"),
+    ),
 }
 FIGURES = tuple(_REGISTRY)
 _RECORD, _TEXT = "drawn.json", ".txt"

@@ -1,4 +1,4 @@
-"""Figures of measured errors and times: aligners (4 to 6) and fusers (11 and 12)."""
+"""Figures of measured errors and times: aligners (4 to 6), fusers (11, 12) and teams (13)."""
 
 import math
 from typing import Any
@@ -23,15 +23,21 @@ from experiments.evaluation.tables import UNKNOWN
 from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, of_pair
 from experiments.reports.figures.style import (
     BLACK,
+    BLUE,
     GIVEN_STYLES,
+    GRAY,
+    GREEN,
+    ORANGE,
     PAGE_WIDTH_IN,
     PALE_GRAY,
+    VERMILLION,
     aligner_legend,
     fuser_styles,
     plain_numbers,
     write_plainly,
 )
 from experiments.studies.statistics import TIME_GROUPS, error_bands, scarce_spans, time_bands
+from mapfusion.fusion.fusers import name_order
 
 # Figures 4 and 5
 _PANEL_HEIGHT_IN, _EXTRA_HEIGHT_IN = 1.9, 0.9  # the latter for legend and common x label
@@ -78,6 +84,20 @@ _COVERAGE_PANELS = {
 }
 _BEFORE = {FILTERED: "FastSLAM's maps, before", SMOOTHED: "smoothed maps, before"}
 _DIAGONAL: dict[str, Any] = {"color": PALE_GRAY, "linewidth": 2.5, "zorder": 1}
+
+
+# Figure 13. Paths of a robot: column, label and style.
+_TEAM_PATHS: dict[str, tuple[str, dict[str, Any]]] = {
+    "alone_path_rmse_m": ("independent robot", {"color": GRAY, "linestyle": "--", "marker": "v"}),
+    "smoothed_path_rmse_m": ("smoother of its log", {"color": ORANGE, "marker": "P"}),
+    "path_rmse_m": ("in the joint map", {"color": BLUE, "marker": "o"}),
+}
+_TEAM_EVENTS: dict[str, dict[str, Any]] = {
+    "adopted": {"color": GREEN, "linewidth": 0.8},
+    "dropped": {"color": VERMILLION, "linewidth": 0.8},
+}
+_MOST_ROBOTS = 8  # gives a figure of half a metre
+_ROBOTS_A_ROW = 2
 
 
 def draw_translation_error(data: ResultTables) -> Figure:
@@ -310,4 +330,44 @@ def draw_coverage(data: ResultTables) -> Figure:
     panels[0].set_ylabel("true points inside (%)")
     consistent = Line2D([], [], label="as stated", **_DIAGONAL)
     aligner_legend(figure, {name: style for name, (_, style) in curves.items()}, 4, [consistent])
+    return figure
+
+
+def draw_team(data: ResultTables) -> Figure:
+    """Draw the error of each robot's path against the iteration, in the joint map and alone.
+
+    Of many robots, the first by name are drawn. Lines of adopted maps begin at the first adoption.
+    """
+    rows = data.rows("team_members")
+    if not rows["path_rmse_m"].notna().any():
+        raise NothingToDraw("no robots whose truth is known exchange maps (`team` of the scenario)")
+    several = rows.groupby(["robot", "iteration"], sort=False).median(numeric_only=True)
+    rows = several.reset_index()
+    events = data.rows("adoptions")
+    robots = sorted(rows["robot"].unique(), key=name_order)
+    shown = robots[:_MOST_ROBOTS]
+    n_rows = -(-len(shown) // _ROBOTS_A_ROW)
+    figure = Figure(figsize=(PAGE_WIDTH_IN, n_rows * _PANEL_HEIGHT_IN + _EXTRA_HEIGHT_IN))
+    panels = figure.subplots(n_rows, _ROBOTS_A_ROW, sharex=True, sharey=True, squeeze=False)
+    for axes in panels.flat[len(shown) :]:
+        axes.set_visible(False)
+    for axes, robot in zip(panels.flat, shown, strict=False):
+        own = rows[rows["robot"] == robot].sort_values("iteration")
+        for column, (_, style) in _TEAM_PATHS.items():
+            known = own.dropna(subset=column)
+            axes.plot(known["iteration"], known[column], markevery=0.2, **style)
+        of_robot = events[events["robot"] == robot]
+        for kind, style in _TEAM_EVENTS.items():
+            for k in of_robot.loc[of_robot["event"] == kind, "iteration"].unique():
+                axes.axvline(k, zorder=0, **style)
+        axes.set(title=robot, yscale="log")
+        write_plainly(axes.yaxis)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("path error, RMS (m)")
+    left_out = f"\n({len(shown)} of {len(robots)} robots)" if len(robots) > len(shown) else ""
+    figure.supxlabel(f"FastSLAM iteration k{left_out}", fontsize=8)
+    styles = dict(_TEAM_PATHS.values())
+    happened = [kind for kind in _TEAM_EVENTS if (events["event"] == kind).any()]
+    lines = [Line2D([], [], label=f"map {kind}", **_TEAM_EVENTS[kind]) for kind in happened]
+    aligner_legend(figure, styles, 3, lines)
     return figure

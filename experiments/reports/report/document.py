@@ -51,7 +51,7 @@ from experiments.reports.report.charts import (
     time_figure,
 )
 from experiments.reports.report.map_view import MAP_TABLES, map_figure
-from experiments.reports.run_screen import images_by, team_lines
+from experiments.reports.run_screen import adoption_lines, images_by, team_lines
 from experiments.scenario.settings import Bound
 from experiments.studies.comparison import (
     BETTER,
@@ -174,6 +174,12 @@ _OF_FUSERS = {
     "fig12_coverage": "On the gray diagonal the covariances are consistent. Below the diagonal a"
     " map is overconfident, above the diagonal its covariances are too large.",
 }
+# Likewise beside the table of robots that exchange maps.
+_OF_TEAMS = {
+    "fig13_team": "Lower is better. The smoother knows all observations of a robot's own log. The"
+    " independent robot and the robot in the joint map are filters. Green lines are adoptions.",
+}
+_EXPLAINED = _OF_FUSERS | _OF_TEAMS
 _TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
 
 
@@ -217,6 +223,7 @@ def contents_of(path: Path) -> dict[str, Any]:
         # The sections of single results are empty.
         empty = ("outcomes", "robots", "fits", "smoother", "team", "edges", "figures", "missing")
         empty += ("scenario_text", "fusers", "fuser_figures", "places", "findings")
+        empty += ("members", "adoptions", "member_figures")
         own: dict[str, Any] = dict.fromkeys(empty, ()) | {
             "title": f"{path.name}, {maps['run_id'].nunique()} runs",
             "description": ", ".join(maps["scenario"].unique()),
@@ -312,6 +319,7 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
     outcomes: list[Outcome] = []  # of this run alone
     # older results lack some tables
     needed = set(metrics.USED_TABLES) - {"smoother", "fusers", "sightings"}
+    needed -= {"adoptions", "team_members"}
     if all(map(data.has, needed)):
         used = {name: data.rows(name).assign(seed=0) for name in metrics.USED_TABLES}
         for metric, bound in data.scenario.get("expect", {}).items():
@@ -339,7 +347,10 @@ def _of_result(data: ResultTables) -> dict[str, Any]:
         "places": list(verdicts_and_places(data)),
         "fusers": last_fused(data.rows("fusers")).to_dict("records"),
         "fuser_figures": list(_pictures(data.folder, _OF_FUSERS)),
-        "figures": list(_pictures(data.folder, [n for n in FIGURES if n not in _OF_FUSERS])),
+        "members": _last(data.rows("team_members")).to_dict("records"),
+        "adoptions": list(adoption_lines(data.rows("adoptions"), data.rows("messages"))),
+        "member_figures": list(_pictures(data.folder, _OF_TEAMS)),
+        "figures": list(_pictures(data.folder, [n for n in FIGURES if n not in _EXPLAINED])),
         "scenario_text": scenario_text.getvalue(),
         "missing": [name for name in _TABLES if not data.has(name)],
     }
@@ -354,7 +365,7 @@ def _pictures(folder: Path, names: Collection[str]) -> Iterator[dict[str, Any]]:
             with Image.open(io.BytesIO(data)) as picture:  # keeps the layout while loading
                 size = dict(zip(("width", "height"), picture.size, strict=True))
             png = base64.b64encode(data).decode()
-            how = _OF_FUSERS.get(name, "")
+            how = _EXPLAINED.get(name, "")
             yield {"about": caption(name, file.parent), "how": how, "png": png, **size}
 
 
