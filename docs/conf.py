@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,10 @@ sys.path.insert(0, str(DOCS.parent))
 
 import mapfusion  # noqa: E402
 from experiments.cli.main import app as command_line  # noqa: E402
+from experiments.evaluation.metrics import ALIGNER_METRICS, METRICS  # noqa: E402
+from experiments.evaluation.tables import MEANING  # noqa: E402
 from experiments.pipeline.stage import use_kernel_cache  # noqa: E402
+from experiments.scenario import settings  # noqa: E402
 from experiments.scenario.loading import schema_text  # noqa: E402
 
 use_kernel_cache()  # for the examples: kernels in the source tree may be of an earlier version
@@ -129,6 +132,35 @@ def scenario_page() -> str:
     return "\n".join(parts)
 
 
+def metric_page() -> str:
+    """Return the page of the metrics that `expect` bounds."""
+    about = (
+        "Names for `expect` ([a gate in a CI](../ci_gate.md)). Each is one number for all seeds of "
+        "a scenario; the meaning says how seeds and robots are combined. Units end the names: "
+        "`_m`, `_rad`, `_kb`; others are ratios, shares or counts."
+    )
+    parts = [f"# Metrics\n\n{about}\n"]
+
+    def add(title: str, rows: Mapping[str, str]) -> None:
+        parts.append(f"## {title}\n\n| Metric | Meaning |\n|---|---|")
+        parts.extend(f"| `{name}` | {meaning} |" for name, meaning in rows.items())
+        parts.append("")
+
+    def meaning(of: Any) -> str:
+        text = inspect.getdoc(getattr(of, "func", of)) or ""
+        text = " ".join(text.split()).removeprefix("Return ").removesuffix(".")
+        which = getattr(of, "keywords", {}).get("variant", "")
+        return f"{text}; here: {MEANING.get(which, f'`{which}`')}" if which else text
+
+    add("Of a run", {name: meaning(METRICS[name]) for name in settings.RUN_METRICS})
+    of_aligners = {f"ALIGNER.{name}": meaning(of) for name, of in ALIGNER_METRICS.items()}
+    add("Of each aligner", of_aligners)
+    columns = {f"FUSER.{name}": MEANING[name] for name in settings.FUSER_METRICS}
+    median = {name: f"{text}; at the end, median over seeds" for name, text in columns.items()}
+    add("Of each fuser", median)
+    return "\n".join(parts)
+
+
 def command_page() -> str:
     """Return the page of all commands and their options."""
     root = typer.main.get_command(command_line)
@@ -175,6 +207,7 @@ def write_reference(_: Sphinx) -> None:
     """Write the pages of the reference that come from the code."""
     REFERENCE.mkdir(exist_ok=True)
     pages = {"scenario_keys": scenario_page, "command_line": command_page, "api": api_page}
+    pages |= {"metrics": metric_page}
     for name, page in pages.items():
         (REFERENCE / f"{name}.md").write_text(page(), encoding="utf-8")
 

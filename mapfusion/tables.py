@@ -92,6 +92,7 @@ _DESCRIPTOR_LIKE = re.compile(
 _NUMBER_LABELS = "number the landmarks 0, 1, 2, ..., with the same number in all maps and logs"
 _MAX_NAMED = 3  # columns with similar names in one message
 _SEPARATORS = {";": "';'", "\t": "tabs", "|": "'|'", " ": "blanks"}
+_MOST_NAMED = 12  # columns in one message
 
 
 def table_path(folder: Path, name: str) -> Path:
@@ -177,6 +178,9 @@ def read_open_table(
             remedy = _renaming({name: similar[name] for name in here})
         elif missing == ["label"] and unread:
             remedy = f"if {unread[0]} is the identity of the landmark, rename it to label"
+        elif kind == "landmark_map" and {"x_m", "y_m"} & set(missing):
+            has = f"it has {', '.join(names[:_MOST_NAMED])}"
+            remedy = f"rename the columns of the position, in metres, to x_m and y_m ({has})"
         elif kind == "landmark_map" and {"cov_xx_m2", "cov_yy_m2"} <= set(missing):
             remedy = "`--sigma 0.05` states one standard deviation for all landmarks, in metres"
         raise InputError(f"{path}: has no column {', '.join(missing)}; {remedy}")

@@ -25,6 +25,8 @@ from mapfusion.robot_log import RobotTruth
 
 _COVERED = 0.95  # nominal probability of the ellipses
 ADOPTED, DROPPED = "adopted", "dropped"
+# Reason why figure 13 is not drawn; screens do not show it, as most scenarios have no team.
+NO_TEAM = "the robots do not exchange maps (`team` of the scenario)"
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def _landmark_errors(
     adopted = rows[rows["origin"] != member.name]
     result: dict[str, Any] = {"n_landmarks": len(rows), "n_adopted": len(adopted)}
     nothing = dict.fromkeys(
-        ("landmark_rmse_m", "gross_share", "nees_per_dof", "coverage_95"), np.nan
+        ("landmark_rmse_m", "gross_share", "frame_nees_per_dof", "frame_coverage_95"), np.nan
     )
     if not len(adopted):
         return result | nothing
@@ -151,8 +153,8 @@ def _landmark_errors(
     return result | {
         "landmark_rmse_m": np.inf if too_many else _rms(error_m[~gross]),
         "gross_share": float(np.mean(gross)),
-        "nees_per_dof": np.nan if too_many else float(np.mean(squares[~gross]) / 2),
-        "coverage_95": float(np.mean(squares <= chi_square_bound(_COVERED, 2))),
+        "frame_nees_per_dof": np.nan if too_many else float(np.mean(squares[~gross]) / 2),
+        "frame_coverage_95": float(np.mean(squares <= chi_square_bound(_COVERED, 2))),
     }
 
 

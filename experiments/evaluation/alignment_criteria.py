@@ -173,6 +173,9 @@ def nothing_merged(result: Path) -> NothingMerged | None:
     motions = tables.read(tables.table_path(result, "fused_motions"), "fused_motions")
     if motions.empty or merged_robots(motions["tx_m"]):
         return None
+    fusers = tables.read(tables.table_path(result, "fusers"), "fusers")
+    if (fusers["n_robots"] > 1).any():  # smoothed maps were merged
+        return None
     errors = tables.read(tables.table_path(result, "errors"), "errors")
     if errors.empty:
         return NothingMerged(None)

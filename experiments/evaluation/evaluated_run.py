@@ -26,7 +26,6 @@ from experiments.evaluation.map_errors import (
 from experiments.evaluation.truth import (
     EvaluatedRobot,
     MapPair,
-    common_landmarks,
     is_surveyed,
     join_map_pairs,
     load_robot,
@@ -100,12 +99,9 @@ class AlignerTiming:
         }
         n_common = []
         for pair in maps:
-            points_a, points_b = pair.points_world_m
-            known = all(np.isfinite(own).any() for own in (points_a, points_b))
+            known = all(np.isfinite(points_m).any() for points_m in pair.points_world_m)
             radius_m = settings.true_pair_radius_m
-            n_common.append(
-                common_landmarks(points_a, points_b, radius_m) if known else tables.UNKNOWN
-            )
+            n_common.append(pair.n_common(radius_m) if known else tables.UNKNOWN)
         ready = cls(scenario.seed, settings.timing_repeats, aligners, maps, n_common)
         for smallest_or_largest in (maps[0], maps[-1]):  # some aligners treat few pairs apart
             for name in aligners:

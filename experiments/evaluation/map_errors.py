@@ -115,7 +115,7 @@ def error_rows(map_pair: MapPair, verifier: Verifier, radius_m: float) -> pd.Dat
         "oracle_distance_m": oracle_m,
         "oracle_distance_rad": np.abs(oracle_rad),
         "n_true": is_true.sum(),
-        "n_common": common_landmarks(*map_pair.points_world_m, radius_m),
+        "n_common": map_pair.n_common(radius_m),
         "n_inliers": n_inliers,
         "precision": n_hits / np.where(n_inliers, n_inliers, np.nan),
         "recall": n_hits / (is_true.sum() or np.nan),

@@ -213,10 +213,10 @@ def _path_over_alone(tables: Tables, variant: str) -> float:
     return (rows["merged_path_rmse_m"] / rows["alone_merged_path_rmse_m"]).agg(variant)
 
 
-_ADOPTED = ("landmark_rmse_m", "nees_per_dof", "coverage_95", "shared_share", "sent_kb")
+_ADOPTED = ("landmark_rmse_m", "frame_nees_per_dof", "frame_coverage_95", "shared_share", "sent_kb")
 
 
-@metric(**{f"adoption.{name}": name for name in _ADOPTED})
+@metric(**{f"adoption.{name.removeprefix('frame_')}": name for name in _ADOPTED})
 def _adopted_column(tables: Tables, variant: str) -> float:
     """Return a column of the last rows of `team_members`, median over adopting robots and seeds."""
     return _adopting(tables)[variant].median()

@@ -150,14 +150,14 @@ _COLUMNS = {
     "adoptions": """robot iteration other event tx_m ty_m theta_rad
         cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt translation_error_m rotation_error_rad reason""",
     # One row per (robot, iteration) of these robots. alone_: filter of the independent robot.
-    # merged_: poses since the first adoption. landmark_rmse_m to coverage_95: landmarks that
+    # merged_: poses since the first adoption. landmark_rmse_m to frame_coverage_95: landmarks that
     # another robot observed first, in the frame of the robot's map, without gross ones, which are
     # counted.
     # shared_share: share of the observations since then that were assigned to landmarks that other
     # robots mapped, too.
     "team_members": """robot iteration path_rmse_m alone_path_rmse_m merged_path_rmse_m
         alone_merged_path_rmse_m smoothed_path_rmse_m n_landmarks n_adopted landmark_rmse_m
-        gross_share nees_per_dof coverage_95 shared_share sent_kb""",
+        gross_share frame_nees_per_dof frame_coverage_95 shared_share sent_kb""",
     # Messages of these robots. n_landmarks: landmarks in the message; n_new: those that the
     # receiver does not have. arrives_s: infinite for lost messages.
     "messages": "iteration sender receiver n_bytes n_landmarks n_new arrives_s lost",
@@ -302,7 +302,7 @@ MEANING = {
     "spread_m": "root of the trace of the particles' position covariance",
     "n_observed": "observations of the frame",
     "n_tracked": "observations of a track that was seen before",
-    "n_new": "observations that created a landmark",
+    "n_new": "observations that created a landmark; messages: landmarks new to the receiver",
     "n_returned": "observations of a landmark that was out of view for a while",
     "log_weight": "logarithm of the normalised weight",
     "time_s": "time of the frame",
@@ -373,7 +373,7 @@ MEANING = {
     "count": "number of observations",
     "n_parents": "landmarks of robots' maps that were fused into it",
     "n_landmarks": "number of landmarks; of maps with truth, those that are compared",
-    "landmark_rmse_m": "RMS landmark error after a rigid fit; fusers: in the frame of the map",
+    "landmark_rmse_m": "RMS landmark error after a rigid fit; fusers, team_members: in the frame",
     "fitted_rmse_m": "RMS landmark error after a rigid fit",
     "fitted_median_m": "median landmark error after a rigid fit",
     "rmse_m": "RMS landmark error after a rigid fit",

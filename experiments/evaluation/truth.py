@@ -1,6 +1,7 @@
 """True poses and points for estimated paths and landmarks; only the evaluation uses this module."""
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from mapfusion.align.rigid_motion import fit_rigid
 from mapfusion.errors import InputError
 from mapfusion.fusion.fusers import AlignedPair
 from mapfusion.geometry import se2
-from mapfusion.geometry.numerics import Float
+from mapfusion.geometry.numerics import Float, chi_square_bound
 from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import (
     TRUTH_TABLES,
@@ -38,6 +39,7 @@ from mapfusion.robot_log import (
 )
 from mapfusion.tables import table_path
 
+_SAME = 0.95  # probability that true points placed by poses are found to be one point
 _MAP_PAIR = ["robot_a", "robot_b", "iteration"]
 
 
@@ -257,10 +259,28 @@ class MapPair:
         """Values of the columns that identify this pair of maps."""
         return dict(zip(_MAP_PAIR, (self.a.name, self.b.name, self.iteration), strict=True))
 
+    def same_within_m(self, radius_m: float) -> float:
+        """Return the distance below which true points of the two robots are one point.
+
+        It is `radius_m`, or more if true points are placed by true poses: such a point is as
+        uncertain as the landmark, and two of them lie within this distance with probability 0.95.
+        """
+        if self.a.surveyed and self.b.surveyed:
+            return radius_m
+        variance_m2 = 0.0
+        for landmarks in self.maps:
+            by_axis = np.trace(landmarks.covariance_m2, axis1=1, axis2=2) / 3
+            variance_m2 += float(np.median(by_axis)) if len(by_axis) else 0.0
+        return max(radius_m, math.sqrt(chi_square_bound(_SAME, 3) * variance_m2))
+
     def is_true(self, radius_m: float) -> np.ndarray:
         """Return, shape (N,), True for correspondences of the same world point."""
-        pairs = self.offered
-        return true_pairs(*self.points_world_m, pairs.index_a, pairs.index_b, radius_m)
+        pairs, within_m = self.offered, self.same_within_m(radius_m)
+        return true_pairs(*self.points_world_m, pairs.index_a, pairs.index_b, within_m)
+
+    def n_common(self, radius_m: float) -> int:
+        """Return the number of landmarks of both maps that are the same world point."""
+        return common_landmarks(*self.points_world_m, self.same_within_m(radius_m))
 
     def aligned(self, aligner: str, a: int, b: int) -> AlignedPair:
         """Return the alignment that a merge uses: the first repetition of an aligner.

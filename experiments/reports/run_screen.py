@@ -12,7 +12,7 @@ import pandas as pd
 from rich.text import Text
 
 from experiments.evaluation import tables
-from experiments.evaluation.adoption import ADOPTED
+from experiments.evaluation.adoption import ADOPTED, NO_TEAM
 from experiments.evaluation.alignment_criteria import (
     ANSWERABLE_PAIRS,
     ORACLE,
@@ -32,7 +32,7 @@ from experiments.evaluation.metrics import CheckedScenario
 from experiments.evaluation.result import renderer
 from experiments.evaluation.run_plan import RunPlan
 from experiments.evaluation.single_steps import alignment_row
-from experiments.evaluation.tables import SHOWN, read_provenance
+from experiments.evaluation.tables import SHOWN, read_provenance, read_scenario
 from experiments.pipeline.stereo_import import ImportedRecording
 from experiments.pipeline.tables import covariances_of
 from experiments.reports.layout import (
@@ -124,8 +124,10 @@ _ALIGNERS |= columns(".3f", spread_m="spread\nm") | columns(".2f", time_ms="time
 _MEMBERS = columns("", robot="robot")
 _MEMBERS |= columns(".4f", merged_path_rmse_m="path\nm", alone_merged_path_rmse_m="alone\nm")
 _MEMBERS |= columns(".2f", over_alone="path /\nalone") | columns("d", n_adopted="adopted\n")
-_MEMBERS |= columns(".4f", landmark_rmse_m="error\nm") | columns(".2f", nees_per_dof="NEES\n/ dof")
-_MEMBERS |= columns(".0%", coverage_95="in\n95 %", shared_share="shared\n")
+_MEMBERS |= columns(".4f", landmark_rmse_m="error\nm") | columns(
+    ".2f", frame_nees_per_dof="NEES\n/ dof"
+)
+_MEMBERS |= columns(".0%", frame_coverage_95="in\n95 %", shared_share="shared\n")
 _MEMBERS |= columns(".0f", sent_kb="sent\nkB")
 _SMOOTHED = columns("", aligner="aligner")
 _SMOOTHED |= columns(".3f", filter_m="FastSLAM's\nm") | columns(".0%", filter_ok="\nok")
@@ -344,11 +346,17 @@ def print_result(result: Path, skipped_figures: Sequence[str] | None) -> None:
     print_frame(times, _WORK, "Work by stage", note)
     team = team_lines(table("fused_motions"), table("team"), pairs)
     print_lines(f"  {line}" for line in (*team, *edge_lines(table("team_edges"))))
+    if len(fused) and len(motions := table("fused_motions")) > 1:
+        scenario = read_scenario(result / "scenario.json")
+        chosen = fused[fused["fuser"] == scenario["merge"].get("fuser")]
+        for row in chosen.to_dict("records"):
+            by = f"{row['n_robots']} of {len(motions)} robots, by {row['fuser']}"
+            print_lines([f"  maps/fused.parquet: {by}"])
     drawn = [] if skipped_figures is None else [f"Figures: {result / 'figures'}"]
     print_lines(["   ".join([*drawn, f"Tables: {result / 'tables'}"])])
     renderer = read_provenance(result / "provenance.json").get("renderer", "unknown")
     print_lines([f"Images of the cameras: {images_by(str(renderer))}"])
-    print_skipped(skipped_figures or ())
+    print_skipped([line for line in skipped_figures or () if not line.endswith(NO_TEAM)])
 
 
 def not_run_lines(errors: pd.DataFrame) -> list[str]:
@@ -423,7 +431,7 @@ def print_alignments(alignments: Sequence[MapAlignment]) -> None:
     note = "T_a_b: refined; sigma: where the maps overlap; pairs: correspondences that\n"
     note += "support it; NFA: number of alignments with as much support by chance; time:\n"
     note += "of the estimate; more with --json"
-    if found["lower_bound"].any() and np.isfinite(sigma_m).any():
+    if (found["lower_bound"] & np.isfinite(at_overlap)).any():
         note += f"\n{_LOWER_BOUND}"
     print_frame(shown, _ALIGNMENTS, "", note)
     said = best_alignment(alignments).reason  # in the advice

@@ -332,6 +332,13 @@ def _validated(where: str, kind: type[S], data: dict[str, Any], place: Place = _
     raise InputErrors(lines)
 
 
+# Ends of messages about missing keys that every scenario needs.
+_EXAMPLES: dict[Location, str] = {
+    ("schema_version",): "; write schema_version: 1",
+    ("name",): "; write a name of your choice, for example name: mine",
+}
+
+
 def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:
     """Yield the problems of a failed validation."""
     # An unknown name comes first: it often explains a missing one.
@@ -345,6 +352,11 @@ def _refused(kind: type, error: ValidationError) -> Iterator[Problem]:
                 yield Problem((*location, *_parts(name)), problem)
         elif isinstance(cause, ContradictingSections):
             yield from map(_problem_of_line, cause.problems)
+        elif each["type"] == "missing":
+            yield Problem(location, f"is missing{_EXAMPLES.get(location, '')}")
+        elif each["type"] == "string_pattern_mismatch":
+            allowed = "expected letters, digits, - and _, first a letter or digit, 41 at most"
+            yield Problem(location, f"is {reprlib.repr(each['input'])}, {allowed}")
         elif each["type"] in _UNKNOWN:
             yield Problem(location, _about_unknown(location, _known_keys(kind)))
         elif each["type"] != "value_error" and not isinstance(each["input"], dict):

@@ -247,9 +247,9 @@ def _candidates(
     """Return landmarks of every pair of maps that may be the same point.
 
     Landmarks with equal labels need no gate and have the dissimilarity 0. Other landmarks have to
-    pass the gate and the descriptor test; without descriptors they have to be inliers of an
-    alignment. The gate is that of the fitted Student-t distribution, because a Gaussian gate would
-    remove the tails that are fitted.
+    pass the gate and the descriptor test. Inliers of an alignment need no descriptor test;
+    landmarks without descriptors have to be inliers. The gate is that of the fitted Student-t
+    distribution, because a Gaussian gate would remove the tails that are fitted.
     """
     factor = np.asarray(np.linalg.cholesky(estimate.covariance), np.float64)
     placed = []
@@ -280,6 +280,10 @@ def _candidates(
                 apart, landmark_maps[a].descriptor_kind, landmark_maps[b].descriptor_kind
             )
             similar = distance <= parameters.max_descriptor_distance
+            for pair in inliers:
+                if (pair.a, pair.b) == (a, b):  # an alignment tells that they are the same point
+                    of_alignment = pair.row_a * len(second) + pair.row_b
+                    similar |= np.isin(i * len(second) + j, of_alignment)
             i, j, distance = i[similar], j[similar], distance[similar]
 
         # gate of the differences, in which common errors cancel

@@ -524,7 +524,16 @@ class MergedMaps:
         )
         if self.note:
             text += f" Note: {_sentence(self.note)}"
-        left = [f"{name} is left out: {_sentence(reason)}" for name, reason in fused.left_out]
+        elsewhere = set[str]()
+        for other in self.fusion.fused[1:]:
+            own = [self.maps[k].name for k in other.members]
+            text += f" {', '.join(own[:-1])} and {own[-1]} make a map of their own."
+            elsewhere |= set(own)
+        left = [
+            f"{name} is left out: {_sentence(reason)}"
+            for name, reason in fused.left_out
+            if name not in elsewhere
+        ]
         return " ".join([text, *left])
 
     def write(self, path: str | os.PathLike[str]) -> list[Path]:

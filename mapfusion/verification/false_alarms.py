@@ -491,7 +491,10 @@ class ChanceTest:
         elif k < MIN_PAIRS:
             reason = f"fewer than {MIN_PAIRS} of {n} {counted} support it"
         else:
-            times = f"{10**log10:.2g}" if log10 < 4 else f"1e{log10:.0f}"
+            if log10 < 1:
+                times = f"{10**log10:.2g}"
+            else:
+                times = f"{10**log10:.0f}" if log10 < 4 else f"1e{log10:.0f}"
             reason = (
                 f"{k} of {n} {counted} agree within {gate_m:g} m; chance alone "
                 f"gives as much {times} times for these maps, {self.false_alarms:g} are allowed"

@@ -44,6 +44,7 @@ TRIO = (
     .replace("{least_ratio: 1}", "{place_m: 0, least_ratio: 1}")
     .replace("repetitions: 2", "repetitions: 3")
     .replace("evaluate:", "    - {name: impicp, method: impicp}\nevaluate:")
+    + "team: {link: {every: 8}}\n"
 )
 # Seconds less, where it does not matter what is in the maps.
 SHORT = TINY.replace("name: tiny", "name: short").replace("frames: 44", "frames: 12")

@@ -17,10 +17,15 @@ from matplotlib.ticker import (
     PercentFormatter,
 )
 
+from experiments.evaluation.adoption import NO_TEAM
 from experiments.evaluation.alignment_criteria import ANSWERABLE_PAIRS, ORACLE
 from experiments.evaluation.map_errors import FILTERED, FUSED, SMOOTHED
 from experiments.evaluation.tables import UNKNOWN
-from experiments.reports.figures.result_tables import NothingToDraw, ResultTables, of_pair
+from experiments.reports.figures.result_tables import (
+    NothingToDraw,
+    ResultTables,
+    of_pair,
+)
 from experiments.reports.figures.style import (
     BLACK,
     BLUE,
@@ -339,8 +344,10 @@ def draw_team(data: ResultTables) -> Figure:
     Of many robots, the first by name are drawn. Lines of adopted maps begin at the first adoption.
     """
     rows = data.rows("team_members")
+    if not len(rows):
+        raise NothingToDraw(NO_TEAM)
     if not rows["path_rmse_m"].notna().any():
-        raise NothingToDraw("no robots whose truth is known exchange maps (`team` of the scenario)")
+        raise NothingToDraw("no true poses: errors are unknown")
     several = rows.groupby(["robot", "iteration"], sort=False).median(numeric_only=True)
     rows = several.reset_index()
     events = data.rows("adoptions")

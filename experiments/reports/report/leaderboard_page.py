@@ -22,6 +22,7 @@ from experiments.studies.leaderboard import (
     FUSIONS,
     REFERENCE_ALIGNER,
     REFERENCE_FUSER,
+    RUNS_TO_RANK,
     Leaderboard,
 )
 from mapfusion.align.alignment import Status
@@ -67,7 +68,17 @@ def print_leaderboard(board: Leaderboard, folder: Path) -> None:
     print_lines(f"  {name}: not ranked, it is not installed" for name in absent)
     failed = zip(rows["aligner"], rows["n_failed"], strict=True)
     print_lines(f"  {name}: failed on {n} tasks, see alignments.parquet" for name, n in failed if n)
+    runs = board.tasks.tasks[["scenario", "seed"]].drop_duplicates()
+    print_lines(f"  {line}" for line in few_runs_lines(len(runs)))
     print_lines([f"Page and tables: {folder}"])
+
+
+def few_runs_lines(n_runs: int) -> list[str]:
+    """Say that few runs cannot rank methods."""
+    if n_runs >= RUNS_TO_RANK:
+        return []
+    few = f"{n_runs} runs can hardly tell methods apart: a method of rank 1 may still be wrong"
+    return [f"{few}; rank on {RUNS_TO_RANK} runs or more (the usual set has 60)"]
 
 
 def write_leaderboard(board: Leaderboard, folder: Path) -> None:
@@ -98,6 +109,7 @@ def write_leaderboard(board: Leaderboard, folder: Path) -> None:
         "aligner_headings": _headings(ALIGNER_COLUMNS),
         "fusers": _text_rows(board.fusers, FUSER_COLUMNS),
         "fuser_headings": _headings(FUSER_COLUMNS),
+        "few_runs": few_runs_lines(len(tasks.tasks[["scenario", "seed"]].drop_duplicates())),
         "best": list(board.aligners.loc[board.aligners["rank"] == 1, "aligner"]),
         "n_tasks": len(tasks.tasks),
         "n_runs": len(tasks.tasks[["scenario", "seed"]].drop_duplicates()),

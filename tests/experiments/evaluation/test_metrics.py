@@ -151,29 +151,66 @@ def tables() -> dict[str, pd.DataFrame]:
     fits = [(0, "A", 1.0), (0, "B", 3.0), (0, "C", 29.0), (1, "A", 6.0), (2, "A", 50.0)]
     fits += [(0, "fused", 7.0), (1, "fused", 9.0), (2, "fused", 20.0)]
     smoother = {name: [1.0 * k, 8.0 * k, 3.0 * k, np.nan] for k, name in enumerate(SMOOTHER, 1)}
-    return {
-        "robots": pd.concat([pd.DataFrame(robots), closing_robots()]),
-        "sightings": pd.concat([closing_sightings(seed) for seed in (0, 1)]),
-        "errors": pd.DataFrame(errors),
-        "smoothed_errors": pd.DataFrame(smoothed_errors),
-        "fusion": pd.DataFrame(fusion, columns=pd.Index(columns)).assign(robot_a="A", robot_b="B"),
-        "map_fits": pd.DataFrame(fits, columns=pd.Index(["seed", "map", "rmse_m"])),
-        "smoother": pd.DataFrame(smoother),
-        "fusers": pd.DataFrame(
-            [
-                {"seed": seed, "fuser": fuser, "iteration": iteration}
-                | {name: times * k for k, name in enumerate(FUSER, 1)}
-                for fuser in FUSERS
-                # the last of each seed counts
-                for seed, iteration, times in (
-                    (0, 20, 1.0),
-                    (0, 10, 9.0),
-                    (1, 20, 2.0),
-                    (2, 20, 9.0),
-                )
-            ]
-        ),
-    } | team_tables()
+    return (
+        {
+            "robots": pd.concat([pd.DataFrame(robots), closing_robots()]),
+            "sightings": pd.concat([closing_sightings(seed) for seed in (0, 1)]),
+            "errors": pd.DataFrame(errors),
+            "smoothed_errors": pd.DataFrame(smoothed_errors),
+            "fusion": pd.DataFrame(fusion, columns=pd.Index(columns)).assign(
+                robot_a="A", robot_b="B"
+            ),
+            "map_fits": pd.DataFrame(fits, columns=pd.Index(["seed", "map", "rmse_m"])),
+            "smoother": pd.DataFrame(smoother),
+            "fusers": pd.DataFrame(
+                [
+                    {"seed": seed, "fuser": fuser, "iteration": iteration}
+                    | {name: times * k for k, name in enumerate(FUSER, 1)}
+                    for fuser in FUSERS
+                    # the last of each seed counts
+                    for seed, iteration, times in (
+                        (0, 20, 1.0),
+                        (0, 10, 9.0),
+                        (1, 20, 2.0),
+                        (2, 20, 9.0),
+                    )
+                ]
+            ),
+        }
+        | team_tables()
+        | adoption_tables()
+    )
+
+
+ADOPTED = ["landmark_rmse_m", "frame_nees_per_dof", "frame_coverage_95", "shared_share", "sent_kb"]
+
+
+def adoption_tables() -> dict[str, pd.DataFrame]:
+    """Robots that exchange maps; D adopts nothing, and C drops what it adopted."""
+    adoptions = [
+        (0, "A", "B", 10, "on trial", 0.1),
+        (0, "A", "B", 20, "adopted", 0.1),
+        (0, "B", "A", 30, "adopted", 0.1),
+        (0, "C", "A", 30, "adopted", 9.0),
+        (0, "C", "A", 50, "dropped", 9.0),
+        (1, "A", "B", 40, "adopted", 9.0),
+    ]
+    columns = ["seed", "robot", "other", "iteration", "event", "translation_error_m"]
+    members = [
+        (0, "A", 20, 99.0, 1.0, 99.0),  # the last iteration counts
+        (0, "A", 60, 1.0, 2.0, 1.0),
+        (0, "B", 60, 3.0, 4.0, 2.0),
+        (0, "C", 60, 9.0, 9.0, 4.0),
+        (0, "D", 60, 9.0, 1.0, 99.0),
+        (1, "A", 60, 4.0, 2.0, 8.0),
+        (2, "A", 60, 4.0, 2.0, 99.0),
+    ]
+    of_members = ["seed", "robot", "iteration", "merged_path_rmse_m", "alone_merged_path_rmse_m"]
+    rows = pd.DataFrame(members, columns=pd.Index([*of_members, "times"]))
+    for k, name in enumerate(ADOPTED, 1):
+        rows[name] = k * rows["times"]
+    events = pd.DataFrame(adoptions, columns=pd.Index(columns)).assign(rotation_error_rad=0.0)
+    return {"adoptions": events, "team_members": rows}
 
 
 SMOOTHER = ["path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share"]
@@ -199,6 +236,12 @@ KNOWN = {
     "landmark_rmse_median_m": 6.0,  # medians 3, 6 and 50; means would be 11, 6 and 50
     "landmark_rmse_worst_m": 50.0,
     "fused_landmark_rmse_m": 9.0,
+    "adoption.robots": 1.0,  # 3, 1 and none
+    "adoption.first_iteration": 30.0,  # 20 and 40
+    "adoption.false_adoptions": 1.0,
+    "adoption.path_over_alone": (3 / 4 + 1) / 2,
+    "adoption.path_over_alone_worst": 2.0,
+    **{f"adoption.{name.removeprefix('frame_')}": 3.0 * k for k, name in enumerate(ADOPTED, 1)},
     "team.merged_robots": 2.0,
     "team.ate_rmse_m": 0.3,
     "team.translation_m": 0.2,

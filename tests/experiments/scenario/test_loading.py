@@ -95,6 +95,7 @@ PLACES = {
     "TrackParameters": "vision.tracks",
     "USurfParameters": "vision.usurf",
     "World": "generate.world",
+    "LinkParameters": "team.link",
 }
 WRITTEN_BY_US = {"Generated", "GeneratedScenario", "Recording", "Robot"}
 

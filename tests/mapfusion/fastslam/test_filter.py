@@ -5,14 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapfusion.fastslam.filter import FastSlam, FastSlamParameters
+from mapfusion.fastslam.filter import FastSlam, FastSlamParameters, PriorMap
 from mapfusion.fastslam.motion import MotionNoise
+from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, inverse, rotation_about_z, transform_points, wrap
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import Observations
 from tests.mapfusion.fastslam.landmark_worlds import (
     EXACT_MOTION,
+    World,
     drive,
     nothing,
+    observe,
     parameters,
     unit,
 )
@@ -359,3 +363,217 @@ def test_the_filter_keeps_to_it(planar: bool) -> None:
             point = np.array([[5.0, 2.0 + apart_m, 0.0]])
             slam.step(np.zeros(3), Observations(point, sigma_m**2 * np.eye(3)[None], descriptor))
         assert len(slam.best_map(min_count=1)) == n_expected
+
+
+FIRST_ADOPTED = 2**30  # number of the first landmark that another robot mapped
+N_BEFORE = 20  # frames before a restart
+
+
+def prior_of(world: World, drift_m: float = 0.0) -> PriorMap:
+    """Return the truth with small errors as a map; every second landmark is another robot's.
+
+    The other robot's drift has a standard deviation of `drift_m` and of as much in radians, that of
+    the robot has none.
+    """
+    rng, n = np.random.default_rng(1), len(world.landmarks)
+    own = np.arange(n) % 2 == 0
+    label = np.arange(n, dtype=np.int32)
+    root = 0.01 * rng.standard_normal((n, 3, 3))
+    covariance_m2 = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(3)
+    seen = np.concatenate(world.seen[:N_BEFORE])
+    source = np.where(own, [np.flatnonzero(seen == k)[0] for k in label], FIRST_ADOPTED + label)
+    last = [max(f for f in range(N_BEFORE) if k in world.seen[f]) for k in label]
+    landmarks = LandmarkMap(
+        world.landmarks + 0.001 * rng.standard_normal((n, 3)),
+        covariance_m2,
+        rng.integers(3, 9, n).astype(np.int32),
+        source,
+        world.descriptor.astype(np.float32),
+        label,
+    )
+    starts = np.cumsum([0, *map(len, world.frames[:N_BEFORE])])
+    drift = np.zeros((5, 3, 5, 3))
+    for k in (0, 1):
+        drift[k, :, 0] = drift[k, :, 1] = drift_m**2 * np.eye(3)
+    return PriorMap(
+        landmarks,
+        source,
+        np.where(own, last, -10 - label),
+        world.path[:N_BEFORE] + rng.normal(0, 1e-3, (N_BEFORE, 3)),
+        np.where(rng.uniform(size=len(seen)) < 0.1, -1, source[seen]),
+        starts,
+        np.array([-30, -1, 0, 10]),
+        drift.reshape(15, 15),
+    )
+
+
+def restarted(world: World, drift_m: float = 0.0, **settings) -> tuple[FastSlam, PriorMap]:
+    """Return a filter of the first frames that goes on in another map."""
+    slam = FastSlam(parameters(**settings), np.random.default_rng(3))
+    for odometry, frame in zip(world.odometry[:N_BEFORE], world.frames, strict=False):
+        slam.step(odometry, frame)
+    prior = prior_of(world, drift_m)
+    slam.restart(prior)
+    return slam, prior
+
+
+def assert_is(found: LandmarkMap, expected: LandmarkMap, source: np.ndarray) -> None:
+    order = np.argsort(source)
+    np.testing.assert_array_equal(found.source_observation, source[order])
+    for name in ("position_m", "covariance_m2", "count", "label", "descriptor"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name)[order])
+
+
+@pytest.mark.parametrize("association", ["descriptor", "gate", "label"])
+def test_a_restarted_filter_has_the_given_map_path_and_associations(association):
+    slam, prior = restarted(drive(3), association=association)
+    assert_is(slam.best_map(min_count=1), prior.landmarks, prior.source)
+    assert slam.n_slots == 12
+    np.testing.assert_array_equal(slam.best_path(), prior.path)
+    np.testing.assert_array_equal(slam.best_associations(), prior.associations)
+    last = prior.associations[prior.frame_starts[-2] :]
+    np.testing.assert_array_equal(slam.last_associations(), last)
+
+
+@pytest.mark.parametrize("association", ["descriptor", "gate", "label"])
+def test_after_a_restart_observations_go_to_the_given_landmarks(association):
+    world = drive(3)
+    slam, prior = restarted(world, association=association, proposal="informed")
+    rows, n_before = np.arange(6), len(prior.associations)
+    pose = compose(world.path[N_BEFORE - 1], [0.15, 0, 0.1])
+    rng = np.random.default_rng(8)
+    frame = observe(pose, world.landmarks[rows], world.descriptor[rows], rows, rng)
+    result = slam.step(np.array([0.15, 0, 0.1]), frame)
+    assert result.n_landmarks == slam.n_slots == 12
+    np.testing.assert_array_equal(slam.last_associations(), prior.source[:6])
+    np.testing.assert_array_equal(slam.best_associations()[n_before:], prior.source[:6])
+    found = slam.best_map(min_count=1)
+    assert found.label is not None
+    found = found[np.argsort(found.label)]
+    np.testing.assert_array_equal(found.count, prior.landmarks.count + (np.arange(12) < 6))
+    np.testing.assert_array_equal(found.position_m[6:], prior.landmarks.position_m[6:])
+
+
+def test_a_label_that_is_not_in_the_given_map_starts_a_landmark():
+    world = drive(3)
+    slam = FastSlam(parameters(association="label"), np.random.default_rng(3))
+    for odometry, frame in zip(world.odometry[:N_BEFORE], world.frames, strict=False):
+        slam.step(odometry, frame)
+    prior = prior_of(world)
+    rest = np.arange(1, 12)
+    source, last_frame = prior.source[rest], prior.last_frame[rest]
+    landmarks = prior.landmarks[rest]
+    slam.restart(replace(prior, landmarks=landmarks, source=source, last_frame=last_frame))
+    assert len(slam.best_map(min_count=1)) == 11
+    n, rows = len(prior.associations), np.arange(2)
+    rng = np.random.default_rng(8)
+    pose = world.path[N_BEFORE - 1]
+    frame = observe(pose, world.landmarks[rows], world.descriptor[rows], rows, rng)
+    slam.step(np.zeros(3), frame)
+    np.testing.assert_array_equal(slam.last_associations(), [n, prior.source[1]])
+    assert slam.best_map(min_count=1).source_observation.tolist().count(n) == 1
+
+
+def test_path_and_associations_go_on_for_long_after_a_restart():
+    """More steps than the interval of the prunings, 256, with many resamplings."""
+    world = drive(3, n_frames=N_BEFORE + 700)
+    slam, prior = restarted(world, n_particles=6, association="label")
+    clouds, n_resampled = [], 0
+    for odometry, frame in zip(world.odometry[N_BEFORE:], world.frames[N_BEFORE:], strict=True):
+        result = slam.step(odometry, frame)
+        clouds.append(result.cloud.copy())
+        n_resampled += result.resampled
+    assert n_resampled > 20
+    path, associations = slam.best_path(), slam.best_associations()
+    np.testing.assert_array_equal(path[:N_BEFORE], prior.path)
+    np.testing.assert_array_equal(associations[: len(prior.associations)], prior.associations)
+    assert len(path) == len(world.path)
+    for pose, cloud in zip(path[N_BEFORE:], clouds, strict=True):
+        assert np.any(np.all(pose == cloud, axis=1))
+    seen = np.concatenate(world.seen[N_BEFORE:])
+    later = associations[len(prior.associations) :]
+    assert np.mean(later == prior.source[seen]) > 0.95
+    assert np.abs(path - world.path)[:, :2].max() < 0.3
+
+
+def by_drift(position_m: Float, covariance: Float) -> Float:
+    """Return the covariances (n, 3, 3) of points by one drift (3, 3) of the plane."""
+    jacobian = np.array([[[1, 0, -y], [0, 1, x], [0, 0, 0]] for x, y, _ in position_m])
+    return jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+
+
+def test_covariances_with_drift_are_those_of_landmark_and_drift():
+    """Those of the other robot drift by 0.05; a frame between two knots has half of their drift."""
+    slam, prior = restarted(drive(3), drift_m=0.05)
+    found, plain = slam.best_map(1, with_drift=True), slam.best_map(1)
+    theirs = found.source_observation >= FIRST_ADOPTED
+    drift = by_drift(found.position_m, 0.05**2 * np.eye(3)) * theirs[:, None, None]
+    np.testing.assert_allclose(found.covariance_m2, plain.covariance_m2 + drift, atol=1e-12)
+    np.testing.assert_array_equal(found.position_m, plain.position_m)
+    assert theirs.sum() == 6
+
+    middle = replace(prior, last_frame=np.full(12, -1), knots=np.array([-2, 0, 5, 10]))
+    covariance = np.zeros((5, 3, 5, 3))
+    covariance[0, :, 0] = np.diag([0.04, 0.01, 0.0])
+    covariance[1, :, 1] = np.diag([0.0, 0.03, 0.02])
+    slam.restart(replace(middle, drift_covariance=covariance.reshape(15, 15)))
+    found = slam.best_map(1, with_drift=True)
+    drift = by_drift(found.position_m, np.diag([0.01, 0.01, 0.005]))
+    np.testing.assert_allclose(found.covariance_m2, plain.covariance_m2 + drift, atol=1e-12)
+
+
+def test_a_loop_to_the_other_robot_makes_all_its_landmarks_certain():
+    """Three of its six landmarks are seen; all were displaced by the same motion."""
+    world, motion = drive(3), np.array([0.06, -0.05, 0.03])
+    settings = {"proposal": "informed", "association": "label", "close_loops": True}
+    slam, prior = restarted(world, drift_m=0.05, **settings)
+    theirs = prior.source >= FIRST_ADOPTED
+    position_m = prior.landmarks.position_m.copy()
+    position_m[theirs] = transform_points(motion, position_m[theirs])
+    displaced = replace(prior.landmarks, position_m=position_m)
+    slam.restart(replace(prior, landmarks=displaced))
+    before = slam.best_map(1, with_drift=True)
+    rng, step = np.random.default_rng(8), np.array([0.15, 0, 0.1])
+    pose, rows = world.path[N_BEFORE - 1], np.array([0, 1, 2, 3, 4, 5, 6])
+    for _ in range(3):
+        pose = compose(pose, step)
+        looks = world.descriptor[rows]
+        slam.step(step, observe(pose, world.landmarks[rows], looks, rows, rng, sigma_m=0.005))
+    after = slam.best_map(1, with_drift=True)
+    assert after.label is not None
+    unseen = np.isin(after.label, [7, 9, 11])
+    np.testing.assert_array_equal(after.count[unseen], before.count[unseen])
+    own_m2 = slam.best_map(1).covariance_m2
+    trace = [np.trace(each.covariance_m2 - own_m2, axis1=1, axis2=2) for each in (before, after)]
+    assert np.all(trace[1][unseen] < 0.2 * trace[0][unseen])
+    off_m = [
+        np.linalg.norm((each.position_m - world.landmarks[each.label])[unseen, :2], axis=1)
+        for each in (before, after)
+    ]
+    assert np.all(off_m[1] < 0.4 * off_m[0])
+    assert off_m[0].min() > 0.04
+
+
+def test_covariances_with_drift_count_the_offset_of_a_track_once():
+    """A landmark is its point plus an offset; after its track the filter has added two offsets."""
+    stray_m, R = 0.2, 1e-4 * np.eye(3)
+    settings = parameters(n_particles=2, motion=EXACT_MOTION, association="label", stray_m=stray_m)
+    slam, point = FastSlam(settings, np.random.default_rng(0)), np.array([[2.0, 0, 0], [3, 1, 0]])
+    label, track = np.arange(2, dtype=np.int32), np.array([5, 6], dtype=np.int32)
+    both = Observations(point, np.tile(R, (2, 1, 1)), label=label, track=track)
+    slam.step(np.zeros(3), both)
+    slam.step(np.zeros(3), both[:1])  # the second track has ended
+    plain, found = slam.best_map(1), slam.best_map(1, with_drift=True)
+    variance = np.array([0.5e-4, 1e-4])
+    expected = variance[:, None, None] * np.eye(3)
+    np.testing.assert_allclose(
+        plain.covariance_m2, expected + [[[0]], [[2 * stray_m**2]]] * np.eye(3), atol=1e-12
+    )
+    np.testing.assert_allclose(found.covariance_m2, expected + stray_m**2 * np.eye(3), atol=1e-12)
+
+
+def test_without_a_history_there_are_no_last_associations():
+    slam = FastSlam(parameters(), np.random.default_rng(0), keep_history=False)
+    slam.step(np.zeros(3), ONE_LANDMARK)
+    with pytest.raises(ValueError, match="keep_history"):
+        slam.last_associations()

@@ -442,3 +442,69 @@ def test_after_two_closures_landmarks_lie_where_the_poses_saw_them(seed, monkeyp
     for frame in (2 * KNOT_SPACING + 2, n - 10):
         off = between(path[frame - 1], path[frame]) - odometry[frame]
         assert np.all(np.abs(off) < 6 * motion.standard_deviations(odometry[frame]))
+
+
+class KnownDrift(AnyFrames):
+    """Dense Gaussian of the drift at some knots and at present, of any covariance."""
+
+    def __init__(self, seed: int, frames: np.ndarray) -> None:
+        super().__init__(np.zeros((1, 3, 3)), np.zeros(len(frames), dtype=int))
+        root = 0.05 * np.random.default_rng(seed).standard_normal((3 * len(frames),) * 2)
+        self.frames, self.covariance = frames, root @ root.T
+
+    def model(self) -> DriftModel:
+        return DriftModel.at_knots(int(self.frames[-1]), self.frames[:-1], self.covariance.copy())
+
+    def covariances(self, frame: np.ndarray) -> Float:
+        """Return the covariances (n, 3, 3) of the drift, linear between the frames."""
+        weight = np.array(
+            [np.interp(frame, self.frames, each) for each in np.eye(len(self.frames))]
+        )
+        slope = np.einsum("kn,ij->nikj", weight, np.eye(3)).reshape(len(frame), 3, -1)
+        return slope @ self.covariance @ slope.transpose(0, 2, 1)
+
+
+# Knots of other robots, which have negative frames, and of the robot itself.
+KNOTS = np.array([-61, -40, -21, -20, -1, 0, 25, 50, 73])
+
+
+def test_covariances_of_a_known_drift_are_those_of_linear_interpolation():
+    dense, frame = KnownDrift(0, KNOTS), np.arange(-61, 74)
+    np.testing.assert_allclose(
+        dense.model().covariances(frame), dense.covariances(frame), atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("then", [-61, -20, 0, 50])
+def test_closures_of_a_known_drift_are_those_of_dense_algebra(then):
+    rng, dense = np.random.default_rng(then + 100), KnownDrift(1, KNOTS)
+    drift_model = dense.model()
+    noise, now, motion = spread_matrix(rng, 0.02), spread_matrix(rng, 0.01), rng.normal(0, 0.05, 3)
+    before = drift_model.covariances(KNOTS)
+    information = np.linalg.inv(noise)
+    pull = information @ motion
+    drift_model.add_closure(np.array([then]), information[None], pull[None], now, SURE)
+    dense.add_closure(73, then, motion, noise + now)
+    frame = np.arange(-61, 74)
+    np.testing.assert_allclose(drift_model.covariances(frame), dense.covariances(frame), atol=1e-12)
+    found = drift_model.take_correction(FAR)
+    assert found is not None
+    np.testing.assert_allclose(found, dense.mean.reshape(-1, 3), atol=1e-12)
+    less = before - drift_model.covariances(KNOTS)
+    assert np.linalg.eigvalsh(less).min() > -1e-12
+    assert np.trace(less[then == KNOTS][0]) > 1e-4
+
+
+def test_a_known_drift_goes_on_with_the_path():
+    """The present drift grows by what is added; knots follow, and the known ones stay."""
+    rng, dense = np.random.default_rng(0), KnownDrift(2, KNOTS)
+    drift_model = dense.model()
+    steps = [spread_matrix(rng, 0.01) for _ in range(3 * KNOT_SPACING)]
+    for step in steps:
+        drift_model.add_frame(step)
+    last = 73 + 3 * KNOT_SPACING
+    assert drift_model.frame == last
+    found = drift_model.covariances(np.array([*KNOTS, last]))
+    np.testing.assert_allclose(found[:-1], dense.covariances(KNOTS), atol=1e-14)
+    expected = dense.covariances(KNOTS[-1:])[0] + np.sum(steps, axis=0)
+    np.testing.assert_allclose(found[-1], expected, atol=1e-13)

@@ -7,6 +7,7 @@ from mapfusion.fastslam.landmark_arrays import BLOCK, FREE, allocate, slots_near
 from mapfusion.fastslam.measurement import DROPPED, NEW, observations_in_map
 from mapfusion.fastslam.particles import ParticleMaps, PathHistory
 from mapfusion.fastslam.resampling import MEMORY
+from mapfusion.landmark_map import LandmarkMap
 from mapfusion.robot_log import Observations
 
 
@@ -144,3 +145,100 @@ def test_a_landmark_takes_a_row_of_76_bytes_a_particle_and_less_than_500_once():
 
 def test_without_landmarks_nothing_is_near():
     assert len(slots_near(ParticleMaps(2, 9.0).slots, np.array([-1.0, -1, 1, 1]))) == 0
+
+
+def shared_past(n: int, n_particles: int, n_steps: int) -> tuple[PathHistory, list, int]:
+    """Return particles with a shared past of n steps, and the expected lives of all of them."""
+    rng = np.random.default_rng(n)
+    path = rng.normal(size=(n, 3))
+    sources = [rng.integers(-1, 100, rng.integers(4)) for _ in range(n)]
+    history = PathHistory.of_path(path, sources, n_particles)
+    shared = list(path), np.concatenate(sources).tolist()
+    told: list = [(list(shared[0]), list(shared[1])) for _ in range(n_particles)]
+    n_last = len(sources[-1])
+    for step in range(n_steps):
+        poses = rng.normal(size=(n_particles, 3))
+        source = rng.integers(-1, 100, (rng.integers(4), n_particles), dtype=np.int32)
+        history.add(poses, source)
+        n_last = len(source)
+        for m, (own_path, associations) in enumerate(told):
+            own_path.append(poses[m])
+            associations.extend(source[:, m])
+        if step % 5 == 0:
+            ancestors = np.sort(rng.integers(n_particles, size=n_particles)).astype(np.int32)
+            history.resample(ancestors)
+            told = [(list(told[a][0]), list(told[a][1])) for a in ancestors]
+    return history, told, n_last
+
+
+@pytest.mark.parametrize("n_steps", [0, 1, 256, 900])
+@pytest.mark.parametrize("n", [1, 40])
+def test_particles_go_on_from_a_shared_past(n: int, n_steps: int) -> None:
+    history, told, n_last = shared_past(n, 5, n_steps)
+    for m, (path, associations) in enumerate(told):
+        np.testing.assert_array_equal(history.path(m), path)
+        assert history.associations(m).tolist() == associations
+        last = history.last_associations(m)
+        assert last.tolist() == associations[len(associations) - n_last :]
+    assert history.n_kept < n + n_steps + 5 * 257
+
+
+def test_a_shared_past_is_corrected() -> None:
+    rng = np.random.default_rng(0)
+    path, by = rng.normal(size=(4, 3)), rng.normal(size=(5, 3))
+    history = PathHistory.of_path(path, [np.empty(0, dtype=np.int64)] * 4, 3)
+    poses = rng.normal(size=(3, 3))
+    history.add(poses, np.empty((0, 3), dtype=np.int32))
+    history.correct(by)
+    for m in range(3):
+        expected = [matrix(T) @ matrix(own) for T, own in zip(by, [*path, poses[m]], strict=True)]
+        found = np.array([matrix(pose) for pose in history.path(m)])
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_landmarks_that_all_particles_share_take_no_rows_until_they_are_needed() -> None:
+    """More than there are slots for at first; a landmark of one particle alone was there before."""
+    rng, n, n_particles = np.random.default_rng(4), 5 * BLOCK, 3
+    root = rng.normal(0, 0.1, (n, 3, 3))
+    given = LandmarkMap(
+        rng.uniform(-20, 20, (n, 3)),
+        root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(3),
+        rng.integers(1, 9, n).astype(np.int32),
+        np.arange(n),
+        rng.normal(size=(n, 8)).astype(np.float32),
+        rng.integers(0, 99, n).astype(np.int32),
+    )
+    maps = ParticleMaps(n_particles, 9.0)
+    first = Observations(np.array([[1.0, 2, 3]]), np.eye(3)[None])
+    seen = observations_in_map(
+        np.zeros((n_particles, 3)), first.position_m, first.covariance_m2, planar=False
+    )
+    maps.create(np.array([[NEW, DROPPED, DROPPED]]), seen, first, 7)
+    source, last_frame = 1000 + np.arange(n), rng.integers(-50, 50, n)
+    slots = maps.add_common(given, source, last_frame)
+    assert (maps.n_slots, maps.n_rows) == (n + 1, 1)
+    assert maps.n_landmarks.tolist() == [n + 1, n, n]
+
+    def assert_known(particle: int) -> None:
+        which, known = maps.landmarks_of(particle, 1)
+        known = type(known)(*(values[-n:] for values in known))
+        np.testing.assert_array_equal(which[-n:], slots)
+        np.testing.assert_array_equal(known.mean_m, given.position_m)
+        np.testing.assert_array_equal(
+            known.covariance_m2, given.covariance_m2[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        )
+        np.testing.assert_array_equal(known.count, given.count)
+
+    for name in ("descriptor", "label"):
+        np.testing.assert_array_equal(getattr(maps.slots, name)[slots], getattr(given, name))
+    np.testing.assert_array_equal(maps.slots.source[slots], source)
+    np.testing.assert_array_equal(maps.slots.last_frame[slots], last_frame)
+    assert_known(0)
+    for k in range(0, n, 7):
+        at = given.position_m[k, :2]
+        assert slots[k] in slots_near(maps.slots, np.array([*at, *at]))
+    assert maps.bring_up_to_date(slots[::2]).all()
+    assert maps.n_rows == 1 + len(slots[::2])
+    maps.resample(np.array([2, 0, 0], dtype=np.int32))
+    for particle in range(n_particles):
+        assert_known(particle)
