@@ -250,9 +250,28 @@ class Team(Section):
 
     Attributes:
         link: link between the robots.
+        starts: frame of the team in which a robot's log starts, by the name of the robot; 0 for the
+            others.
+        carried: for robots that are the same as another one after it was carried elsewhere, the
+            name of that one. Their logs start when that one ends. They know its maps, but not
+            where they are.
     """
 
     link: LinkParameters = LinkParameters()
+    starts: dict[Name, Annotated[int, Range(0, MAX_COUNT, "frames")]] = Field(default_factory=dict)
+    carried: dict[Name, Name] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _once(self) -> Self:
+        for name, before in self.carried.items():
+            if name in self.starts:
+                raise ValueError(f"starts.{name}: {name} starts when the log of {before} ends")
+            chain = [name]
+            while chain[-1] in self.carried:
+                chain.append(self.carried[chain[-1]])
+                if chain[-1] in chain[:-1]:
+                    raise ValueError(f"carried.{name}: a robot comes before itself")
+        return self
 
 
 class Bound(Section):

@@ -85,6 +85,10 @@ class RobotInput:
         min_count: number of observations that a landmark of the map needs.
         odometry_covariance: covariance of visual odometry, shape (T, 3, 3); None for wheels.
         attitude: attitude that levelled the observations; None for a level robot.
+        start: frame of the team in which the log starts; later than 0 for a robot that joins later.
+        predecessor: name of the log that the robot recorded before it was carried elsewhere and its
+            odometry was reset; empty for none. The robot knows all maps that it knew then, starts
+            when that log ends, and looks for itself in them.
     """
 
     log: RobotLog
@@ -93,6 +97,8 @@ class RobotInput:
     min_count: int = 3
     odometry_covariance: Float | None = None
     attitude: Attitude | None = None
+    start: int = 0
+    predecessor: str = ""
 
 
 class _Aligned(NamedTuple):
@@ -170,6 +176,17 @@ class TeamRobot:
         """True if the log has no more frames."""
         return self.iteration == len(self.given.log) - 1
 
+    @property
+    def is_lost(self) -> bool:
+        """True if the robot was carried elsewhere and has not found itself in any map."""
+        return bool(self.given.predecessor) and not self.adopted
+
+    def inherit(self, predecessor: "TeamRobot") -> None:
+        """Take over the maps that the robot knew before it was carried elsewhere."""
+        self._received = dict(predecessor._received)
+        if predecessor._compact is not None:
+            self._received[predecessor.name] = predecessor._version, predecessor._compact
+
     def n_shared_now(self) -> int:
         """Return the number of observations in the last frame of landmarks that others mapped."""
         sources = self.filter.last_associations()
@@ -183,6 +200,8 @@ class TeamRobot:
     def smooth(self) -> None:
         """Smooth the log so far; without a solution the robot keeps the map that it has."""
         given = self.given
+        if self.own is not None and self.own.n_frames == self.iteration + 1:
+            return  # nothing is new
         log = first_frames(given.log, self.iteration + 1)
         if floor_m := given.filter.noise_floor_m:
             wider_m2 = log.observations.covariance_m2 + floor_m**2 * np.eye(3)

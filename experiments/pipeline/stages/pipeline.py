@@ -406,6 +406,14 @@ def _fusers(
 def _team(scenario: Scenario, robots: Sequence[RobotStages]) -> Stage:
     """Return the stage of the robots that exchange maps; it uses the aligner of `merge`."""
     assert scenario.team is not None
+    names, own = {robot.name for robot in robots}, scenario.team
+    named = {"starts": own.starts, "carried": own.carried}
+    for key, robots_of in named.items():
+        others = own.carried.values() if key == "carried" else ()
+        for name in (*robots_of, *others):
+            if name not in names:
+                known = f"known are {', '.join(sorted(names, key=name_order))}"
+                raise InputError(f"team.{key}: there is no robot {name}, {known}")
     entries = scenario.align.aligners
     entry = next(each for each in entries if each.name == scenario.merge.aligner)
     method = find_method(entry.method)

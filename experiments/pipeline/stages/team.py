@@ -108,6 +108,8 @@ class TeamSettings:
     every: int
     robots: tuple[str, ...]
     link: LinkParameters
+    starts: dict[str, int]
+    carried: dict[str, str]
     method: str
     parameters: dict[str, Any]
     time_limit_s: float
@@ -135,21 +137,24 @@ def run(settings: TeamSettings, job: Job) -> dict[str, float]:
             raise InputError(f"team.range_m: the true poses of {name} are needed, but unknown")
         distance_m = path_distances(known)
     team = Team(given, merging, settings.link, settings.seed, distance_m)
-    evaluated = set(evaluated_iterations(len(team.time_s), settings.every))
+    evaluated = [set(evaluated_iterations(len(each.log), settings.every)) for each in given]
     frames: dict[str, list[pd.DataFrame]] = {"maps": [], "paths": []}
     lists: dict[str, list[dict[str, Any]]] = {"steps": [], "events": [], "messages": []}
     seconds: dict[str, float] = {"alone": 0.0, "joint": 0.0}
     for k in range(len(team.time_s)):
         moment = team.step(k)
-        for robot, frame, took_s in zip(team.robots, moment.frames, moment.seconds, strict=True):
-            if frame is not None:
-                seconds["joint" if robot.adopted else "alone"] += took_s
-                lists["steps"].append(_step_row(robot, frame.result.best_pose))
-            if k in evaluated:
-                frames["maps"].append(_map_rows(robot, k))
+        done = zip(team.robots, moment.frames, moment.seconds, evaluated, strict=True)
+        for robot, frame, took_s, own in done:
+            if frame is None:
+                continue
+            seconds["joint" if robot.adopted else "alone"] += took_s
+            lists["steps"].append(_step_row(robot, frame.result.best_pose))
+            if frame.iteration in own:
+                frames["maps"].append(_map_rows(robot, frame.iteration))
                 path = robot.filter.best_path()
                 poses = {"iteration": np.arange(len(path))} | named_columns(POSE_FIELDS, path)
-                frames["paths"].append(pd.DataFrame(poses).assign(robot=robot.name, evaluated=k))
+                at = {"robot": robot.name, "evaluated": frame.iteration}
+                frames["paths"].append(pd.DataFrame(poses).assign(**at))
         lists["events"] += [_event_row(event) for event in moment.events]
         for sent in moment.sent:
             message = sent.message
@@ -175,7 +180,8 @@ def _input_of(settings: TeamSettings, job: Job, name: str) -> RobotInput:
     smoother = log_to_smooth(folder, slam, settings.smoother)[1]
     own = replace(settings.filter, motion=motion)
     attitude = read_attitude(folder, len(log))
-    return RobotInput(log, own, smoother, settings.min_count, covariance, attitude)
+    when = settings.starts.get(name, 0), settings.carried.get(name, "")
+    return RobotInput(log, own, smoother, settings.min_count, covariance, attitude, *when)
 
 
 def _step_row(robot: TeamRobot, pose: np.ndarray) -> dict[str, Any]:

@@ -433,6 +433,10 @@ def test_a_restarted_filter_has_the_given_map_path_and_associations(association)
     np.testing.assert_array_equal(slam.best_associations(), prior.associations)
     last = prior.associations[prior.frame_starts[-2] :]
     np.testing.assert_array_equal(slam.last_associations(), last)
+    motion = np.array([0.2, 0.0, 0.1])
+    result = slam.step(motion, nothing(), np.zeros(3))
+    np.testing.assert_array_equal(result.cloud, np.tile(compose(prior.path[-1], motion), (15, 1)))
+    np.testing.assert_array_equal(result.log_weights, np.full(15, -np.log(15)))
 
 
 @pytest.mark.parametrize("association", ["descriptor", "gate", "label"])

@@ -162,8 +162,8 @@ def test_robots_hear_each_other_within_the_range() -> None:
     for near, messages in zip(apart_m <= range_m, sent, strict=True):
         assert [each.is_lost for each in messages] == [not near] * 2
     assert 0 < np.count_nonzero(apart_m <= range_m) < 6
-    distance_m = path_distances([paths[0], paths[1][:5]])
-    assert distance_m(1, 0, 17) == pytest.approx(np.linalg.norm((paths[0][17] - paths[1][4])[:2]))
+    off_m = (paths[0][17] - paths[1][4])[:2]
+    assert path_distances(paths)(1, 4, 0, 17) == pytest.approx(np.linalg.norm(off_m))
 
 
 @pytest.mark.parametrize(("delay_s", "frame"), [(0.0, 10), (3.0, 16)])
