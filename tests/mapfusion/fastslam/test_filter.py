@@ -426,7 +426,7 @@ def assert_is(found: LandmarkMap, expected: LandmarkMap, source: np.ndarray) -> 
 
 @pytest.mark.parametrize("association", ["descriptor", "gate", "label"])
 def test_a_restarted_filter_has_the_given_map_path_and_associations(association):
-    slam, prior = restarted(drive(3), association=association)
+    slam, prior = restarted(drive(3), association=association, resample_fraction=0.0)
     assert_is(slam.best_map(min_count=1), prior.landmarks, prior.source)
     assert slam.n_slots == 12
     np.testing.assert_array_equal(slam.best_path(), prior.path)
