@@ -52,6 +52,10 @@ _SMOOTHER |= columns(".1%", gross_share="gross", coverage_95="in 95 %")
 _FUSERS = columns("", fuser="fuser") | columns(".2g", landmark_rmse_m="landmarks, m")
 _FUSERS |= columns(".2g", over_better_filter="over filter", nees_per_dof="NEES / dof")
 _FUSERS |= columns(".0%", coverage_95="in 95 %")
+_ADOPTION = columns("d", n_robots="robots", n_adopting="adopting")
+_ADOPTION |= columns(".2f", path_over_alone="path /\nalone") | columns(".0%", worse="worse")
+_ADOPTION |= columns(".2g", landmark_rmse_m="landmarks\nm", frame_nees_per_dof="NEES\n/ dof")
+_ADOPTION |= columns(".0%", frame_coverage_95="in\n95 %", shared_share="shared")
 _TEAM = columns("", source="path") | columns(">", robots="robots")
 _TEAM |= columns(".3g", rmse="RMSE, m", median="median", max="max")
 _TEAM_PAIRS = columns("d", n_pairs="pairs\nof maps", n_met="met") | columns(
@@ -112,6 +116,10 @@ def print_summary(summary: Summary, written: Path | None, skipped: Sequence[str]
     note += "fitted error over that of the better FastSLAM map; (95 %, bootstrap)"
     title = "Fused maps by fuser at the end, median over runs"
     _print(_rows(summary, "fusers"), _FUSERS, title, note)
+    note = "path / alone: path errors since the first adoption over those of the independent\n"
+    note += "robots; worse: share of robots above 1.1; landmarks: adopted ones; (95 %, bootstrap)"
+    title = "Robots that exchange maps while they drive, median over robots and runs"
+    _print(_rows(summary, "adoption"), _ADOPTION, title, note)
     team = _rows(summary, "team")
     if len(team):
         robots = team["n_robots"].map(str) + "/" + team["n_team"].map(str)

@@ -152,6 +152,11 @@ FUSION_COLUMNS = ("nees_with_drift", "nees_without_drift", "degrees_of_freedom",
 SMOOTHER_COLUMNS = ("path_rmse_m", "filter_over_smoother", "landmark_rmse_m", "gross_share")
 SMOOTHER_COLUMNS += ("nees_per_dof", "coverage_95")
 _FUSER_FIGURES = ("landmark_rmse_m", "over_better_filter", "nees_per_dof", "coverage_95")
+_ADOPTED_FIGURES = ("landmark_rmse_m", "frame_nees_per_dof", "frame_coverage_95")
+_ADOPTED_FIGURES += ("shared_share", "sent_kb")
+ADOPTION_COLUMNS = ("robot", "iteration", "merged_path_rmse_m", "alone_merged_path_rmse_m")
+ADOPTION_COLUMNS += _ADOPTED_FIGURES
+_WORSE = 1.1  # times the error of the independent robot
 FUSER_COLUMNS = ("fuser", "iteration", *_FUSER_FIGURES)
 _PATH_KEYS = ["source", "quantity", "delta", "delta_unit"]
 
@@ -260,6 +265,25 @@ def smoother_summary(smoother: pd.DataFrame, rng: np.random.Generator) -> pd.Dat
     return pd.DataFrame([about | _medians(smoother, SMOOTHER_COLUMNS, rng)])
 
 
+def adoption_summary(team_members: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """Summarise robots that went on in a joint map (table `team_members`): medians over robots.
+
+    Robots count at their last iteration.
+
+    Returns:
+        One row: n_runs, n_robots, n_adopting, `worse` (share of these whose path error since the
+        merge is more than 1.1 times the independent robot's), and medians with their intervals.
+    """
+    last = team_members.sort_values("iteration").groupby(["run_id", "robot"]).tail(1)
+    own = last[last["merged_path_rmse_m"].notna()]
+    over_alone = own["merged_path_rmse_m"] / own["alone_merged_path_rmse_m"]
+    own = own.assign(path_over_alone=over_alone)
+    row: dict[str, Any] = {"n_runs": intervals.clusters_of(last).n, "n_robots": len(last)}
+    row |= {"n_adopting": len(own)}
+    row |= {"worse": float((over_alone > _WORSE).mean()) if len(own) else np.nan}
+    return pd.DataFrame([row | _medians(own, ("path_over_alone", *_ADOPTED_FIGURES), rng)])
+
+
 def fuser_summary(fusers: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """Summarise fusers (table `fusers`): medians over runs, each at its last iteration.
 
@@ -361,6 +385,7 @@ _FURTHER: dict[str, tuple[Any, str, Callable[..., pd.DataFrame], str]] = {
     "landmark_nees": (None, "nees", nees_of_maps, "nees"),
     "smoother": (SMOOTHER_COLUMNS, "smoother", smoother_summary, "smoother"),
     "fusers": (FUSER_COLUMNS, "fusers", fuser_summary, "fusers"),
+    "team_members": (ADOPTION_COLUMNS, "adoption", adoption_summary, "adoption"),
     "fusion": (FUSION_COLUMNS, "nees", nees_of_pairs, "fusion"),
     "errors": (
         alignment_criteria.CONSISTENCY_COLUMNS,
@@ -428,9 +453,10 @@ def summarise(runs: Runs) -> Summary:
 
     made["errors_by_iteration"] = _each(medians, bands)
     timings = pd.DataFrame()
-    missing = tuple(table for table in _FURTHER if not runs.has(table))
+    absent = [table for table in _FURTHER if not runs.has(table)]
+    missing = tuple(table for table in absent if table != "team_members")  # few have a team
     for table, (columns, name, made_of, seed) in _FURTHER.items():
-        if table not in missing:
+        if table not in absent:
             rows = runs.read(table, columns)
             made[name] = _joined([made.get(name, pd.DataFrame()), _each(rows, made_of, seed)])
             timings = rows if table == "aligner_timings" else timings

@@ -145,7 +145,7 @@ _TABLES = (
     "map_fits",
     "landmark_nees",
 )
-_TABLES += ("sightings", "smoother", "team", "team_pairs", "fusers")
+_TABLES += ("sightings", "smoother", "team", "team_pairs", "fusers", "team_members", "adoptions")
 
 
 class Sweep(NamedTuple):
@@ -229,6 +229,7 @@ def plan_run(
     read = [stage for robot in pipeline.robots for stage in (robot.log, robot.slam, robot.smooth)]
     read += [*(pair.filtered.estimates for pair in pipeline.pairs), *evaluated.evaluations]
     read += pipeline.fusers.values()
+    read += [] if pipeline.team is None else [pipeline.team]
     needs = tuple(name for stage in read for name in task_names(stage))
     name, arguments = f"run/{run.run_id}", (run, evaluated, stages, tables.dataset)
     last = Task(name, "write the tables", rows_of, arguments, (), needs)

@@ -11,6 +11,7 @@ from mapfusion.align.alignment import Status
 from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry.se2 import between
 from mapfusion.landmark_map import LandmarkMap
+from mapfusion.robot_log import first_frames
 from mapfusion.team.adoption import ADOPTED
 from mapfusion.team.map_message import MapMessage
 from mapfusion.team.robot import Event, TeamRobot
@@ -25,6 +26,7 @@ from tests.mapfusion.team.teams_of_points import (
     given,
     kinds,
     merging,
+    smoothed_of,
 )
 
 # Robots that see much of what the others saw within 30 frames.
@@ -124,10 +126,20 @@ def test_a_message_holds_the_robots_own_map_alone() -> None:
     meet(team, 4)
     north, south = team
     assert north.adopted == ("south",)
+    go_on(team, 10)
     exchange(team)
-    own = received(south, "north").source_observation
-    assert own.max() < len(north.given.log.observations)
+    found = received(south, "north")
+    assert found.source_observation.max() < len(north.given.log.observations)
     assert_has_map_of(south, north)
+    # as certain as without the other robot
+    alone = smoothed_of(first_frames(north.given.log, 50))[1].landmarks
+    assert found.label is not None
+    assert alone.label is not None
+    _, rows, of_alone = np.intersect1d(found.label, alone.label, return_indices=True)
+    assert len(rows) > 0.95 * len(alone)
+    found_m2, alone_m2 = found.covariance_m2[rows], alone.covariance_m2[of_alone]
+    share = np.trace(found_m2, axis1=1, axis2=2) / np.trace(alone_m2, axis1=1, axis2=2)
+    assert np.median(share) == pytest.approx(1.0, abs=0.05)
 
 
 def test_after_a_receipt_only_changes_are_sent() -> None:
