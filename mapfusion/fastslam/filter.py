@@ -315,9 +315,9 @@ class FastSlam:
         self._tracked, self._best = ActiveTracks(), 0
         if self._descriptor_kind is None:
             self._descriptor_kind = landmarks.descriptor_kind
-        if landmarks.label is not None:
-            known = zip(landmarks.label.tolist(), slot_indices.tolist(), strict=True)
-            self._slot_of_label = {label: slot for label, slot in known if label != NO_LABEL}
+        labels = [] if landmarks.label is None else landmarks.label.tolist()
+        known = zip(labels, slot_indices.tolist(), strict=False)
+        self._slot_of_label = {label: slot for label, slot in known if label != NO_LABEL}
         if self._history is not None:
             sources = np.split(prior.associations, prior.frame_starts[1:-1])
             self._history = PathHistory.of_path(prior.path, sources, n_particles)

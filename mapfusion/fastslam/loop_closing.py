@@ -64,7 +64,7 @@ class DriftModel:
             covariance: (3K + 3, 3K + 3) covariance of the drift at the knots and at present.
         """
         model = cls()
-        model.frame, model._knots, model._covariance = frame, knots, covariance
+        model.frame, model._knots, model._covariance = frame, knots, covariance.copy()
         model._pending = np.zeros(len(covariance))
         return model
 

@@ -201,22 +201,24 @@ def prior_of(
         offset_m2: variance of the offset between a track's point and its landmark.
     """
     own, landmarks, parents = maps[0], fused.landmarks, fused.parents
-    assert landmarks.joint is not None
+    joint = landmarks.joint
+    if joint is None:  # a simpler fuser stood in
+        joint = JointCovariance(landmarks.covariance_m2, np.zeros((len(landmarks), 0, 3)))
     is_own = parents[:, 0] != ABSENT
     source = ADOPTED + np.arange(len(landmarks), dtype=np.int64)
     source[is_own] = own.landmarks.source_observation[parents[is_own, 0]]
     # logs of the others precede that of the robot
-    last_frame, segments, first = np.full(len(landmarks), -1), [(0, len(log) - 1)], 0
+    last_frame, segments, first = np.zeros(len(landmarks), np.int64), [(0, len(log) - 1)], 0
     for k in fused.members[1:]:
         other = maps[k]
         first -= other.n_frames
-        has = parents[:, k] != ABSENT
+        has = (parents[:, k] != ABSENT) & (last_frame == 0)  # the first robot that has it
         last_frame[has] = first + other.last_frame[parents[has, k]]
         segments.insert(0, (first, first + other.n_frames - 1))
     last_frame[is_own] = own.last_frame[parents[is_own, 0]]
 
-    drift = drift_of_map(landmarks.joint, landmarks.position_m, last_frame, segments)
-    conditional_m2 = landmarks.joint.own_m2 + drift.remainder_m2 + offset_m2 * np.eye(3)
+    drift = drift_of_map(joint, landmarks.position_m, last_frame, segments)
+    conditional_m2 = joint.own_m2 + drift.remainder_m2 + offset_m2 * np.eye(3)
 
     fused_row = np.full(len(own.landmarks), ABSENT)
     fused_row[parents[is_own, 0]] = np.flatnonzero(is_own)

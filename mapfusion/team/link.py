@@ -14,14 +14,16 @@ class LinkParameters:
     """Settings of the link.
 
     Attributes:
-        every: number of frames between two exchanges of maps.
+        every: number of frames between two exchanges of maps. A robot that goes on in the joint map
+            forgets landmarks that it has seen too rarely for its map; with fewer frames it would
+            forget many.
         range_m: largest distance of two robots that hear each other; None: any.
         loss: probability that a message is lost.
         delay_s: time between the end of a transmission and its arrival.
         bytes_per_s: data rate of a robot's transmitter; None: a message takes no time.
     """
 
-    every: Annotated[int, Range(1, 1_000_000, "frames")] = 20
+    every: Annotated[int, Range(5, 1_000_000, "frames")] = 20
     range_m: Annotated[float, Range(0, 1e6, "m")] | None = None
     loss: Annotated[float, Range(0, 1, "1")] = 0.0
     delay_s: Annotated[float, Range(0, 1e6, "s")] = 0.0

@@ -34,6 +34,9 @@ from mapfusion.team.map_message import CompactMap, MapMessage
 from mapfusion.verification.registration import Registration
 from mapfusion.verification.rivals import DISTINCT_M
 
+# Most maps that a sender keeps for a receiver that does not confirm them.
+_MOST_UNRECEIVED = 16
+
 
 class Event(NamedTuple):
     """Change of what a robot has adopted.
@@ -105,6 +108,8 @@ class _Aligned(NamedTuple):
     """Verified alignment of two maps, with the numbers of these maps.
 
     `is_confirmed` is true if an alignment of earlier maps was accepted, too, and agrees.
+    `T_accepted` is the motion that was last accepted, at this exchange or the one before; None if
+    there is none.
     """
 
     versions: tuple[int, int]
@@ -112,6 +117,7 @@ class _Aligned(NamedTuple):
     correspondences: Correspondences
     log10_false_alarms: float
     is_confirmed: bool
+    T_accepted: Float | None = None
 
 
 class Origin(NamedTuple):
@@ -154,11 +160,14 @@ class TeamRobot:
         self._smoothed: Smoothed | None = None
         self._compact: CompactMap | None = None
         self._received: dict[str, tuple[int, CompactMap]] = {}
+        # Maps that a sender may still build messages on, by version.
+        self._bases: dict[str, dict[int, CompactMap]] = {}
         self._timed: dict[str, tuple[int, TimedMap]] = {}
         self._acknowledged: dict[str, tuple[int, CompactMap]] = {}
         self._sent: dict[str, dict[int, CompactMap]] = {}
         self._aligned: dict[tuple[str, str], _Aligned] = {}
         self._missed: set[str] = set()
+        self._on_trial: set[str] = set()
 
     @property
     def iteration(self) -> int:
@@ -224,7 +233,10 @@ class TeamRobot:
             return None
         version, known = self._acknowledged.get(receiver, (0, None))
         message = MapMessage.between(known, self._compact, (version, self._version))
-        self._sent.setdefault(receiver, {})[self._version] = message.applied_to(known)
+        sent = self._sent.setdefault(receiver, {})
+        sent[self._version] = message.applied_to(known)
+        if len(sent) > _MOST_UNRECEIVED:
+            del sent[min(sent)]
         return message.with_receipts({name: n for name, (n, _) in self._received.items()})
 
     def receive(self, sender: str, message: MapMessage) -> None:
@@ -234,15 +246,18 @@ class TeamRobot:
         if receipt in sent:
             self._acknowledged[sender] = receipt, sent[receipt]
             self._sent[sender] = {n: each for n, each in sent.items() if n > receipt}
-        version, known = self._received.get(sender, (0, None))
-        if message.version <= version or message.base > version:
+        version, _ = self._received.get(sender, (0, None))
+        bases = self._bases.get(sender, {})
+        if message.version <= version or (message.base and message.base not in bases):
             return
-        base = known if message.base else None
-        self._received[sender] = message.version, message.applied_to(base)
+        found = message.applied_to(bases.get(message.base))
+        self._received[sender] = message.version, found
+        kept = {n: each for n, each in bases.items() if n >= message.base}
+        self._bases[sender] = kept | {message.version: found}
 
     def merge(self) -> list[Event]:
         """Align and fuse the maps that the robot has; go on in the fused map."""
-        if self.own is None:
+        if self.own is None or self.own.n_frames <= self.iteration:  # smoothing failed
             return []
         names = [self.name, *sorted(self._received, key=name_order)]
         maps = [self.own, *(self._timed_map(name) for name in names[1:])]
@@ -266,11 +281,12 @@ class TeamRobot:
         members = (0,) if component is None else tuple(component.members.tolist())
         found = {names[k] for k in members[1:]}
         missing = set(self.adopted) - found
-        events = self._events(found, missing)
-        if missing - self._missed:  # the filter stays in the map that it has
-            self._missed |= missing
-            return events
-        self._missed = set()
+        kept = missing - self._missed
+        self._missed = missing if kept else set()
+        if kept:  # the filter stays in the map that it has
+            return self._events(dict.fromkeys(kept, "kept"))
+        kinds = dict.fromkeys(found - set(self.adopted), "adopted")
+        events = self._events(kinds | dict.fromkeys(missing, "dropped"), component, names)
         if not found and not missing:
             return events
         if component is None:
@@ -298,28 +314,36 @@ class TeamRobot:
         rng = generator(self._seed, "team", self.name, *names, self.iteration)
         registered = merging.registration.register(*maps, pairs, rng)
         alignment = registered.applied
-        agrees = False
-        if before is not None and before.alignment.ok and alignment.ok:
+        agrees, T_accepted = False, alignment.T_a_b if alignment.ok else None
+        if alignment.ok and before is not None and before.T_accepted is not None:
             p_b = maps[1].position_m[:, :2]
-            distance_m = rms_distance_m(alignment.T_a_b, before.alignment.T_a_b, p_b)
+            distance_m = rms_distance_m(alignment.T_a_b, before.T_accepted, p_b)
             agrees = distance_m < DISTINCT_M
+        elif not alignment.ok and before is not None and before.alignment.ok:
+            T_accepted = before.T_accepted
         log10 = registered.verdict.log10_false_alarms
-        return _Aligned(versions, alignment, pairs, log10, agrees)
+        return _Aligned(versions, alignment, pairs, log10, agrees, T_accepted)
 
-    def _events(self, found: set[str], missing: set[str]) -> list[Event]:
-        """Return what changes at this exchange."""
-        kinds = dict.fromkeys(found - set(self.adopted), "adopted")
-        kinds |= {name: "dropped" if name in self._missed else "kept" for name in missing}
+    def _events(
+        self, kinds: dict[str, str], fused: FusedMap | None = None, names: Sequence[str] = ()
+    ) -> list[Event]:
+        """Return what changes at this exchange: kinds of change by robot, and new trials."""
+        on_trial = set[str]()
         for a, b in self._aligned:
             known = self._aligned[a, b]
             is_new = b not in kinds and b not in self.adopted
             if a == self.name and is_new and known.alignment.ok and not known.is_confirmed:
-                kinds[b] = "on trial"
+                on_trial.add(b)
+        kinds |= dict.fromkeys(on_trial - self._on_trial, "on trial")
+        self._on_trial = on_trial
         events = []
         for name in sorted(kinds, key=name_order):
             alignment = self._aligned[self.name, name].alignment
-            motion = alignment.T_a_b, alignment.covariance
-            made = self.iteration, self.name, name, kinds[name], *motion, alignment.reason
+            motion, reason = (alignment.T_a_b, alignment.covariance), alignment.reason
+            if kinds[name] == "adopted" and fused is not None:  # perhaps by way of another robot
+                k, reason = names.index(name), alignment.reason if alignment.ok else ""
+                motion = fused.T_first_map[k], fused.motion_covariance[k]
+            made = self.iteration, self.name, name, kinds[name], *motion, reason
             events.append(Event(*made))
         return events
 

@@ -144,7 +144,7 @@ def test_a_run_judges_its_team_beside_the_independent_robots(trio_result: Path) 
     ("team", "told"),
     [
         ("{link: {loss: 1.5}}", "team.link.loss: is 1.5"),
-        ("{link: {every: 0}}", "team.link.every: is 0"),
+        ("{link: {every: 4}}", "team.link.every: is 4"),
         ("{starts: {R2: 5}, carried: {R2: R1}}", "R2 starts when the log of R1 ends"),
         ("{carried: {R2: R1, R1: R2}}", "a robot comes before itself"),
     ],

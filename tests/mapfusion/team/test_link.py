@@ -82,7 +82,7 @@ def test_the_same_messages_are_lost_at_any_rate_and_range() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("every", 0), ("loss", 1.1), ("delay_s", -1.0), ("bytes_per_s", 0.0), ("range_m", -1.0)],
+    [("every", 4), ("loss", 1.1), ("delay_s", -1.0), ("bytes_per_s", 0.0), ("range_m", -1.0)],
 )
 def test_wrong_settings_are_named(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=name):

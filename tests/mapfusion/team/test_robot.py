@@ -336,3 +336,68 @@ def test_landmarks_of_others_become_the_robots_own_when_it_sees_them() -> None:
     np.testing.assert_array_equal(labels[own.source_observation], own.label)
     # one landmark a label: observations before and after the adoption belong together
     assert len(np.unique(own.label)) == len(own)
+
+
+def test_one_refusal_does_not_drop_a_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    refuse(monkeypatch, lambda names, iteration: iteration == 49)
+    team = robots(*drives("north", "south"))
+    assert [e.kind for e in meet(team, 7) if e.robot == "north"] == ["on trial", "adopted", "kept"]
+    assert team[0].adopted == ("south",)
+
+
+def test_an_adoption_is_told_when_it_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """South is refused from frame 49 on; west is confirmed at the same exchange."""
+
+    def refused(names: tuple[str, str], iteration: int) -> bool:
+        late, pair = iteration >= 49, set(names)
+        early_west = pair == {"north", "west"} and iteration < 39
+        return (names == ("north", "south") and late) or early_west or pair == {"south", "west"}
+
+    refuse(monkeypatch, refused)
+    team = robots(*drives("north", "south", "west"))
+    for _ in range(7):
+        for event in meet(team, 1):
+            if event.robot == "north" and event.kind == "adopted":
+                assert event.other in team[0].adopted
+
+
+def test_a_failed_smoothing_does_not_turn_the_filter_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    team = robots(*drives("north", "south"))
+    meet(team, 4)
+    assert team[0].adopted
+
+    def fails(*given: object, **named: object) -> None:
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr("mapfusion.team.robot.smooth", fails)
+    meet(team, 1)
+    assert len(team[0].filter.best_path()) == 50
+
+
+def test_an_adoption_by_way_of_another_robot_tells_its_motion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The own alignment of north with west is refused and wrong."""
+    align = TeamRobot._align
+
+    def wrong(robot, names, maps, versions):
+        found = align(robot, names, maps, versions)
+        if set(names) != {"north", "west"}:
+            return found
+        refused = {"T_a_b": np.full(3, 9.0), "status": Status.REFUSED, "reason": "forced"}
+        return found._replace(alignment=replace(found.alignment, **refused), is_confirmed=False)
+
+    monkeypatch.setattr(TeamRobot, "_align", wrong)
+    driven = drives("north", "south", "west")
+    events = [e for e in meet(robots(*driven), 4) if e.robot == "north"]
+    (event,) = [e for e in events if (e.kind, e.other) == ("adopted", "west")]
+    true = between(driven[0].T_world_robot[0], driven[2].T_world_robot[0])
+    np.testing.assert_allclose(event.T_robot_other, true, atol=0.1)
+    assert event.reason == ""
+
+
+def test_a_trial_is_told_once() -> None:
+    """Both logs end while the alignment is on trial."""
+    team = robots(*drives("north", "south", n_frames=30))
+    told = [event.kind for event in meet(team, 6) if event.robot == "north"]
+    assert told.count("on trial") == 1

@@ -1,12 +1,14 @@
 """Tests of `mapfusion.team.team`."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from mapfusion.fastslam.mapping import run_log
-from mapfusion.geometry.numerics import Float, generator
+from mapfusion.geometry.numerics import Float, chi_square_bound, generator
+from mapfusion.geometry.se2 import between
 from mapfusion.robot_log import RobotLog
 from mapfusion.team.link import LinkParameters
 from mapfusion.team.robot import TeamRobot
@@ -176,3 +178,31 @@ def test_messages_arrive_after_their_delay(delay_s: float, frame: int) -> None:
         team.step(k)
         arrived.append("south" in team.robots[0]._received)
     assert arrived.index(True) == frame
+
+
+def test_a_robot_that_was_carried_elsewhere_finds_itself() -> None:
+    """South is north after it was carried; it joins when the log of north ends."""
+    first, second = drive(0, n_frames=60), drive(0, "south", SOUTH, 60)
+    inputs = given(first, second)
+    inputs[1] = replace(inputs[1], predecessor="north")
+    team = Team(inputs, merging(), LinkParameters(every=EVERY, loss=1.0), seed=0)
+    assert team.starts == [0, 60]
+    assert len(team.time_s) == 120
+    moments = [team.step(k) for k in range(120)]
+    assert moments[59].frames[1] is None
+    assert moments[60].frames[0] is None
+    events = [event for moment in moments for event in moment.events if event.robot == "south"]
+    found = next(event for event in events if event.kind == "adopted")
+    assert found.iteration % 5 == 0  # before the next exchange is due
+    true = between(second.T_world_robot[0], first.T_world_robot[0])
+    error = found.T_robot_other - true
+    assert error @ np.linalg.solve(found.covariance, error) < chi_square_bound(0.999, 3)
+
+
+def test_a_late_robot_joins() -> None:
+    inputs = given(drive(0, n_frames=60), drive(0, "south", SOUTH, 60))
+    inputs[1] = replace(inputs[1], start=30)
+    team = Team(inputs, merging(), LinkParameters(every=EVERY), seed=0)
+    events = [event for k in range(90) for event in team.step(k).events]
+    assert {event.robot for event in events if event.kind == "adopted"} == {"north", "south"}
+    assert all(event.iteration < 60 for event in events)
