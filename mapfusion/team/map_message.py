@@ -151,12 +151,14 @@ class CompactMap(NamedTuple):
         described = self.descriptor.astype(np.float32) * self.scale[:, None]
         viewing = None
         if header.field is not None:
-            seen = (landmarks[name] for name in ("direction_rad", "distance_m"))
-            seen = [values.astype(np.float64) for values in seen]
-            pose = self.frames["pose"].astype(np.float64)
-            reach = self.frames["reach_m"].astype(np.float32)
-            n_views = landmarks["n_views"].astype(np.int32)
-            viewing = Viewing(*seen, n_views, pose, reach, header.field)
+            viewing = Viewing(
+                landmarks["direction_rad"].astype(np.float64),
+                landmarks["distance_m"].astype(np.float64),
+                landmarks["n_views"].astype(np.int32),
+                self.frames["pose"].astype(np.float64),
+                self.frames["reach_m"].astype(np.float32),
+                header.field,
+            )
         received = LandmarkMap(
             position,
             joint.marginal_m2,

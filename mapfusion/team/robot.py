@@ -339,12 +339,12 @@ class TeamRobot:
         events = []
         for name in sorted(kinds, key=name_order):
             alignment = self._aligned[self.name, name].alignment
-            motion, reason = (alignment.T_a_b, alignment.covariance), alignment.reason
+            T, covariance, reason = alignment.T_a_b, alignment.covariance, alignment.reason
             if kinds[name] == "adopted" and fused is not None:  # perhaps by way of another robot
-                k, reason = names.index(name), alignment.reason if alignment.ok else ""
-                motion = fused.T_first_map[k], fused.motion_covariance[k]
-            made = self.iteration, self.name, name, kinds[name], *motion, reason
-            events.append(Event(*made))
+                k, reason = names.index(name), reason if alignment.ok else ""
+                T, covariance = fused.T_first_map[k], fused.motion_covariance[k]
+            of = self.iteration, self.name, name, kinds[name]
+            events.append(Event(*of, T, covariance, reason))
         return events
 
     def _adopt(self, fused: FusedMap, names: Sequence[str], maps: Sequence[TimedMap]) -> None:
