@@ -150,7 +150,9 @@ def metric_page() -> str:
         text = inspect.getdoc(getattr(of, "func", of)) or ""
         text = " ".join(text.split()).removeprefix("Return ").removesuffix(".")
         which = getattr(of, "keywords", {}).get("variant", "")
-        return f"{text}; here: {MEANING.get(which, f'`{which}`')}" if which else text
+        if "column" in text:
+            return f"{text}; here: {MEANING[which]}"
+        return f"{text}; here: `{which}`" if which and " or " in text else text
 
     add("Of a run", {name: meaning(METRICS[name]) for name in settings.RUN_METRICS})
     of_aligners = {f"ALIGNER.{name}": meaning(of) for name, of in ALIGNER_METRICS.items()}

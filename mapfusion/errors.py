@@ -165,7 +165,7 @@ _FORMER_MODULES = {
         "registration align.registration align.supported align.completion"
     ),
     "verification.verdict": "evidence.precision evidence.pair_evidence evidence.judge",
-    "fusion": "fuse team",
+    "fusion": "fuse",
     "fastslam.landmark_arrays": "fastslam.landmarks",
     "fusion.landmark_association": (
         "fusion.aligned_landmarks aligned_landmarks same_point fuse.clusters"

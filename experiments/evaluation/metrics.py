@@ -185,13 +185,13 @@ def _adopting(tables: Tables) -> pd.DataFrame:
     return rows.merge(adopted, on=["seed", "robot"])
 
 
-@metric(**{"adoption.robots": "size", "adoption.first_iteration": "min"})
+@metric(**{"adoption.robots": "number", "adoption.first_iteration": "first"})
 def _adoptions(tables: Tables, variant: str) -> float:
-    """Return the number of robots that adopted maps or the first iteration, median over seeds."""
+    """Return the number of adopting robots or the first iteration of it, median over seeds."""
     if tables["team_members"].empty:
         return np.nan
     adopted = tables["adoptions"].query("event == 'adopted'")
-    if variant == "size":
+    if variant == "number":
         n_robots = adopted.groupby("seed")["robot"].nunique()
         return n_robots.reindex(tables["team_members"]["seed"].unique(), fill_value=0).median()
     return adopted.groupby("seed")["iteration"].min().median()
@@ -208,7 +208,10 @@ def _false_adoptions(tables: Tables, variant: str) -> float:
 
 @metric(**{"adoption.path_over_alone": "median", "adoption.path_over_alone_worst": "max"})
 def _path_over_alone(tables: Tables, variant: str) -> float:
-    """Return the path error since the merge over the independent robot's, over robots and seeds."""
+    """Return the path error since the merge over the independent robot's.
+
+    It is the median or the max over robots and seeds.
+    """
     rows = _adopting(tables)
     return (rows["merged_path_rmse_m"] / rows["alone_merged_path_rmse_m"]).agg(variant)
 

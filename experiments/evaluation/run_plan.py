@@ -33,6 +33,7 @@ _TYPICAL_S: Mapping[str, float] = {
     "observed": 0.008,
     "log": 0.0004,
     "slam": 0.01,
+    "team": 0.03,
     "smooth": 0.02,
     "match": 0.15,
     "aligner": 0.05,
@@ -155,6 +156,8 @@ def _amounts(run: EvaluatedRun) -> dict[Stage, float]:
         estimates = stage.before["align"]
         assert isinstance(estimates, Stage)
         maps[stage] = maps[estimates]
+    if pipeline.team is not None:
+        amounts[pipeline.team] = float(frames)
     return amounts | maps | dict.fromkeys(pipeline.fusers.values(), float(frames))
 
 

@@ -238,6 +238,7 @@ def find_jumps(log: RobotLog, observed: Motions, noise: MotionNoise) -> list[Jum
     rows = np.flatnonzero(wrong & (observed.n_agree >= enough))
     if len(rows) > max(_MAX_JUMP_SHARE * len(square), 1):
         return []
+    covariance = 0.5 * (covariance + np.swapaxes(covariance, 1, 2))  # exactly, as files hold it
     return [
         Jump(int(observed.end[n]), motion[n], covariance[n], odometry[n]) for n in rows.tolist()
     ]

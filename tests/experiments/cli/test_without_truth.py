@@ -33,7 +33,8 @@ evaluate: {every: 10, timing_points: 2, timing_repeats: 1}
 fuse: {every: 40}
 """
 NEED_THE_TRUTH = {"errors", "fusion", "true_pairs", "path_statistics", "map_fits", "landmark_nees"}
-SOUND = {"tracks", "findings"}  # of logs without pictures that agree with themselves
+# Of logs without pictures that agree with themselves, of robots that stay alone.
+SOUND = {"tracks", "findings", "adoptions", "team_members", "messages"}
 NEED_THE_TRUTH |= {"team", "team_pairs", "fusers", "fuser_coverage", "smoothed_errors"}
 
 

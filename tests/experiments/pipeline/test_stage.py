@@ -101,7 +101,9 @@ TOLD = {
 }
 NO_OTHER_VALUE = {
     "schema_version",  # there is one
-    "generated",  # a section that is absent; those of the first robot are there, and changed
+    # sections that are absent; those of the first robot are there, and changed
+    "generated",
+    "team",
     "robots.1.odometry",
     "robots.1.radiometry",
     # others name it, or its parameters are this method's

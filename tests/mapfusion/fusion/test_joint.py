@@ -388,3 +388,18 @@ def test_covariances_that_are_too_small_leave_no_duplicates(seed: int) -> None:
     assert len(fused.landmarks) <= n + 2
     assert np.hypot(*(fused.T_first_map[1] - T_a_b)[:2]) < 0.012
     assert abs(fused.T_first_map[1, 2] - T_a_b[2]) < 0.004
+
+
+def test_inliers_of_alignments_need_no_alike_descriptors() -> None:
+    """A landmark looks different from the other side; the alignment tells that it is one point."""
+    team = DrawnTeam([slice(0, 40), slice(20, 60)], 5)
+    other = np.random.default_rng(1).normal(size=team.maps[1].descriptor.shape).astype(np.float32)
+    other /= np.linalg.norm(other, axis=1, keepdims=True)
+    team.maps[1] = replace(team.maps[1], descriptor=other)
+    n_inliers = len(team.pairs[0].inliers)
+    assert n_inliers == 20
+    fused = _fused(team)
+    assert not fused.fallback
+    both = np.all(fused.parents != ABSENT, axis=1)
+    assert np.count_nonzero(both) >= 0.9 * n_inliers
+    np.testing.assert_array_equal(fused.parents[both, 0], fused.parents[both, 1] + 20)
