@@ -1,4 +1,4 @@
-"""Maps as robots send them: a compact form, and messages with what has changed.
+"""Maps as robots send them: a compact form, and messages with its changes.
 
 A landmark takes 46 bytes without its descriptor, which is sent once. The shared errors of a map are
 sent as drift at a few frames (`adoption.drift_of_map`), not for each landmark.
@@ -178,7 +178,7 @@ class CompactMap(NamedTuple):
 
 @dataclass(frozen=True)
 class MapMessage:
-    """What has changed between two versions of a map.
+    """Changes between two versions of a map.
 
     Attributes:
         version: number of the map that the receiver has afterwards.

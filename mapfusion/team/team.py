@@ -18,7 +18,7 @@ _LOST_EVERY = 5
 
 
 class Moment(NamedTuple):
-    """What happens in one frame of a team.
+    """Result of one frame of a team.
 
     Attributes:
         iteration: number of the frame.
