@@ -1,5 +1,6 @@
 """Tests of `mapfusion.team.adoption`."""
 
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from mapfusion.fusion.merge import merge
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import compose, transform_points
+from mapfusion.robot_log import RobotLog
 from mapfusion.smoother.smooth import Smoothed
 from mapfusion.team.adoption import (
     ADOPTED,
@@ -190,12 +192,13 @@ def test_frames_with_few_landmarks_are_corrected_like_those_beside_them() -> Non
 
 
 class Adoption(NamedTuple):
-    """What a robot goes on with, and what it was made of."""
+    """Map and path that a robot goes on with, and the maps and the log of which they were made."""
 
     prior: PriorMap
     fused: FusedMap
     maps: list[TimedMap]
     smoothed: Smoothed
+    log: RobotLog
 
 
 @cache
@@ -214,11 +217,11 @@ def adoption(offset_m2: float = 0.0) -> Adoption:
     fused = merge([each.landmarks for each in maps], pairs).fused[0]
     assert fused.members.tolist() == [0, 1, 2]
     prior = prior_of(fused, maps, smoothed[0], drives[0].log, offset_m2)
-    return Adoption(prior, fused, list(maps), smoothed[0])
+    return Adoption(prior, fused, list(maps), smoothed[0], drives[0].log)
 
 
 def test_own_landmarks_keep_their_numbers_and_frames() -> None:
-    prior, fused, maps, _ = adoption()
+    prior, fused, maps, *_ = adoption()
     row = fused.parents[:, 0]
     own = row != ABSENT
     assert 0 < own.sum() < len(own)
@@ -231,7 +234,7 @@ def test_own_landmarks_keep_their_numbers_and_frames() -> None:
 
 def test_frames_of_others_come_before_those_of_the_robot() -> None:
     """South has 40 frames, -40 to -1; west has 45 frames, -85 to -41."""
-    prior, fused, maps, _ = adoption()
+    prior, fused, maps, *_ = adoption()
     for k, (first, last) in {1: (-40, -1), 2: (-85, -41)}.items():
         row = fused.parents[:, k]
         alone = np.flatnonzero((row != ABSENT) & (np.sum(fused.parents != ABSENT, axis=1) == 1))
@@ -246,7 +249,7 @@ def test_frames_of_others_come_before_those_of_the_robot() -> None:
 
 
 def test_the_first_pose_and_the_associations_stay() -> None:
-    prior, _, _, smoothed = adoption()
+    prior, _, _, smoothed, _ = adoption()
     np.testing.assert_array_equal(prior.path[0], smoothed.estimate.path[0])
     np.testing.assert_array_equal(prior.associations, smoothed.landmark)
     assert np.abs(prior.path - smoothed.estimate.path)[1:].max() > 1e-4
@@ -254,7 +257,7 @@ def test_the_first_pose_and_the_associations_stay() -> None:
 
 
 def test_drift_and_independent_errors_make_up_the_covariance_of_the_fused_map() -> None:
-    prior, fused, _, _ = adoption()
+    prior, fused, *_ = adoption()
     knots = np.append(prior.knots, len(prior.path) - 1)
     n, n_knots = len(prior.source), len(knots)
     weight = np.array([np.interp(prior.last_frame, knots, each) for each in np.eye(n_knots)]).T
@@ -275,3 +278,18 @@ def test_drift_and_independent_errors_make_up_the_covariance_of_the_fused_map() 
 def test_the_offset_of_a_track_is_added_to_each_landmark() -> None:
     more = adoption(0.01).prior.landmarks.covariance_m2 - adoption().prior.landmarks.covariance_m2
     np.testing.assert_allclose(more, np.broadcast_to(0.01 * np.eye(3), more.shape), atol=1e-12)
+
+
+def test_shared_errors_that_are_no_drift_become_independent() -> None:
+    """Each landmark is displaced at random, so that no motion of the plane explains it."""
+    given = adoption()
+    assert given.fused.landmarks.joint is not None
+    own_m2 = given.fused.landmarks.joint.own_m2
+    common_m = np.random.default_rng(2).normal(0, 0.1, (len(own_m2), 4, 3))
+    landmarks = replace(given.fused.landmarks, joint=JointCovariance(own_m2, common_m))
+    fused = replace(given.fused, landmarks=landmarks)
+    prior = prior_of(fused, given.maps, given.smoothed, given.log, 0.0)
+    added_m2 = prior.landmarks.covariance_m2 - own_m2
+    expected_m2 = np.swapaxes(common_m, 1, 2) @ common_m
+    found, wanted = (np.trace(each, axis1=1, axis2=2).sum() for each in (added_m2, expected_m2))
+    assert 0.6 < found / wanted <= 1.0  # drift explains a part by chance
