@@ -145,7 +145,8 @@ _COLUMNS = {
     # poses.
     "team": "component source n_robots n_team n rmse mean median std min max sse",
     # What robots adopt that exchange maps while they drive (`team` in the scenario). event: on
-    # trial (accepted once), adopted, kept (adopted, but not accepted at this exchange) or dropped.
+    # trial (accepted once), adopted, kept (adopted, but not accepted at this exchange), dropped, or
+    # not smoothed (the robot's own log; it neither sends nor merges).
     # The motion is the pose of the other robot's map in that of the robot.
     "adoptions": """robot iteration other event tx_m ty_m theta_rad
         cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt translation_error_m rotation_error_rad reason""",
@@ -347,7 +348,7 @@ MEANING = {
     "finding": "what was found, in words",
     # Robots that exchange maps
     "other": "robot whose map it is",
-    "event": "on trial, adopted, kept or dropped",
+    "event": "on trial, adopted, kept, dropped or not smoothed",
     "alone_path_rmse_m": "RMS position error of the independent robot's path",
     "merged_path_rmse_m": "RMS position error of the poses since the first adoption",
     "alone_merged_path_rmse_m": "the same of the independent robot",

@@ -108,6 +108,7 @@ def adoption_lines(adoptions: pd.DataFrame, messages: pd.DataFrame) -> Iterator[
         if row["event"] == ADOPTED and not math.isnan(row["translation_error_m"]):
             off = f", {metres(row['translation_error_m'])} off"
         words = {"on trial": "has the map of {} on trial", "kept": "keeps the map of {} for now"}
+        words["not smoothed"] = "neither sends nor merges"
         text = words.get(row["event"], f"{row['event']} the map of {{}}").format(row["other"])
         yield f"{row['iteration']:>5}  {row['robot']} {text}{off}{why}"
     if len(messages):

@@ -40,6 +40,15 @@ _MIN_INFORMATION = 1e-9
 _MIN_CORRECTION_M = 1e-3
 
 
+def between_knots(knots: np.ndarray, frame: np.ndarray) -> Float:
+    """Return the weights (n, K) of linear interpolation between K knots at frames (n,)."""
+    knot = np.clip(np.searchsorted(knots, frame, side="right") - 1, 0, len(knots) - 2)
+    share = (frame - knots[knot]) / (knots[knot + 1] - knots[knot])
+    weight, each = np.zeros((len(frame), len(knots))), np.arange(len(frame))
+    weight[each, knot], weight[each, knot + 1] = 1 - share, share
+    return weight
+
+
 class DriftModel:
     """Joint Gaussian of the drift at K knots of the path and at the present frame.
 
@@ -70,10 +79,7 @@ class DriftModel:
 
     def covariances(self, frame: np.ndarray) -> Float:
         """Return the covariances (n, 3, 3) of the drift at frames (n,)."""
-        knot, share = self._between(frame)
-        weight = np.zeros((len(frame), len(self._knots) + 1))
-        each = np.arange(len(frame))
-        weight[each, knot], weight[each, knot + 1] = 1 - share, share
+        weight = between_knots(np.append(self._knots, self.frame), frame)
         n = len(self._knots) + 1
         blocks = self._covariance.reshape(n, 3, n, 3)
         return np.einsum("nk,kilj,nl->nij", weight, blocks, weight, optimize=True)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.fastslam.filter import PriorMap
-from mapfusion.fastslam.loop_closing import KNOT_SPACING
+from mapfusion.fastslam.loop_closing import KNOT_SPACING, between_knots
 from mapfusion.fusion.fusers import FusedMap
 from mapfusion.fusion.landmark_association import ABSENT
 from mapfusion.geometry.joint_covariance import JointCovariance
@@ -82,15 +82,6 @@ class Drift(NamedTuple):
         """Covariance of the drift, shape (3K + 3, 3K + 3)."""
         stacked = self.by_shared.reshape(-1, self.by_shared.shape[2])
         return stacked @ stacked.T
-
-
-def between_knots(knots: np.ndarray, frame: np.ndarray) -> Float:
-    """Return the weights (n, K) of linear interpolation between K knots at frames (n,)."""
-    knot = np.clip(np.searchsorted(knots, frame, side="right") - 1, 0, len(knots) - 2)
-    share = (frame - knots[knot]) / (knots[knot + 1] - knots[knot])
-    weight, each = np.zeros((len(frame), len(knots))), np.arange(len(frame))
-    weight[each, knot], weight[each, knot + 1] = 1 - share, share
-    return weight
 
 
 def fit_drift(

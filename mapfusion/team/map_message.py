@@ -12,11 +12,12 @@ import numpy as np
 
 from mapfusion.camera import CalibrationError
 from mapfusion.descriptors import DescriptorKind
+from mapfusion.fastslam.loop_closing import between_knots
 from mapfusion.geometry.joint_covariance import JointCovariance
 from mapfusion.geometry.numerics import Float
 from mapfusion.geometry.se2 import IDENTITY, motion_jacobian
 from mapfusion.landmark_map import LandmarkMap
-from mapfusion.team.adoption import TimedMap, between_knots, drift_of_map
+from mapfusion.team.adoption import TimedMap, drift_of_map
 from mapfusion.viewing import BEARINGS, FieldOfView, Viewing
 
 # State of a landmark. The factor is the lower Cholesky factor of the covariance of its own error.

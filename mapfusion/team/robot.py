@@ -45,10 +45,11 @@ class Event(NamedTuple):
         iteration: number of the frame.
         robot: name of the robot.
         other: name of the robot whose map it is.
-        kind: `on trial`, `adopted`, `kept` (not accepted this time) or `dropped`.
+        kind: `on trial`, `adopted`, `kept` (not accepted this time) or `dropped`; `not smoothed` if
+            the robot's own log cannot be smoothed, so that it neither sends nor merges.
         T_robot_other: pose of the other map in that of the robot, shape (3,); NaN if unknown.
         covariance: covariance of this pose, shape (3, 3).
-        reason: reason of the verdict; empty if there is none.
+        reason: reason of the verdict or of the failure; empty if there is none.
     """
 
     iteration: int
@@ -88,6 +89,7 @@ class RobotInput:
         min_count: number of observations that a landmark of the map needs.
         odometry_covariance: covariance of visual odometry, shape (T, 3, 3); None for wheels.
         attitude: attitude that levelled the observations; None for a level robot.
+        max_memory_gb: smoothing that may take more memory is refused.
         start: frame of the team in which the log starts; later than 0 for a robot that joins later.
         predecessor: name of the log that the robot recorded before it was carried elsewhere and its
             odometry was reset; empty for none. The robot knows all maps that it knew then, starts
@@ -100,6 +102,7 @@ class RobotInput:
     min_count: int = 3
     odometry_covariance: Float | None = None
     attitude: Attitude | None = None
+    max_memory_gb: float = np.inf
     start: int = 0
     predecessor: str = ""
 
@@ -168,6 +171,7 @@ class TeamRobot:
         self._aligned: dict[tuple[str, str], _Aligned] = {}
         self._missed: set[str] = set()
         self._on_trial: set[str] = set()
+        self._not_smoothed = ""
 
     @property
     def iteration(self) -> int:
@@ -207,19 +211,22 @@ class TeamRobot:
         return self.frame
 
     def smooth(self) -> None:
-        """Smooth the log so far; without a solution the robot keeps the map that it has."""
+        """Smooth the log so far; if that fails, `merge` tells the reason."""
         given = self.given
         if self.own is not None and self.own.n_frames == self.iteration + 1:
             return  # nothing is new
+        self._not_smoothed = ""
         log = first_frames(given.log, self.iteration + 1)
         if floor_m := given.filter.noise_floor_m:
             wider_m2 = log.observations.covariance_m2 + floor_m**2 * np.eye(3)
             log = replace(log, observations=replace(log.observations, covariance_m2=wider_m2))
         landmark = _as_rows(self.filter.best_associations())
         try:
-            smoothed = smooth(log, landmark, self.filter.best_path(), given.smoother)
+            path = self.filter.best_path()
+            smoothed = smooth(log, landmark, path, given.smoother, given.max_memory_gb)
             landmarks = smoothed_map(log, smoothed, attitude=given.attitude)
-        except np.linalg.LinAlgError:
+        except (np.linalg.LinAlgError, MemoryError) as error:
+            self._not_smoothed = f"smoothing fails: {error}"
             return
         if not len(landmarks):
             return
@@ -257,7 +264,11 @@ class TeamRobot:
 
     def merge(self) -> list[Event]:
         """Align and fuse the maps that the robot has; go on in the fused map."""
-        if self.own is None or self.own.n_frames <= self.iteration:  # smoothing failed
+        if self._not_smoothed:
+            nothing = np.full(3, np.nan), np.full((3, 3), np.nan)
+            own = self.iteration, self.name, self.name, "not smoothed"
+            return [Event(*own, *nothing, self._not_smoothed)]
+        if self.own is None or self.own.n_frames <= self.iteration:  # no landmarks
             return []
         names = [self.name, *sorted(self._received, key=name_order)]
         maps = [self.own, *(self._timed_map(name) for name in names[1:])]

@@ -422,7 +422,8 @@ def _team(scenario: Scenario, robots: Sequence[RobotStages]) -> Stage:
         before |= {f"log {robot.name}": robot.log, f"slam {robot.name}": robot.slam}
     return _stage(
         team.TEAM_STAGE,
-        *(scenario, scenario.slam, scenario.evaluate, scenario.align, scenario.team, entry),
+        *(scenario, scenario.slam, scenario.smooth, scenario.evaluate, scenario.align),
+        *(scenario.team, entry),
         values={
             "robots": tuple(robot.name for robot in robots),
             "smoother": smoother_parameters(scenario),

@@ -104,6 +104,7 @@ class TeamSettings:
     seed: int
     filter: FastSlamParameters
     smoother: SmootherParameters
+    max_memory_gb: float
     min_count: int
     every: int
     robots: tuple[str, ...]
@@ -134,7 +135,7 @@ def run(settings: TeamSettings, job: Job) -> dict[str, float]:
         known = [poses for poses in true if poses is not None]
         if len(known) < len(true):
             name = settings.robots[next(k for k, poses in enumerate(true) if poses is None)]
-            raise InputError(f"team.range_m: the true poses of {name} are needed, but unknown")
+            raise InputError(f"team.link.range_m: the true poses of {name} are needed, but unknown")
         distance_m = path_distances(known)
     team = Team(given, merging, settings.link, settings.seed, distance_m)
     evaluated = [set(evaluated_iterations(len(each.log), settings.every)) for each in given]
@@ -180,8 +181,8 @@ def _input_of(settings: TeamSettings, job: Job, name: str) -> RobotInput:
     smoother = log_to_smooth(folder, slam, settings.smoother)[1]
     own = replace(settings.filter, motion=motion)
     attitude = read_attitude(folder, len(log))
-    when = settings.starts.get(name, 0), settings.carried.get(name, "")
-    return RobotInput(log, own, smoother, settings.min_count, covariance, attitude, *when)
+    more = settings.max_memory_gb, settings.starts.get(name, 0), settings.carried.get(name, "")
+    return RobotInput(log, own, smoother, settings.min_count, covariance, attitude, *more)
 
 
 def _step_row(robot: TeamRobot, pose: np.ndarray) -> dict[str, Any]:

@@ -507,7 +507,7 @@ def by_drift(position_m: Float, covariance: Float) -> Float:
 
 
 def test_covariances_with_drift_are_those_of_landmark_and_drift():
-    """Those of the other robot drift by 0.05; a frame between two knots has half of their drift."""
+    """The other robot drifts by 0.05; a frame between two knots has half of its drift."""
     slam, prior = restarted(drive(3), drift_m=0.05)
     found, plain = slam.best_map(1, with_drift=True), slam.best_map(1)
     theirs = found.source_observation >= FIRST_ADOPTED

@@ -129,7 +129,7 @@ def test_shared_errors_that_are_drift_keep_the_joint_covariance() -> None:
 
 
 def test_displacements_are_drift_plus_a_remainder_that_is_orthogonal_to_it() -> None:
-    """Of any shared errors the trace of the covariance is kept on average, if not for each point.
+    """The trace of the covariance is kept on average, if not for each point.
 
     The covariance of a point lacks the products of its drift and its remainder.
     """

@@ -367,10 +367,11 @@ def test_a_failed_smoothing_does_not_turn_the_filter_back(monkeypatch: pytest.Mo
     assert team[0].adopted
 
     def fails(*given: object, **named: object) -> None:
-        raise np.linalg.LinAlgError
+        raise np.linalg.LinAlgError("singular")
 
     monkeypatch.setattr("mapfusion.team.robot.smooth", fails)
-    meet(team, 1)
+    told = [event for event in meet(team, 1) if event.robot == "north"]
+    assert [(e.kind, e.reason) for e in told] == [("not smoothed", "smoothing fails: singular")]
     assert len(team[0].filter.best_path()) == 50
 
 
