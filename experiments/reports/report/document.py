@@ -176,8 +176,9 @@ _OF_FUSERS = {
 }
 # Likewise beside the table of robots that exchange maps.
 _OF_TEAMS = {
-    "fig13_team": "Lower is better. The smoother knows all observations of a robot's own log. The"
-    " independent robot and the robot in the joint map are filters. Green lines are adoptions.",
+    "fig13_team": "Lower is better; errors of the whole path so far. The smoother knows all"
+    " observations of a robot's own log. The independent robot and the robot in the joint map are"
+    " filters. Green lines are adoptions.",
 }
 _EXPLAINED = _OF_FUSERS | _OF_TEAMS
 _TABLES = tuple(dict.fromkeys((*MAP_TABLES, *metrics.USED_TABLES, "timings")))
